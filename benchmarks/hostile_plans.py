@@ -295,6 +295,20 @@ def _svg_styles(size: int) -> bytes:
     return _svg(f"<style>{rules}</style>" + '<path class="a1 a2 a3" d="M0 0h5v5h-5z"/>' * (size // 90))
 
 
+_SQUARE = '<path d="M0 0h5v5h-5z"/>'
+
+
+def _svg_symbols(levels: int) -> bytes:
+    """Return a symbol of ten symbols of ten symbols."""
+    groups = (f'<g id="a{k + 1}">' + f'<use href="#a{k}"/>' * 10 + "</g>" for k in range(levels))
+    symbols = '<path id="a0" d="M0 0h5v5h-5z"/>' + "".join(groups)
+    return _svg(f'<defs>{symbols}</defs><use href="#a{levels}"/>')
+
+
+def _svg_copied(attributes: str, copies: int) -> bytes:
+    return _svg(f'<defs><path id="a" {attributes}/></defs>' + '<use href="#a"/>' * copies)
+
+
 def _dxf_pairs(*pairs: tuple[int, object]) -> str:
     return "".join(f"{code}\n{value}\n" for code, value in pairs)
 
@@ -362,6 +376,14 @@ def _dxf_cycle(_size: int) -> bytes:
     block = [(0, "SECTION"), (2, "BLOCKS"), (0, "BLOCK"), (2, "A"), (0, "INSERT"), (2, "A"), (10, 0), (20, 0)]
     insert = _dxf_pairs((0, "INSERT"), (8, "0"), (2, "A"), (10, 0), (20, 0))
     return _dxf(insert, _dxf_pairs(*block, (0, "ENDBLK"), (0, "ENDSEC")))
+
+
+def _dxf_copies(size: int) -> bytes:
+    """Return an array of a block, whose number of copies is two numbers in the file."""
+    side = math.isqrt(size // 2)
+    block = [(0, "SECTION"), (2, "BLOCKS"), (0, "BLOCK"), (2, "A"), (10, 0), (20, 0)]
+    insert = _dxf_pairs((0, "INSERT"), (8, "0"), (2, "A"), (10, 0), (20, 0), (70, side), (71, side), (44, 1), (45, 1))
+    return _dxf(insert, _dxf_pairs(*block) + _dxf_line((0, 0), (5, 5)) + _dxf_pairs((0, "ENDBLK"), (0, "ENDSEC")))
 
 
 def _dxf_text(size: int) -> bytes:
@@ -559,6 +581,24 @@ HOSTILE_PLANS: tuple[HostilePlan, ...] = (
     _plan("svg", "light areas over walls", _svg_patches),
     _plan("svg", "swings of doors", _svg_arcs),
     _plan("svg", "style rules", _svg_styles),
+    _plan(
+        "svg", "declarations for all", lambda s: _svg(f"<style>*{{{'a:b;' * (s // 8)}}}</style>{_SQUARE * (s // 50)}")
+    ),
+    _plan(
+        "svg",
+        "a rule of one class",
+        lambda s: _svg(f"<style>{',.a' * (s // 6)}{{{'a:b;' * (s // 8)}}}</style>{_SQUARE}"),
+    ),
+    _plan("svg", "comments without an end", lambda s: _svg(f"<style>{'/*' * (s // 2)}</style>{_SQUARE}")),
+    _plan("svg", "a rule without a brace", lambda s: _svg(f"<style>{'a' * s}}}</style>{_SQUARE}")),
+    _plan(
+        "svg",
+        "a transform around all",
+        lambda s: _svg(f'<g transform="{"rotate(7)" * (s // 18)}">{_SQUARE * (s // 50)}</g>'),
+    ),
+    _plan("svg", "symbols of symbols", lambda _: _svg_symbols(4)),
+    _plan("svg", "copies of a path", lambda s: _svg_copied(f'd="M0 0{"h1" * (s // 2)}"', 30)),
+    _plan("svg", "copies of classes", lambda s: _svg_copied(f'class="{"a " * (s // 4)}" d="M0 0h5v5h-5z"', s // 40)),
     _plan("svg", "numbers of 1e308", lambda s: _svg_many([[(0.0, 0.0), (1e300, 0.0), (5.0, 1e300)]] * 9)),
     _plan(
         "svg", "arcs of radius 1e308", lambda s: _svg('<path d="M0 0' + "A1e308 1e308 0 0 0 9 9" * (s // 22) + '"/>')
@@ -588,6 +628,7 @@ HOSTILE_PLANS: tuple[HostilePlan, ...] = (
     _plan("dxf", "a spline of degree 200", lambda s: _dxf(_dxf_spline(s))),
     _plan("dxf", "layers", _dxf_layers),
     _plan("dxf", "a block in itself", _dxf_cycle),
+    _plan("dxf", "an array of a block", _dxf_copies),
     _plan("dxf", "format codes in a text", _dxf_text),
     _plan("dxf", "numbers of 1e308", lambda s: _dxf("".join(_dxf_line((0, 0), (1e308, 1e308)) for _ in range(9)))),
     _plan("pdf", "lines that cross", lambda s: pdf(_pdf_lines(chords(s // 10, 700.0))), _POINTS),

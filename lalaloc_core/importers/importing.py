@@ -85,7 +85,7 @@ def import_plans(
             f"the file has {len(content)} bytes; the limit is {limits.max_plan_bytes} (max_plan_bytes); "
             "export a single storey"
         )
-    budget = Budget(limits, clock, trace, on_step)
+    budget = Budget(limits, clock, trace, on_step, len(content))
     try:
         budget.begin("opening the file")
         format, source = _open(content, limits)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.photograph.bent_lines import bend_warnings
 from lalaloc_core.photograph.cameras import Around, Camera, Perspective, camera_axes
 from lalaloc_core.photograph.exif import ExifLens, read_exif_lens
 from lalaloc_core.photograph.layouts import Layout, find_layout
@@ -351,6 +352,7 @@ def photograph_of_picture(
         camera, focal_sd = lens.camera, lens.focal_sd
         small = camera.scaled(columns, rows)
         attitude = estimate_attitude(lines_of(segments, small))
+    warnings = (*warnings, *bend_warnings(segments, small))
     estimated = (
         Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
         for angle, sd in ((attitude.pitch, attitude.pitch_sd), (attitude.roll, attitude.roll_sd))

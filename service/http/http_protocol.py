@@ -12,7 +12,7 @@ import h11
 from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.h11_impl import STATUS_PHRASES, H11Protocol
 
-from service.http.paced_parsing import Pace, PacedParser
+from service.http.paced_parsing import Pace, PacedParser, ParsingAccount
 
 # Heads of requests, and their lines; larger ones get a 431.
 MAX_HEAD_BYTES, _MAX_HEADERS = 16 * 1024, 100
@@ -119,7 +119,10 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
         def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
             super().connection_made(transport)
             self.conn = _CountedConnection(lambda: self._parser)
-            self._parser = PacedParser(transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused)
+            account = ParsingAccount(self.config.app, lambda: self.scope, self.client[0] if self.client else "")
+            self._parser = PacedParser(
+                transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused, account.add
+            )
             self.flow = _Flow(transport, self._parser)
             _send_at_once(transport)
             self._idle_since = monotonic()

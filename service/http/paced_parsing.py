@@ -7,13 +7,19 @@ them at once would keep the event loop from all other connections.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from time import monotonic
+from collections.abc import Callable, Mapping
+from time import monotonic, thread_time
+from typing import Any
+
+from service.capacity.cpu_accounts import CpuAccounts
+from service.security.permissions import client_of
 
 # Events of one connection in a turn of the event loop.
 EVENTS_PER_TURN = 64
 # Time (s) per event of connections that have more than that, of all of them together: a few percent of the loop.
 _EVENT_S = 2e-4
+# CPU time (s) of parsing that is charged at once; a client is active when it is charged, which one request is not for.
+_CHARGED_S = 1e-3
 # Unparsed bytes of a connection: that of a few reads, which can arrive although reading is paused.
 _MAX_WAITING_BYTES = 2**20
 
@@ -35,6 +41,30 @@ class Pace:
 EVENTS = Pace(_EVENT_S)
 
 
+class ParsingAccount:
+    """CPU time of parsing on one connection, charged to the client of its last request.
+
+    Requests that were not accepted have none: their parsing is charged to the client address.
+    """
+
+    def __init__(self, app: Any, scope: Callable[[], Mapping[str, Any] | None], address: str) -> None:
+        """Create an account for a connection from an address; `app` has `Admission` while it runs."""
+        self._app = app
+        self._scope = scope
+        self._address = address
+        self._owed_s = 0.0
+
+    def add(self, cpu_s: float) -> None:
+        """Add CPU time (s)."""
+        self._owed_s += cpu_s
+        # An app without its lifespan has no accounts.
+        admission = getattr(getattr(self._app, "state", None), "admission", None)
+        if self._owed_s >= _CHARGED_S and admission is not None:
+            accounts: CpuAccounts = admission.cpu_accounts
+            accounts.charge(client_of(self._scope() or {}, self._address), self._owed_s, rests=True)
+            self._owed_s = 0.0
+
+
 class PacedParser:
     """Feeder of a protocol's parser.
 
@@ -48,6 +78,7 @@ class PacedParser:
         parse: Callable[[bytes], None],
         piece_bytes: int,
         may_read: Callable[[], bool],
+        spent: Callable[[float], None],
     ) -> None:
         """Create a feeder.
 
@@ -56,12 +87,14 @@ class PacedParser:
             parse: handles a piece; an empty one handles what the parser holds already.
             piece_bytes: maximum size of a piece. A piece is parsed as a whole if the parser does not count its events.
             may_read: tells whether the protocol itself wants more bytes.
+            spent: receives the CPU time (s) of each turn.
         """
         self.events_left = EVENTS_PER_TURN
         self._transport = transport
         self._parse = parse
         self._piece_bytes = piece_bytes
         self._may_read = may_read
+        self._spent = spent
         self._waiting = bytearray()
         self._timer: asyncio.TimerHandle | None = None
         self._blocked = set[str]()
@@ -116,9 +149,11 @@ class PacedParser:
 
     def _run(self) -> None:
         self.events_left = EVENTS_PER_TURN
+        begin_s = thread_time()
         self._parse(self._take())
         while self._waiting and self.events_left > 0 and not self._blocked and not self._transport.is_closing():
             self._parse(self._take())
+        self._spent(thread_time() - begin_s)
         self.settle()
 
     def _go_on(self) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import CloseCode, Frame
 
-from service.http.paced_parsing import PacedParser
+from service.http.paced_parsing import PacedParser, ParsingAccount
 
 # Fragments of a message; a photograph is sent in several messages.
 _MAX_FRAGMENTS = 1024
@@ -25,7 +25,10 @@ class BoundedSocket(WebSocketsSansIOProtocol):
     def connection_made(self, transport: Any) -> None:
         """Prepare the connection."""
         super().connection_made(transport)
-        self._parser = PacedParser(transport, self._parse, _PIECE_BYTES, lambda: not self.read_paused)
+        account = ParsingAccount(
+            self.config.app, lambda: getattr(self, "scope", None), self.client[0] if self.client else ""
+        )
+        self._parser = PacedParser(transport, self._parse, _PIECE_BYTES, lambda: not self.read_paused, account.add)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Drop what waits."""

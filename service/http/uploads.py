@@ -184,7 +184,7 @@ async def read_parts(
     # One more than allowed, so that the error states the limit.
     max_files = max(_MAX_PARTS, *(repeats.most + 1 for repeats in repeated.values())) if repeated else _MAX_PARTS
     chunks = _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES)
-    parser = MultiPartParser(
+    parser = _NamingParser(
         request.headers,
         _within_parts(chunks, options.get(b"boundary", b""), max_files + _MAX_PARTS),
         max_files=max_files,
@@ -205,7 +205,7 @@ async def read_parts(
             ]
             raise errors.InvalidRequestError(faults) from error
         if error.message.startswith(_TOO_LARGE_PART):
-            name = parser._current_part.field_name[:50]
+            name = parser.part_name[:50]
             is_file = aliases.get(name, name) in {*files, *repeated, *substitutes}
             raise errors.InvalidRequestError([(name, _NO_FILE if is_file else _LARGE_FIELD)]) from error
         raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
@@ -217,6 +217,34 @@ async def read_parts(
         for name, value in form.multi_items()
     ]
     return _sort(items, limits, files, fields, check, repeated, substitutes)
+
+
+class _NamingParser(MultiPartParser):
+    """Parser that tells the name of the part that it reads, for errors.
+
+    Attributes:
+        part_name: name of the last part whose head was read; empty before.
+    """
+
+    part_name = ""
+    _header_name = _header_value = b""
+
+    def on_header_field(self, data: bytes, start: int, end: int) -> None:
+        """Read a piece of a header's name."""
+        super().on_header_field(data, start, end)
+        self._header_name += data[start:end]
+
+    def on_header_value(self, data: bytes, start: int, end: int) -> None:
+        """Read a piece of a header's value."""
+        super().on_header_value(data, start, end)
+        self._header_value += data[start:end]
+
+    def on_header_end(self) -> None:
+        """Note the name of the part."""
+        super().on_header_end()
+        if self._header_name.lower() == b"content-disposition":
+            self.part_name = parse_options_header(self._header_value)[1].get(b"name", b"").decode("utf-8", "replace")
+        self._header_name = self._header_value = b""
 
 
 def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:

@@ -26,6 +26,7 @@ from service.routes.query_request import PHOTO
 from service.runtime import Runtime
 from service.security import caller_of
 from service.security.audit import entry_of
+from service.security.permissions import put_caller
 
 router = APIRouter(tags=["sessions"])
 _SUFFIX = "/stream"
@@ -50,6 +51,8 @@ async def stream_session(socket: WebSocket) -> None:
     if answer.status != 200:
         await _deny(socket, Response(answer.body, answer.status, dict(answer.headers)))
         return
+    # Parsing of its frames is charged to the caller.
+    put_caller(socket.scope, caller_of(request.scope))
     try:
         runtime.access_control.check_handshake(request)
         with admission.streams.hold(caller_of(request.scope).client), suppress(WebSocketDisconnect):

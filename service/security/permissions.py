@@ -6,7 +6,7 @@ import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Self
+from typing import Any, Self
 
 from starlette.routing import compile_path
 from starlette.types import Scope
@@ -172,6 +172,12 @@ def put_caller(scope: Scope, caller: Caller) -> None:
 def caller_of(scope: Scope) -> Caller:
     """Return the caller of an accepted request."""
     return scope[_SCOPE_KEY]
+
+
+def client_of(scope: Mapping[str, Any], address: str) -> str:
+    """Return the unit of fair sharing of a request, or of an address whose request was not accepted yet."""
+    caller: Caller | None = scope.get(_SCOPE_KEY)
+    return network_of(address) if caller is None else caller.client
 
 
 def network_of(client: str) -> str:

@@ -16,11 +16,13 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig
 from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.bent_lines import measure_bend
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 from lalaloc_core.photograph.patches import UNSEEN, patch_azimuths
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
+from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 
 Tag = ExifTags.Base
@@ -357,3 +359,47 @@ def test_heic_photograph_is_read() -> None:
     view = opened(buffer.getvalue())
     assert view.hfov.source == "exif"
     assert np.abs(view.patches[0].pixels.astype(int) - opened(jpeg(pixels, PHONE)).patches[0].pixels).mean() < 4.0
+
+
+@pytest.mark.parametrize("field", [120.0, 130.0])
+def test_fisheye_picture_that_is_read_in_perspective_has_bent_lines(field: float) -> None:
+    camera = Fisheye.of_hfov(1280, 960, math.radians(field))
+    taken = jpeg(take(sphere("living_room"), camera))
+    warnings = opened(taken, projection="perspective", hfov_deg=100.0).warnings
+    assert any("straight lines are bent by" in text and "send projection=fisheye" in text for text in warnings)
+    stated = opened(taken, projection="fisheye", hfov_deg=field).warnings
+    assert not any("bent" in text for text in stated)
+
+
+@pytest.mark.parametrize("name", ["kitchen", "living_room", "bedroom", "study"])
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0])
+def test_lines_of_a_picture_in_perspective_are_straight(name: str, heading_deg: float) -> None:
+    camera = Perspective.of_hfov(1280, 960, math.radians(80.0))
+    photograph = opened(jpeg(take(sphere(name), camera, heading_deg=heading_deg)), hfov_deg=80.0)
+    assert not any("bent" in text for text in photograph.warnings)
+
+
+def test_bend_is_measured_in_shares_of_the_longer_side() -> None:
+    def bent(x: np.ndarray, y: float) -> np.ndarray:
+        """Return pieces of a line that rises by 8 px to its middle."""
+        points = np.stack([x, y + math.copysign(8.0, y - 240.0) * (1.0 - ((x - 320.0) / 320.0) ** 2)], axis=1)
+        return np.concatenate([points[:-1], points[1:]], axis=1)
+
+    x = np.linspace(0.0, 640.0, 17)
+    lines = np.concatenate([bent(x, y) for y in (20.0, 60.0, 420.0, 460.0)])
+    bend = measure_bend(lines, width=640, height=480)
+    assert bend == pytest.approx(8.0 / 640.0 * 240.0 / 200.0, rel=0.2)
+    straight = np.concatenate(
+        [np.stack([x[:-1], x[:-1] * 0 + y, x[1:], x[1:] * 0 + y], axis=1) for y in (20.0, 60.0, 460.0)]
+    )
+    assert measure_bend(straight, width=640, height=480) == pytest.approx(0.0, abs=1e-6)
+    # An arch is on one side of the centre.
+    assert measure_bend(np.concatenate([bent(x, y) for y in (20.0, 40.0, 60.0)]), width=640, height=480) is None
+
+
+def test_heic_picture_with_a_broken_exif_block_is_read() -> None:
+    pytest.importorskip("pillow_heif")
+    photograph = opened((FOLDER / "heic_bad_exif.heic").read_bytes())
+    assert photograph.sphere is not None
+    assert photograph.sphere.std() > 20.0
+    assert any("Exif" in text or "EXIF" in text for text in photograph.warnings), photograph.warnings

@@ -17,21 +17,25 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+import svgelements
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
-from benchmarks.hostile_plans import HOSTILE_PLANS, HostilePlan, star
+from benchmarks.hostile_plans import HOSTILE_PLANS, HostilePlan, pdf, star
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from lalaloc_core.importers.common.assemble import assemble
 from lalaloc_core.importers.common.crossings import check_network
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
 from lalaloc_core.importers.drawing import enclosed_rooms
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose
-from lalaloc_core.importers.formats import dxf
+from lalaloc_core.importers.formats import dxf, pdf_page
+from lalaloc_core.importers.picture import lettering, wall_mask
+from lalaloc_core.importers.picture.ink import read_ink
 from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
@@ -374,3 +378,84 @@ def test_large_number_of_a_model_is_named():
     pytest.importorskip("ifcopenshell")
     plan = next(plan for plan in HOSTILE_PLANS if plan.title == "a number of 1.E400")
     _assert_rejected(plan.make(1000), "the number 1.E400; the limit is 1.E100")
+
+
+def _hostile(format: str, title: str) -> HostilePlan:
+    return next(plan for plan in HOSTILE_PLANS if (plan.format, plan.title) == (format, title))
+
+
+@pytest.mark.parametrize(
+    ("format", "title", "message"),
+    [
+        (
+            "svg",
+            "declarations for all",
+            r"styles, classes, transforms and paths of the SVG's \d+ elements, with copies",
+        ),
+        ("svg", "a rule of one class", r"style rules of the SVG repeat declarations of more than \d+ characters"),
+        ("svg", "a transform around all", r"transforms count 12 times"),
+        ("svg", "copies of a path", r"paths 100 times"),
+        ("svg", "copies of classes", r"\d+ characters .*; the limit is \d+ for its size"),
+        ("svg", "symbols of symbols", r"the file of \d+ bytes draws more than \d+ shapes, the limit for its size"),
+    ],
+)
+def test_svg_is_refused_before_its_library_multiplies_what_it_reads(
+    monkeypatch: pytest.MonkeyPatch, format: str, title: str, message: str
+):
+    monkeypatch.setattr(svgelements.SVG, "parse", pytest.fail)
+    _assert_rejected(_hostile(format, title).make(100_000), message)
+
+
+def test_style_sheets_reach_the_library_without_what_does_not_end(monkeypatch: pytest.MonkeyPatch):
+    sheets = []
+    parse = svgelements.SVG.parse
+
+    def reading(stream: io.BytesIO, **options: Any) -> Any:
+        sheets.append(re.search(rb"<ns0:style>(.*)</ns0:style>", stream.getvalue()))
+        return parse(stream, **options)
+
+    monkeypatch.setattr(svgelements.SVG, "parse", reading)
+    style = "/* a */ .a, .b { fill: red } // line\n}}} b {} c{d:e} aaaa /* no end"
+    drawing = f'<style>{style}</style><rect class="Room b" width="500" height="500"/>'
+    import_plans(SVG.format(drawing).encode(), ImportOptions(metres_per_pixel=0.01))
+    assert sheets[0] is not None
+    assert sheets[0][1] == b".a, .b{fill: red}c{d:e}"
+
+
+def test_copies_of_blocks_are_bounded_by_the_size_of_the_file(monkeypatch: pytest.MonkeyPatch):
+    content = _hostile("dxf", "an array of a block").make(100_000)
+    monkeypatch.setattr(dxf, "_read_drawing", pytest.fail)
+    _assert_rejected(content, rf"the file of {len(content)} bytes draws more than {10_000 + len(content) // 10} shapes")
+
+
+def test_packed_operators_are_counted_before_they_are_read(monkeypatch: pytest.MonkeyPatch):
+    content = pdf(b"0 0 m 9 9 l S " * 30_000)
+    monkeypatch.setattr(pdf_page, "_add_path", pytest.fail)
+    _assert_rejected(content, rf"the file of {len(content)} bytes draws more than {10_000 + len(content) // 4} shapes")
+
+
+def test_large_picture_is_read_at_a_bounded_number_of_pixels():
+    ink = read_ink(np.full((6000, 4000), 255, np.uint8), 0.01)
+    assert ink.mask.size <= 12_010_000
+    # Its places are those of the whole picture.
+    assert ink.to_plan(np.array([[0.0, ink.mask.shape[0]]]))[0] == pytest.approx([0.0, 0.0])
+    assert ink.to_plan(np.array([[ink.mask.shape[1], 0.0]]))[0] == pytest.approx([40.0, 60.0], rel=1e-3)
+
+
+def test_picture_without_anything_of_the_size_of_letters_is_not_searched_for_texts(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(lettering, "_boxes", pytest.fail)
+    gray = np.full((2000, 2000), 255, np.uint8)
+    gray[::100] = gray[:, ::100] = 0
+    assert not lettering.read_texts(gray, ReportBuilder(), Budget()).drawing.letterings
+
+
+def test_outlines_of_a_picture_of_noise_are_counted_before_they_are_polygons(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shapely, "Polygon", pytest.fail)
+    noise = np.where(np.random.default_rng(0).random((150, 150)) < 0.55, 0, 255).astype(np.uint8)
+    # One dark area with thousands of holes.
+    gray = np.kron(noise, np.ones((20, 20), np.uint8))
+    ink = read_ink(gray, 0.01, straighten=False)
+    walls = wall_mask.WallMask(ink.mask, 0.1, None)
+    monkeypatch.setattr(wall_mask, "_MAX_OUTLINES", 1000)
+    with pytest.raises(InvalidFloorPlanError, match=r"\d+ outlines; the limit is 1000"):
+        wall_mask.wall_polygons(walls, ink, lambda: None)

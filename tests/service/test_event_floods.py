@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -15,9 +17,11 @@ from fastapi import FastAPI, Request, WebSocket, WebSocketDisconnect
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.sync.client import connect
 
+from service.capacity.cpu_accounts import CpuAccounts
 from service.http import paced_parsing
 from service.http.http_protocol import MAX_HEAD_BYTES
 from service.http.paced_parsing import EVENTS_PER_TURN, PacedParser
+from service.security.permissions import Caller, put_caller
 from service.settings import Settings
 from tests.service.conftest import wait_for
 from tests.service.test_server import served
@@ -110,7 +114,7 @@ def test_turn_of_the_loop_handles_a_bounded_number_of_events(monkeypatch: pytest
             parser.events_left -= len(piece)
 
         transport = _Transport()
-        parser = PacedParser(transport, parse, 1, lambda: True)
+        parser = PacedParser(transport, parse, 1, lambda: True, lambda _cpu_s: None)
         parser.feed(bytes(1000))
         assert not transport.reading
         while parser.held:
@@ -246,3 +250,59 @@ def test_text_that_is_not_utf_8_is_the_clients_error(
         assert client.recv(4096)[2:4] == (1007).to_bytes(2, "big")
         wait_for(lambda: received == ["closed"])
     assert not caplog.records
+
+
+class _Admission:
+    """Accounts of an app that runs, without its other parts."""
+
+    def __init__(self) -> None:
+        self.cpu_accounts = CpuAccounts()
+
+
+@pytest.fixture
+def charged(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, CpuAccounts]]:
+    """Port and accounts of an app whose path `/keyed` is of a tenant; every reading of the clock takes a second."""
+    app, admission = _app([]), _Admission()
+    app.state.admission = admission
+    clock = itertools.count()
+    monkeypatch.setattr(paced_parsing, "thread_time", lambda: float(next(clock)))
+
+    @app.post("/keyed")
+    async def keyed(request: Request) -> int:
+        put_caller(request.scope, Caller("acme", None, frozenset(), "acme"))
+        return len(await request.body())
+
+    with served(app, Settings()) as port:
+        yield port, admission.cpu_accounts
+
+
+def test_parsing_is_charged_to_the_client(charged: tuple[int, CpuAccounts]) -> None:
+    port, accounts = charged
+    with _connected(port) as client:
+        head = b"POST /keyed HTTP/1.1\r\n" + HOST + b"Content-Length: 100000\r\n\r\n"
+        for piece in (head, bytes(50_000), bytes(50_000)):
+            client.sendall(piece)
+            time.sleep(0.1)
+        assert b"100000" in client.recv(4096)
+    # The head came before the key was known.
+    assert accounts.total_s("127.0.0.1") == 1.0
+    assert accounts.total_s("acme") >= 2.0
+
+
+@pytest.mark.parametrize("path", ["/body", "/refused"])
+def test_parsing_without_a_key_is_charged_to_the_address(charged: tuple[int, CpuAccounts], path: str) -> None:
+    port, accounts = charged
+    with _connected(port) as flood:
+        _send_quietly(flood, _chunked(path, b"x", 2000))
+        _read_all(flood)
+    # A turn of the loop handles a bounded number of events; a refused body is not parsed.
+    assert accounts.total_s("127.0.0.1") >= (1000 // EVENTS_PER_TURN if path == "/body" else 1)
+
+
+def test_frames_are_charged_to_the_client(charged: tuple[int, CpuAccounts]) -> None:
+    port, accounts = charged
+    with _connected(port) as client:
+        _handshake(client)
+        before_s = accounts.total_s("127.0.0.1")
+        client.sendall(1000 * b"\x89\x80\0\0\0\0")
+        wait_for(lambda: accounts.total_s("127.0.0.1") >= before_s + 1000 // EVENTS_PER_TURN // 4)

@@ -12,6 +12,8 @@ from lalaloc_core.importers.common.import_report import Trace
 
 _REMEDY = "export a single storey, or only the layers of walls, doors, windows and rooms"
 
+# Copies of a file's shapes that any file may draw, beside those that its size allows.
+_COPIES = 10_000
 # Enough for the largest plan in the native format.
 _MIN_JSON_VALUES = 1_000_000
 
@@ -77,6 +79,7 @@ class Budget:
     Attributes:
         trace: receives what is read from a drawing, if anyone asks for it.
         on_step: called with every step of the import as it begins.
+        size_bytes: size of the file, which bounds the copies of its shapes; 0 if unknown.
     """
 
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS
@@ -84,6 +87,7 @@ class Budget:
     clock: Callable[[], float] = time.process_time
     trace: Trace | None = None
     on_step: OnStep | None = None
+    size_bytes: int = 0
     entities: int = 0
     started_s: float = field(init=False)
 
@@ -117,6 +121,22 @@ class Budget:
         self.check_time()
         if self.on_step is not None:
             self.on_step(ImportStep(step, done, total))
+
+    def check_copies(self, shapes: int, bytes_each: int) -> None:
+        """Check the number of shapes that are drawn after all copies are made, before they are.
+
+        Blocks, symbols and packed operators can draw hundreds of thousands of shapes from a few hundred bytes, and the
+        time to read a file follows from its shapes. Shapes that a file states take at least `bytes_each` of it.
+
+        Raises:
+            InvalidFloorPlanError: there are too many for the size of the file.
+        """
+        limit = _COPIES + self.size_bytes // bytes_each
+        if shapes > limit:
+            raise InvalidFloorPlanError(
+                f"the file of {self.size_bytes} bytes draws more than {limit} shapes, the limit for its size, with "
+                "copies of its blocks or symbols or by repeated lines; remove the copies, or explode the blocks"
+            )
 
     def check_time(self) -> None:
         """Check the time.

@@ -66,6 +66,7 @@ def _convert(content: bytes, budget: Budget) -> bytes:
                 f"the DWG drawing converts to {size} bytes; the limit is {limit} (max_unpacked_bytes); export fewer "
                 "layers"
             )
+        budget.size_bytes = size
         return made.read_bytes()
 
 

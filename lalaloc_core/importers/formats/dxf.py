@@ -48,6 +48,7 @@ _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
 _MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
+_BYTES_PER_SHAPE = 10
 # Maximum distance of a curve from its polyline, as a share of the drawing's size.
 _SAG = 2e-5
 # A polyline is closed if its ends are nearer than this share of its length. The distance to the origin must not matter,
@@ -188,7 +189,9 @@ def _check_blocks(document: DxfDocument, budget: Budget) -> None:
                 break
         return count
 
-    budget.spend(total(document.modelspace(), 0))
+    shapes = total(document.modelspace(), 0)
+    budget.spend(shapes)
+    budget.check_copies(shapes, _BYTES_PER_SHAPE)
 
 
 def _weight(entity: DXFEntity) -> int:

@@ -34,6 +34,8 @@ _MAX_PAINTED = 1000
 # Opacity (of 255) of fills that can be walls, and of fills that hide what is below them.
 _OPAQUE, _HIDING = 60, 230
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
+# Smallest packed size of a line or area.
+_BYTES_PER_SHAPE = 4
 Matrix = Float[np.ndarray, "3 3"]
 
 
@@ -93,6 +95,8 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
         InvalidFloorPlanError: the page has too many entities, or is painted over too often.
     """
     width, height = page.get_size()
+    shapes = _count_shapes(page.raw, pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject, budget, 0)
+    budget.check_copies(shapes, _BYTES_PER_SHAPE)
     found = PageContent(size_pt=(float(width), float(height)))
     for item, matrix in _objects(
         page.raw, pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject, np.eye(3), budget, 0
@@ -114,6 +118,20 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
             )
     found.drawing.letterings = _letterings(page)
     return found
+
+
+def _count_shapes(holder: Any, count: Any, get: Any, budget: Budget, depth: int) -> int:
+    """Return the number of objects after forms are expanded, or one more than may be expanded at all."""
+    shapes = max(count(holder), 0)
+    for index in range(shapes if depth < _MAX_FORM_DEPTH and shapes <= budget.limits.max_entities else 0):
+        if shapes > budget.limits.max_entities:
+            break
+        item = get(holder, index)
+        if item and pdfium.FPDFPageObj_GetType(item) == pdfium.FPDF_PAGEOBJ_FORM:
+            shapes += _count_shapes(
+                item, pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject, budget, depth + 1
+            )
+    return shapes
 
 
 def _objects(
@@ -164,8 +182,10 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
             drawing.swings += leaves
         elif len(points) >= 3 and (subpath.is_closed or is_filled):
             shells += polygons_from_geometry(shapely.Polygon(points))
-        elif len(points) >= 2 and is_stroked and shapely.LineString(points).length > 0.0:
-            drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen, drawing.next_order))
+        elif len(points) >= 2 and is_stroked and (line := shapely.LineString(points)).length > 0.0:
+            drawing.strokes.append(Stroke(line, "", None, pen, drawing.next_order))
+    if not shells:
+        return out_of_range
     parts, order = even_odd_polygons(shells), drawing.next_order
     if fill_colour is not None and not is_wall and fill_colour[3] >= _HIDING:
         drawing.patches += [Patch(part, order, is_bluish(*fill_colour[:3])) for part in parts]

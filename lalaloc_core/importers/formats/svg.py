@@ -42,10 +42,10 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     is_bluish,
     is_dark,
 )
+from lalaloc_core.importers.formats.svg_limits import check_work
 
 # Attribute of the root element with the scale of exported drawings.
 _SCALE_ATTRIBUTE = "data-metres-per-unit"
-_HREF = "{http://www.w3.org/1999/xlink}href"
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 # Names that editors generate.
 _AUTOMATIC = re.compile(
@@ -53,9 +53,6 @@ _AUTOMATIC = re.compile(
 )
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|cm|in|pt|pc|px|)\s*")
-_BYTES_PER_ENTITY = 12
-# Style rules times elements.
-_MAX_STYLES = 2_000_000
 # Fills that are less opaque do not hide what is below them.
 _OPAQUE = 0.9
 # Elements without a shape, and elements that are drawn only where they are used.
@@ -105,7 +102,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
     _drop_ignored(root)
-    _check_uses(root, budget)
+    check_work(root, budget)
     paper_m, own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder("svg")
     drawing = _read_drawing(root, options, builder, budget)
@@ -170,40 +167,6 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 def _drop_ignored(root: Element) -> None:
     for parent in root.iter():
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
-
-
-def _check_uses(root: Element, budget: Budget) -> None:
-    """Count the elements after `<use>` is expanded: nested uses can multiply to billions.
-
-    References are resolved as svgelements does: the last element with an id, and any character before it.
-    """
-    by_id = {element.get("id"): element for element in root.iter() if "id" in element.attrib}
-    sizes: dict[Element, int] = {}
-    open_elements: set[Element] = set()
-
-    def size(element: Element) -> int:
-        if element in sizes:
-            return sizes[element]
-        if element in open_elements:
-            raise InvalidFloorPlanError("a <use> element refers to itself; remove it or convert it to paths")
-        open_elements.add(element)
-        total = 1 + len(element.get("d", "")) // _BYTES_PER_ENTITY + len(element.get("points", "")) // _BYTES_PER_ENTITY
-        total += sum(size(child) for child in element)
-        if local_name(element) == "use":
-            target = by_id.get(element.get("href", element.get(_HREF, "#"))[1:])
-            total += size(target) if target is not None else 0
-        open_elements.discard(element)
-        sizes[element] = total
-        return total
-
-    budget.spend(size(root))
-    rules = sum((element.text or "").count("{") for element in root.iter() if local_name(element) == "style")
-    # Every element is compared with the rules.
-    if rules * len(sizes) > _MAX_STYLES:
-        raise InvalidFloorPlanError(
-            f"the SVG has {rules} style rules for {len(sizes)} elements; the limit is {_MAX_STYLES // len(sizes)} "
-            "rules for as many; save it as plain SVG, with styles as attributes"
-        )
 
 
 def _size_on_paper(root: Element) -> float | None:

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 
-# Finer pictures are reduced to this resolution (m per pixel).
-FINEST_M = 0.01
+# Finer pictures are reduced to this resolution (m per pixel), and larger ones to so many pixels, each of which takes
+# half a microsecond: a flat of any size, or a storey of 35 m by 35 m, at the finest resolution.
+FINEST_M, _MOST_PIXELS = 0.01, 12_000_000
 # Warmth of grey pixels.
 COLOURLESS = 128.0
 # Lighting is evened out over this length.
@@ -73,13 +74,13 @@ def read_ink(
 
     Rows of `gray` are from the top, and 255 is white; for `warmth` see `Ink`.
     """
-    if metres_per_pixel < FINEST_M:
-        factor = metres_per_pixel / FINEST_M
+    factor = min(metres_per_pixel / FINEST_M, math.sqrt(_MOST_PIXELS / gray.size), 1.0)
+    if factor < 1.0:
         rows, columns = (max(1, round(size * factor)) for size in gray.shape)
         gray = cv2.resize(gray, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
         if warmth is not None:
             warmth = cv2.resize(warmth, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
-        metres_per_pixel = FINEST_M
+        metres_per_pixel /= factor
     even = _even_light(gray, metres_per_pixel)
     threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     threshold = float(np.clip(threshold, *_THRESHOLD))

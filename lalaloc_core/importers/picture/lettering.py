@@ -29,6 +29,8 @@ _TILE_PX, _OVERLAP_PX = 1280, 256
 _SMALLEST_PX, READ_PX = 1200, 2 * _TILE_PX - _OVERLAP_PX
 # A picture is read as one tile first, and in several if a text is lower than this.
 _LEGIBLE_PX = 18
+# Heights (pixels) of letters in a picture as one tile, and their largest width: letters of a word can touch.
+_LETTER_PX, _WORD_WIDTH = (3, 120), 15
 # Texts are read in batches until this share of the import's time is over.
 _SHARE_OF_TIME, _BATCH = 0.5, 6
 _MIN_SCORE, _MAX_LENGTH, _MAX_TEXTS = 0.7, 200, 400
@@ -90,8 +92,9 @@ def read_texts(
     budget.begin("reading texts")
     try:
         factor, ink = _resized_ink(gray, _TILE_PX, straighten=straighten)
-        boxes = _boxes(ink, builder, budget)
-        is_small = min((_height(box) for _, box in boxes), default=0.0) < _LEGIBLE_PX
+        has_letters = _has_letters(ink)
+        boxes = _boxes(ink, builder, budget) if has_letters else []
+        is_small = has_letters and min((_height(box) for _, box in boxes), default=0.0) < _LEGIBLE_PX
         if max(rows, columns) > _TILE_PX and is_small and _share_of_time(budget) < _SHARE_OF_TIME / 3.0:
             finer_factor, finer = _resized_ink(gray, READ_PX, straighten=straighten)
             if len(found_finer := _boxes(finer, builder, budget)) >= len(boxes):
@@ -125,6 +128,15 @@ def _resized_ink(gray: UInt8[np.ndarray, "h w"], longest_px: int, *, straighten:
     size = (max(1, round(columns * factor)), max(1, round(rows * factor)))
     resized = cv2.resize(gray, size, interpolation=cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC)
     return factor, read_ink(resized.astype(np.uint8), _ASSUMED_M / max(size), straighten=straighten)
+
+
+def _has_letters(ink: Ink) -> bool:
+    """Return whether anything in a picture has the size of letters; looking for texts takes seconds."""
+    _, _, stats, _ = cv2.connectedComponentsWithStats(ink.lines.astype(np.uint8), connectivity=8)
+    width, height = stats[1:, cv2.CC_STAT_WIDTH], stats[1:, cv2.CC_STAT_HEIGHT]
+    # Texts can be upright.
+    short, long = np.minimum(width, height), np.maximum(width, height)
+    return bool(((short >= _LETTER_PX[0]) & (short <= _LETTER_PX[1]) & (long <= _WORD_WIDTH * short)).any())
 
 
 def _height(box: Corners) -> float:

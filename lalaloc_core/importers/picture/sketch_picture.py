@@ -17,7 +17,7 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
-from lalaloc_core.importers.picture.ink import Ink, read_ink
+from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
 from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 
@@ -237,6 +237,10 @@ def _report(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: Repor
     if ink.skew_deg:
         builder.turned_deg = -ink.skew_deg
         builder.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to straighten it")
+    if ink.metres_per_pixel > max(metres_per_pixel, FINEST_M) * 1.001:
+        builder.notes.append(
+            f"the picture is large and was read at {100 * ink.metres_per_pixel:.2g} cm per pixel; crop it to one storey"
+        )
     if metres_per_pixel > _COARSE_M:
         builder.unsure.append(
             f"a pixel is {100 * metres_per_pixel:.1f} cm; above {100 * _COARSE_M:g} cm walls are too thin; "

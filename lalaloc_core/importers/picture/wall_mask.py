@@ -27,8 +27,8 @@ _WIDE_PART = 0.15
 _CUT_CORNER_M, _SQUARE = 0.07, 0.8
 # Strokes of panes are paler than walls (of 255), thinner than walls (share), and long (m).
 _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
-# Separate walls of a picture.
-_MAX_PIECES = 10_000
+# Outlines of walls in a picture, with those of the areas that they enclose.
+_MAX_OUTLINES = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,24 +73,30 @@ def outlined_walls(ink: Ink) -> WallMask | None:
     count, found = cv2.connectedComponents(white, connectivity=4)
     labels = np.asarray(found, dtype=np.int32)
     depth = cv2.distanceTransform(white, cv2.DIST_L2, 5)
-    deepest = np.zeros(count)
-    np.maximum.at(deepest, labels.ravel(), depth.ravel())
-    is_cavity = 2.0 * deepest * ink.metres_per_pixel <= _MAX_CAVITY_M
-    is_cavity |= _is_narrow(labels, depth * ink.metres_per_pixel, count)
+    half_cavity = 0.5 * _MAX_CAVITY_M / ink.metres_per_pixel
+    is_cavity = ~_reaches(labels, depth > half_cavity, count) | _is_narrow(labels, depth, half_cavity, count)
     is_cavity[0] = False
     return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
 
 
-def _is_narrow(labels: Int[np.ndarray, "h w"], depth_m: Float[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
-    """Return the white areas that are as narrow as a wall nearly everywhere, and only slightly wider elsewhere."""
+def _is_narrow(
+    labels: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], reach: float, count: int
+) -> Bool[np.ndarray, "n"]:
+    """Return the white areas that are as narrow as a wall nearly everywhere, and only slightly wider elsewhere.
+
+    `depth` is the distance from the ink, and `reach` half the width of the widest cavity, both in pixels.
+    """
     area = np.bincount(labels.ravel(), minlength=count)
-    reach = 0.5 * _MAX_CAVITY_M
-    middle = labels[depth_m > reach]
-    deepest = np.zeros(count)
-    np.maximum.at(deepest, labels.ravel(), depth_m.ravel())
     # A wide part covers more pixels than the centres of its discs.
-    wide = 3.0 * np.bincount(middle, minlength=count)
-    return (wide <= _WIDE_PART * area) & (deepest <= 1.5 * reach)
+    wide = 3.0 * np.bincount(labels[depth > reach], minlength=count)
+    return (wide <= _WIDE_PART * area) & ~_reaches(labels, depth > 1.5 * reach, count)
+
+
+def _reaches(labels: Int[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
+    """Return whether each labelled area has one of some pixels; a maximum per label takes ten times as long."""
+    found = np.zeros(count, bool)
+    found[labels[where]] = True
+    return found
 
 
 def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
@@ -122,11 +128,9 @@ def _without_furniture(
     count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     labels = np.asarray(found, dtype=np.int32)
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-    deepest = np.zeros(count)
-    np.maximum.at(deepest, labels.ravel(), depth.ravel())
     is_large = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * metres_per_pixel >= _SMALL_M
-    thick = 2.0 * deepest - 1.0
-    keep = is_large | ((thick >= thickness_range[0] * thickness) & (thick <= thickness_range[1] * thickness))
+    thinnest, thickest = (0.5 * (share * thickness + 1.0) for share in thickness_range)
+    keep = is_large | (_reaches(labels, depth >= thinnest, count) & ~_reaches(labels, depth > thickest, count))
     keep[0] = False
     return keep[labels]
 
@@ -135,17 +139,16 @@ def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> 
     """Return walls as straightened polygons in plan metres.
 
     Raises:
-        InvalidFloorPlanError: there are too many, or the time is over.
+        InvalidFloorPlanError: they have too many outlines, or the time is over.
     """
     contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
         return []
     straight = max(_STRAIGHT_PX * ink.metres_per_pixel, _STRAIGHT_M)
-    pieces = int((hierarchy.reshape(-1, 4)[:, 3] < 0).sum())
-    if pieces > _MAX_PIECES:
+    if len(contours) > _MAX_OUTLINES:
         raise InvalidFloorPlanError(
-            f"the picture has {pieces} separate dark areas as thick as walls; the limit is {_MAX_PIECES}; check the "
-            "scale, and remove noise, hatches and patterns"
+            f"the dark areas as thick as walls in the picture have {len(contours)} outlines; the limit is "
+            f"{_MAX_OUTLINES}; check the scale, and remove noise, hatches and patterns"
         )
     holes: dict[int, list[np.ndarray]] = {}
     for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
