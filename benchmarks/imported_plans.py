@@ -22,13 +22,13 @@ from benchmarks.opening_trust import query_of
 from benchmarks.plan_drawing import HOME, Model, model_of
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.plans import TEST, generate_home
 from lalaloc_core.learn.synth.scene.shots import sample_shots
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import Query
 
 _NEAR_M, _IOU = 1.0, 0.9

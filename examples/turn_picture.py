@@ -17,9 +17,9 @@ from examples.truth import FOLDER, PLAN_PATH
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.draw.answer import draw_answer, drawn_answer
 from lalaloc_core.draw.canvas import MUTED, document, image, jpeg, pixels, words
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import stated_height
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel
 from lalaloc_core.evaluate.methods.method import Pose, PredictedCandidate
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, score_galleries
 from lalaloc_core.evaluate.runs.predictions import Prediction
@@ -20,6 +19,7 @@ from lalaloc_core.learn.data.synthetic.hand_held import encode_film, exposed, tu
 from lalaloc_core.learn.data.synthetic.turned import Phone
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn

@@ -25,7 +25,7 @@ from lalaloc_core.bundle import Bundle, write_manifest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.calibrate.parameter_fits import Answers, cross_validate, fit_confidence
-from lalaloc_core.evaluate.methods.lalaloc import LocalModel, found_pose
+from lalaloc_core.evaluate.methods.lalaloc import found_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import position_errors_m
@@ -39,6 +39,7 @@ from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, localise
