@@ -136,6 +136,27 @@ def test_scanned_map_becomes_rooms():
     assert passage.centroid.coords[0] == pytest.approx((1.02, 4.55), abs=0.1)
 
 
+def test_furniture_in_a_map_is_no_wall_and_is_named():
+    bare, cells = _scanned(), _scanned()
+    # Outlines of tables of 1.2 m x 0.7 m and 2.2 m x 0.9 m, one of them beside the door.
+    for top, left, height, width in ((40, 60, 14, 17), (20, 100, 18, 44), (70, 30, 14, 24)):
+        cells[top : top + height, left : left + width] = 0
+        cells[top + 1 : top + height - 1, left + 1 : left + width - 1] = 205
+    plan, expected = import_plan(_map(cells)), import_plan(_map(bare))
+    _assert_same_rooms(plan.document, shapes(expected.document), 0.1)
+    assert len(lines(plan.document, "passage")) == 1
+    (told,) = (text for text in plan.report.unsure if "furniture" in text)
+    assert told.startswith("3 occupied areas")
+    assert "(6.1, 3.6)" in told
+    assert not any("furniture" in text for text in expected.report.unsure)
+
+
+def test_free_standing_wall_is_no_furniture():
+    cells = _scanned()
+    cells[50, 25:60] = 0
+    assert not any("furniture" in text for text in import_plan(_map(cells)).report.unsure)
+
+
 def test_unknown_areas_are_no_rooms():
     cells = _scanned()
     cells[11:90, 81:150] = 205

@@ -14,6 +14,7 @@ from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.drawing.enclosed_rooms import explained_size
 from lalaloc_core.importers.picture.ink import find_skew, rotate_picture
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
@@ -23,6 +24,9 @@ _FINE_M = 0.0125
 _FREE_SHARE = 0.5
 # Smaller groups of occupied cells (m) are legs of furniture and noise.
 _SPECK_M = 0.6
+# Longest and shortest side of a piece of furniture (m), pieces that are named, and share of the time after which the
+# walls are not read again without furniture.
+_LARGEST_PIECE_M, _THINNEST_PIECE_M, _MAX_NAMED, _SHARE_OF_TIME = 2.6, 0.35, 8, 0.3
 # Largest turn that aligns the walls with the picture, and the threshold of half a cell.
 _MAX_TURN_DEG, _HALF = 45.0, 127
 # Share of a room's outline that has a seen wall within so many cells, if unknown cells close the rest; rooms that
@@ -52,6 +56,19 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     if not cells.any():
         return Sketch()
     sketch, report = _read_walls(cells, grid, budget)
+    furniture, places = _furniture(cells, grid.frame)
+    if places and budget.elapsed_s < _SHARE_OF_TIME * budget.limits.max_import_s:
+        cleared, cleared_report = _read_walls(cells & ~furniture, grid, budget)
+        # A piece of a wall between two doors can look like furniture.
+        if _explained(cleared) >= _explained(sketch):
+            cells, sketch, report = cells & ~furniture, cleared, cleared_report
+            named = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in places[:_MAX_NAMED])
+            area_m2 = float(furniture.sum()) * grid.frame.resolution_m**2
+            named = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in places[:_MAX_NAMED])
+            builder.unsure.append(
+                f"{len(places)} occupied areas that touch no wall, {area_m2:.1f} m² of cells, are taken for furniture: "
+                f"{named}; draw them as holes of their rooms if they are columns"
+            )
     beside_free = cv2.dilate(grid.free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     unseen = _without_specks(beside_free & ~grid.free & ~grid.occupied, grid.frame)
     if unseen.any():
@@ -125,6 +142,33 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
         start, end = to_map(np.array([opening.start, opening.end]))
         openings.append(SketchedOpening(opening.kind, point_xy(start), point_xy(end)))
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
+
+
+def _explained(sketch: Sketch) -> float:
+    return explained_size([room.shape for room in sketch.rooms])
+
+
+def _furniture(
+    cells: UInt8[np.ndarray, "h w"], frame: MapFrame
+) -> tuple[UInt8[np.ndarray, "h w"], list[tuple[float, float]]]:
+    """Return the groups of cells (1) of the size of furniture that touch no wall, and their middles in the map frame.
+
+    Thinner ones are free-standing walls.
+    """
+    count, labels, stats, centres = cv2.connectedComponentsWithStats(cells, connectivity=8)
+    found, places = np.zeros_like(cells), []
+    for index in range(1, count):
+        left, top, width, height = stats[index, : cv2.CC_STAT_AREA]
+        if max(width, height) * frame.resolution_m > _LARGEST_PIECE_M:
+            continue
+        part = labels[top : top + height, left : left + width] == index
+        _, size, _ = cv2.minAreaRect(np.argwhere(part).astype(np.float32))
+        if (min(size) + 1.0) * frame.resolution_m >= _THINNEST_PIECE_M:
+            found[top : top + height, left : left + width][part] = 1
+            x, row = centres[index]
+            middle = np.array([[x + 0.5, frame.size[0] - row - 0.5]]) * frame.resolution_m
+            places.append(point_xy(frame.to_map(middle)[0]))
+    return found, places
 
 
 class _Distance:
