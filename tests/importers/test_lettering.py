@@ -155,6 +155,16 @@ def test_printed_names_and_dimensions_of_a_picture_are_read(px_per_m: float, tex
     check_flat(import_plan(PrintedPlan(px_per_m, text_px).file(), limits=LIMITS), px_per_m)
 
 
+def test_straight_scan_with_noise_and_shadow_is_read():
+    page = PrintedPlan(40.0, 13)
+    grey = np.asarray(page.picture, dtype=float)
+    rows, columns = grey.shape
+    shadow = 1.0 - 0.4 * (np.linspace(0.0, 1.0, rows)[:, None] + np.linspace(0.0, 1.0, columns))
+    noise = np.random.default_rng(0).normal(0.0, 5.0, grey.shape)
+    page.picture = Image.fromarray(np.clip((20.0 + 0.9 * grey) * shadow + noise, 0, 255).astype(np.uint8))
+    check_flat(import_plan(page.file(), limits=LIMITS), page.px_per_m)
+
+
 @pytest.mark.slow
 def test_printed_names_and_dimensions_of_a_scan_are_read():
     page = PrintedPlan()
