@@ -12,6 +12,7 @@ on the other load of the machine, so that CPU seconds are printed beside them.
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import subprocess
@@ -87,10 +88,9 @@ def _service(data: Path, files: list[Path], plans: int) -> tuple[object, ...]:
         album = f"/albums/{client.post('/albums', json=place).raise_for_status().json()['id']}"
         before_s, begin_s = harness.cpu_s(service.process), time.monotonic()
         with harness.MemoryWatch(service.process) as memory:
-            for portion in _portions(files):
-                parts = [("photo", (path.name, path.read_bytes(), "image/jpeg")) for path in portion]
-                lines = client.post(f"{album}/photographs", files=parts).raise_for_status().text.splitlines()
-                assert len(lines) == len(portion)
+            left = files
+            while left:
+                left = [path for portion in _portions(left) for path in _send(client, album, portion)]
             read_s = time.monotonic() - begin_s
             _wait(client, album)
             pinned_s, spent_s = time.monotonic() - begin_s, harness.cpu_s(service.process) - before_s
@@ -102,6 +102,19 @@ def _service(data: Path, files: list[Path], plans: int) -> tuple[object, ...]:
         corrected_s = time.monotonic() - begin_s
     counts = solved["solution"]["pins"] if solved["solution"] else {solved["reason"]: solved["photographs"]}
     return (*_seconds(read_s, pinned_s, corrected_s, spent_s), f"{memory.highest:.0f}", _words(counts))
+
+
+def _send(client: httpx.Client, album: str, files: list[Path]) -> list[Path]:
+    """Add photographs; return those that the service is too busy for, to be sent again."""
+    parts = [("photo", (path.name, path.read_bytes(), "image/jpeg")) for path in files]
+    answer = client.post(f"{album}/photographs", files=parts).raise_for_status()
+    lines = [json.loads(line) for line in answer.text.splitlines()]
+    refused = [line["problem"] for line in lines if line["status"] >= 400 and line["status"] not in (503, 504)]
+    assert not refused, refused[0]
+    busy = [files[line["index"]] for line in lines if line["status"] >= 400]
+    if busy:
+        print(f"busy: {len(busy)} photographs are sent again", file=sys.stderr)
+    return busy
 
 
 def _command(data: Path, files: list[Path], _plans: int) -> tuple[object, ...]:

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 from playwright.sync_api import expect, sync_playwright
 
 from examples.launch import ROOT, running_service
@@ -26,7 +26,8 @@ from lalaloc_core.photograph.cameras import Perspective
 
 _ROOMS = ("living_room", "kitchen", "bedroom", "study")
 _AZIMUTHS_DEG, _PITCH = (-100.0, 20.0, 140.0), math.radians(-3.0)
-_CAMERA = Perspective.of_hfov(800, 600, math.radians(74.0))
+_CAMERA = Perspective.of_hfov(800, 600, math.radians(90.0))
+_FOCAL_LENGTH_35MM, _TAKEN = 0xA405, 0x9003
 _WIDTH, _HEIGHT = 1280, 860
 _WAIT_MS = 180_000.0
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -67,7 +68,10 @@ def _photographs(folder: Path) -> list[Path]:
         for azimuth_deg in _AZIMUTHS_DEG:
             view = cut_view(sphere, _CAMERA, azimuth=math.radians(azimuth_deg), pitch=_PITCH, roll=0.0)
             paths.append(folder / f"IMG_{len(paths) + 2041}.jpg")
-            Image.fromarray(view).save(paths[-1], quality=92)
+            exif = Image.Exif()
+            tags = {_FOCAL_LENGTH_35MM: 18, _TAKEN: f"2026:05:01 10:{len(paths):02}:00"}
+            exif.get_ifd(ExifTags.IFD.Exif).update(tags)
+            Image.fromarray(view).save(paths[-1], quality=92, exif=exif)
     return paths
 
 

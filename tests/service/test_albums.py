@@ -409,6 +409,26 @@ def test_albums_of_another_tenant_do_not_exist(
         store.close()
 
 
+def test_photographs_count_against_the_storage_quota(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+) -> None:
+    with start_app(tmp_path) as client:
+        store = Store(database_of(tmp_path))
+        album_id = create(client, upload(client))
+        (first,) = add(client, album_id, pictures[:1])
+        used = client.get("/usage").json()["stored_bytes"]["used"]
+        store.tenants.change_limits("default", stored_bytes=used + 3000)
+        wait_for(lambda: client.get("/usage").json()["stored_bytes"]["limit"] == used + 3000)
+        kept, refused = add(client, album_id, pictures[:2])
+        assert (kept["status"], refused["status"]) == (200, 507)
+        assert refused["problem"]["type"] == "urn:lalaloc:problem:storage-quota"
+        assert client.get("/usage").json()["stored_bytes"]["used"] == used
+        # A deleted photograph makes room for another one.
+        assert client.delete(f"/albums/{album_id}/photographs/{first['photograph']['id']}").status_code == 204
+        assert [line["status"] for line in add(client, album_id, pictures[1:2])] == [201]
+        store.close()
+
+
 def test_album_goes_with_its_plan_and_expires(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
 ) -> None:

@@ -57,7 +57,7 @@ class PinPage {
     this.svg.append(this.base, this.names, this.pins);
     this.choice.addEventListener("change", () => void this.guarded(() => this.choose(this.choice.value)));
     this.levels.addEventListener("change", () => void this.guarded(() => this.showPlan(this.levels.value)));
-    this.onFiles("plan-file", async ([file]) => this.take(await api.uploadPlan(file!)));
+    this.onFiles("plan-file", ([file]) => this.upload(file!));
     for (const id of ["photo-files", "photo-folder"]) this.onFiles(id, (files) => this.add(files));
     acceptDrops(byId("folder"), (files) => void this.guarded(() => this.addAny(files)));
     acceptDrops(byId("place"), (files) => void this.guarded(() => this.addAny(files, files.length === 1)));
@@ -129,6 +129,13 @@ class PinPage {
     await this.reset(venue.name, first);
   }
 
+  private async upload(file: File): Promise<void> {
+    const plan = await api.uploadPlan(file);
+    this.choice.prepend(h("option", { value: `plan:${plan.id}` }, plan.name));
+    this.choice.selectedIndex = 0;
+    await this.take(plan);
+  }
+
   private async take(plan: Plan): Promise<void> {
     await this.floors.takePlan(plan);
     await this.reset(plan.name, plan.id);
@@ -176,7 +183,7 @@ class PinPage {
   private async addAny(files: File[], isPlan = false): Promise<void> {
     const plans = isPlan ? files : files.filter((file) => !isPicture(file));
     const pictures = files.filter((file) => !plans.includes(file));
-    if (plans.length === 1) await this.take(await api.uploadPlan(plans[0]!));
+    if (plans.length === 1) await this.upload(plans[0]!);
     if (pictures.length > 0 || plans.length > 1) await this.add([...pictures, ...(plans.length > 1 ? plans : [])]);
   }
 
