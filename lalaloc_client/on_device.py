@@ -167,12 +167,12 @@ class OnDeviceModel:
 
     def _film(self, content: bytes, options: Mapping[str, Any]) -> TurnFeatures:
         from lalaloc_core.localise.encode.photograph_encoder import patch_size
-        from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
         from lalaloc_core.photograph.film import read_film
+        from lalaloc_core.photograph.turned import stated_headings
 
         assert self._encoder is not None
         film = read_film(content, stated=_stated_camera(options), patch_size=patch_size(self._bundle.manifest))
-        headings_deg, std_deg = LinkedTurn.of(film.angles).stated
+        headings_deg, std_deg = stated_headings(film.angles)
         return TurnFeatures(
             [self._encoder.features(photograph) for photograph in film.photographs],
             headings_deg,
@@ -191,9 +191,8 @@ class OnDeviceModel:
     def _photographs(self, photographs: Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
         from lalaloc_core.localise.encode.features import is_features
         from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
-        from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
         from lalaloc_core.photograph import open_photograph
-        from lalaloc_core.photograph.turned import open_turn
+        from lalaloc_core.photograph.turned import open_turn, stated_headings
 
         assert self._encoder is not None
         contents, stated = [picture_file(photograph) for photograph in photographs], _stated_camera(options)
@@ -208,7 +207,7 @@ class OnDeviceModel:
         if not all(map(overlaps, contents)):
             return TurnFeatures([self.features(content, options) for content in contents])
         opened, angles = open_turn(contents, stated, sphere_size=sphere, patch_size=patch)
-        return TurnFeatures([self._encoder.features(view) for view in opened], *LinkedTurn.of(angles).stated)
+        return TurnFeatures([self._encoder.features(view) for view in opened], *stated_headings(angles))
 
 
 def filmed(answer: SequenceLocalisation, sent: TurnFeatures) -> SequenceLocalisation:

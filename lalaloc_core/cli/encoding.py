@@ -93,6 +93,7 @@ def _encode_turn(
 ) -> None:
     """Write the features of a turn, and the angles between them, which features cannot tell."""
     from lalaloc_core.cli.turning import read_turn
+    from lalaloc_core.photograph.turned import stated_headings
 
     turn = read_turn(arguments.turn, manifest, stated)
     for warning in turn.warnings:
@@ -104,7 +105,7 @@ def _encode_turn(
         raise InvalidInputError(f"'{out}' cannot be made: {error.strerror}") from error
     for index, photograph in enumerate(turn.photographs):
         _write(out / f"{index:02}.features", encoder.features(photograph))
-    headings_deg, std_deg = turn.linked.stated
+    headings_deg, std_deg = stated_headings(turn.linked.angles)
     fields = {"motion": "turn", "relative_heading_deg": headings_deg, "relative_heading_std_deg": std_deg}
     _write(out / "turn.json", json.dumps(fields, indent=1).encode())
 

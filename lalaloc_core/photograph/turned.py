@@ -19,6 +19,8 @@ from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView, angles_of_
 
 # Largest relative standard deviation of the focal length by several photographs' lines: their errors are alike.
 _LINES_FOCAL_SD = 0.03
+# Least standard deviation (degrees) of relative headings that are stated.
+_LEAST_STD_DEG = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,16 @@ def open_turn(
         if turned.stated is not None:
             photographs[index] = turned.applied(read(contents[index], stated=turned.stated))
     return photographs, angles
+
+
+def stated_headings(angles: Sequence[TurnAngles]) -> tuple[list[float | None], float]:
+    """Return what to state beside features of photographs: their relative headings and the deviation (degrees).
+
+    Headings of photographs that do not overlap with the first are unknown.
+    """
+    std_deg = max(math.degrees(angle.heading_sd) for angle in angles if not angle.group)
+    headings = [None if angle.group else round(math.degrees(angle.heading), 2) for angle in angles]
+    return headings, round(max(std_deg, _LEAST_STD_DEG), 2)
 
 
 def turn_views(photographs: Sequence[Photograph]) -> list[TurnView]:

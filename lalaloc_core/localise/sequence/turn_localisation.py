@@ -19,8 +19,6 @@ from lalaloc_core.photograph.turn_angles import TurnAngles
 ON_THE_SPOT = Motion(distance_m=0.0, distance_std_m=0.15)
 # Standard deviation up to which relative headings are exact: the networks predict by columns of 2.8°.
 EXACT = math.radians(5.0)
-# Least standard deviation (degrees) of relative headings that are stated.
-_LEAST_STD_DEG = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,19 +44,6 @@ class LinkedTurn:
         if any(angle.group or angle.heading_sd > EXACT for angle in self.angles):
             return None
         return [angle.heading for angle in self.angles]
-
-    @property
-    def stated(self) -> tuple[list[float | None], float]:
-        """Return what to state beside features of the photographs: relative headings and their deviation (degrees).
-
-        Those to photographs that do not overlap with the first are unknown.
-        """
-        known = [angle for angle in self.angles if not angle.group]
-        std_deg = max(math.degrees(angle.heading_sd) for angle in known)
-        return (
-            [None if angle.group else round(math.degrees(angle.heading), 2) for angle in self.angles],
-            round(max(std_deg, _LEAST_STD_DEG), 2),
-        )
 
     @property
     def motions(self) -> list[Motion]:
