@@ -149,38 +149,6 @@ def test_only_features_leave_a_phone_with_the_box_ticked(camera: Browser, servic
     assert b"\xff\xd8\xff" not in sent
 
 
-_ASKED = """
-globalThis.asked = [];
-DeviceOrientationEvent.requestPermission = async () => {
-  asked.push(navigator.userActivation.isActive);
-  if (asked.length === 1) throw new DOMException("", "NotAllowedError");
-  return "granted";
-};
-"""
-
-
-def test_gyroscope_is_asked_for_again_after_a_refusal(phone: Visit) -> None:
-    # As Safari on iOS asks, within the click.
-    phone.page.add_init_script(_ASKED)
-    page = _open(phone)
-    find = page.locator("#look-dialog .primary")
-    # Without it, the picture tells how far the camera has turned.
-    expect(find).to_have_text(re.compile("\\(2 photo"))
-    page.keyboard.press("Escape")
-    protocol = page.context.new_cdp_session(page)
-    page.get_by_role("button", name="Look around").click()
-    # The page waits for it; an angle that does not change is not told again.
-    _hold(protocol, 1.0)
-    expect(find).to_have_text(re.compile("\\(1 photo"))
-    _hold(protocol, 335.0)
-    expect(find).to_have_text(re.compile("\\(2 photo"))
-    with page.expect_response("**/localise/sequence", timeout=120_000) as answered:
-        find.click()
-    angles = [pose["view"]["relative_heading"]["source"] for pose in answered.value.json()["poses"]]
-    assert angles == ["given", "given"]
-    assert page.evaluate("asked") == [True, True]
-
-
 def test_hints_for_walking_and_for_the_dark(phone: Visit) -> None:
     page = _open(phone)
     protocol, hint = page.context.new_cdp_session(page), page.locator("#look-hint")
