@@ -38,6 +38,7 @@ class LocaliseNode(Node):
         self.mount = FloorTransform(values["camera_forward_m"], values["camera_left_m"], values["camera_yaw"])
         self.client = Client(values["url"], api_key=values["key"] or None)
         self.tracker = self.client.track(values["plan"], camera_height_m=values["camera_height_m"])
+        self.tracker.begin()
         self.odometry: FloorTransform | None = None
         self.at_photograph: FloorTransform | None = None
         self.poses = self.create_publisher(PoseWithCovarianceStamped, "lalaloc/pose", 10)
@@ -95,7 +96,7 @@ def main() -> None:
     try:
         rclpy.spin(node)
     finally:
-        node.tracker.close()
+        node.tracker.end()
         node.client.close()
         rclpy.shutdown()
 

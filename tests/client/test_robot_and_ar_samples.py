@@ -103,7 +103,7 @@ def test_node_publishes_pose_and_map_to_odom(
             node.on_odometry(odometry)
             node.on_photograph(photograph)
         session = app.get("/sessions/" + node.tracker.session.id).json()
-        node.tracker.close()
+        node.tracker.end()
         node.client.close()
     assert session["photographs"] == 2
     pose = session["pose"]
