@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import dataclasses
 import json
 import logging
 import os
@@ -33,7 +34,10 @@ _INSTRUCTIONS = (
 _DATA, _BASE64, _BEARER = "data:", ";base64,", "Bearer "
 # Base64 of the service's largest files, in a request to this server.
 _MAX_BODY_BYTES = 2**28
-_MAX_PHOTOGRAPHS, _MAX_LISTED = 64, 100
+_MAX_PHOTOGRAPHS, _MAX_LISTED, _MAX_PINNED = 64, 100, 500
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp"})
+# Photographs of one upload to an album, whose bytes a service limits together, and the longest wait for its solution.
+_UPLOADED_TOGETHER, _SOLVE_S = 8, 300.0
 # Films are read and plans with many rooms prepared within this.
 _TIMEOUT_S = 120.0
 
@@ -60,7 +64,14 @@ def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool)
     http_options(base_url, api_key, _TIMEOUT_S)
     tools = _Tools(base_url, api_key, reads_paths=reads_paths)
     server: MCPServer[Any] = MCPServer("lalaloc", instructions=_INSTRUCTIONS)
-    for tool in (tools.import_plan, tools.list_plans, tools.localise_photograph, tools.localise_turn, tools.next_step):
+    for tool in (
+        tools.import_plan,
+        tools.list_plans,
+        tools.localise_photograph,
+        tools.localise_turn,
+        tools.pin_folder,
+        tools.next_step,
+    ):
         server.add_tool(tool)
     return server
 
@@ -178,6 +189,65 @@ class _Tools:
             else:
                 found = await service.query(film_request, path, self._file(film), values, options)
             return found.decode()
+
+    async def pin_folder(
+        self,
+        context: Context[Any, Any],
+        folder: Annotated[str | None, Field(description="Path of a folder of photographs on this machine.")] = None,
+        photographs: Annotated[list[File] | None, Field(description="The photographs instead, each as a file.")] = None,
+        floorplan_id: PlanId = None,
+        venue_id: VenueId = None,
+        hfov_deg: FieldOfView = None,
+        camera_height_m: CameraHeight = None,
+    ) -> list[str | Image]:
+        """Pin up to 500 photographs of one visit to a plan together: the room of each, its place and an arrow.
+
+        Returns the state of each (sure, uncertain, set_aside) with reasons and suggestions, the photographs that were
+        refused, the id of the stored album, and for one plan a drawing of it (SVG).
+        """
+        files = self._folder(folder, photographs)
+        _place(floorplan_id, venue_id)
+        view = ViewOptions(hfov_deg=hfov_deg)
+        async with self._service(context) as service:
+            album = await service.create_album(floorplan_id, venue_id=venue_id, camera_height_m=camera_height_m, **view)
+            refused = [
+                {"photograph": line.name or first + line.index + 1, "problem": line.problem}
+                for first in range(0, len(files), _UPLOADED_TOGETHER)
+                async for line in service.add_to_album(album.id, files[first : first + _UPLOADED_TOGETHER])
+                if line.problem is not None
+            ]
+            solved = await service.wait_until_solved(album.id, _SOLVE_S)
+            pins = [
+                {"photograph": row.name or row.number, **dataclasses.asdict(row.pin)}
+                async for row in service.album_photographs(album.id)
+                if row.pin is not None
+            ]
+            told = {"album_id": album.id, "solution": solved.solution, "pins": pins, "refused": refused}
+            answer: list[str | Image] = [_text(told)]
+            if floorplan_id is not None and pins:
+                answer.append((await service.album_file(album.id, "svg")).decode())
+            return answer
+
+    def _folder(self, folder: str | None, photographs: list[str] | None) -> list[bytes | Path]:
+        """Return the photographs of a folder by name, or those that are given.
+
+        Raises:
+            ToolError: both or none are given, none or too many are found, or the folder is not read.
+        """
+        if (folder is None) == (photographs is None):
+            raise ToolError("give either folder or photographs")
+        if folder is None:
+            files = [self._file(photograph) for photograph in photographs or []]
+        else:
+            if not self._reads_paths:
+                raise ToolError("this server reads no folders of its machine; send the photographs as data URLs")
+            path = Path(os.path.expanduser(folder))
+            if not path.is_dir():
+                raise ToolError(f"there is no folder '{folder}'; give the full path")
+            files = sorted(entry for entry in path.iterdir() if entry.suffix.lower() in _SUFFIXES)
+        if not 1 <= len(files) <= _MAX_PINNED:
+            raise ToolError(f"{len(files)} photographs are given; an album has 1 to {_MAX_PINNED}")
+        return [*files]
 
     async def next_step(
         self,

@@ -73,7 +73,8 @@ def _said(result: Any) -> Any:
 def test_plan_is_imported_and_photographs_are_localised(app: httpx.Client, flat: Path, photograph: Path) -> None:
     async def talk(client: Any) -> None:
         tools = {tool.name: tool for tool in (await client.list_tools()).tools}
-        assert set(tools) == {"import_plan", "list_plans", "localise_photograph", "localise_turn", "next_step"}
+        names = {"import_plan", "list_plans", "localise_photograph", "localise_turn", "pin_folder", "next_step"}
+        assert set(tools) == names
         assert all(tool.description for tool in tools.values())
         plan = _said(await client.call_tool("import_plan", {"plan": str(flat)}))
         assert (plan["status"], [room["name"] for room in plan["rooms"]]) == (
@@ -106,6 +107,28 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
     _over_stdio(str(app.base_url), talk)
 
 
+def test_folder_is_pinned(app: httpx.Client, flat: Path, tmp_path: Path, panorama: bytes) -> None:
+    folder = tmp_path / "visit"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes(panorama)
+    (folder / "b.png").write_bytes(encode_picture(256, 128, "PNG"))
+    (folder / "c.jpg").write_bytes(b"no photograph")
+    (folder / "notes.txt").write_text("left out")
+
+    async def talk(client: Any) -> None:
+        plan = _said(await client.call_tool("import_plan", {"plan": str(flat)}))
+        found = await client.call_tool("pin_folder", {"folder": str(folder), "floorplan_id": plan["id"]})
+        told = _said(found)
+        assert [pin["photograph"] for pin in told["pins"]] == ["a.jpg", "b.png"]
+        assert {pin["state"] for pin in told["pins"]} <= {"sure", "uncertain", "set_aside"}
+        assert [refused["photograph"] for refused in told["refused"]] == ["c.jpg"]
+        assert _texts(found)[1].startswith("<svg")
+        listed = app.get(f"/albums/{told['album_id']}/photographs").json()["photographs"]
+        assert [row["name"] for row in listed] == ["a.jpg", "b.png"]
+
+    _over_stdio(str(app.base_url), talk)
+
+
 @pytest.mark.parametrize(
     ("tool", "arguments", "remedy"),
     [
@@ -117,6 +140,9 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
         ("import_plan", {"plan": "data:text/plain;base64,aGVsbG8="}, "plan"),
         ("localise_turn", {"floorplan_id": "x"}, "either photographs or film"),
         ("localise_turn", {"floorplan_id": "x", "photographs": [_JPEG + "aGVsbG8="]}, "2 to 64"),
+        ("pin_folder", {"floorplan_id": "x"}, "either folder or photographs"),
+        ("pin_folder", {"floorplan_id": "x", "folder": "/missing"}, "no folder '/missing'"),
+        ("pin_folder", {"floorplan_id": "x", "photographs": []}, "1 to 500"),
         ("localise_turn", {"floorplan_id": "x", "film": _JPEG + "aGVsbG8="}, ""),
     ],
 )
