@@ -6,6 +6,9 @@ computed is in `lalaloc_client.planar`, which needs no ROS. Needs rclpy, tf2_ros
     python3 localise_node.py --ros-args -p url:=http://127.0.0.1:8000 -p plan:=ID -p camera_forward_m:=0.2
 """
 
+# ROS's packages come with ROS.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import rclpy

@@ -19,6 +19,7 @@ import pytest
 from mcp.client.stdio import StdioServerParameters
 from mcp.client.streamable_http import streamable_http_client
 
+from lalaloc_core.bundle import default_bundle
 from service.storage import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, encode_picture, wait_for
 from tests.service.test_security import bearer, make_key
@@ -107,7 +108,7 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
     _over_stdio(str(app.base_url), talk)
 
 
-def test_folder_is_pinned(app: httpx.Client, flat: Path, tmp_path: Path, panorama: bytes) -> None:
+def test_folder_is_pinned(start_app: StartApp, flat: Path, tmp_path: Path, panorama: bytes) -> None:
     folder = tmp_path / "visit"
     folder.mkdir()
     (folder / "a.jpg").write_bytes(panorama)
@@ -126,7 +127,9 @@ def test_folder_is_pinned(app: httpx.Client, flat: Path, tmp_path: Path, panoram
         listed = app.get(f"/albums/{told['album_id']}/photographs").json()["photographs"]
         assert [row["name"] for row in listed] == ["a.jpg", "b.png"]
 
-    _over_stdio(str(app.base_url), talk)
+    # Albums need the fitted weights of the shipped model.
+    with start_app(tmp_path / "data", bundle=default_bundle()) as app:
+        _over_stdio(str(app.base_url), talk)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
@@ -128,7 +129,7 @@ def test_unity_sample_agrees_with_the_client(tmp_path: Path) -> None:
     cameras = [world @ np.array(camera_matrix(pose, "unity")) @ tilted(0.3) for pose in POSES]
     expected = np.array(align(POSES, [rows_of(c) for c in cameras], "unity", camera_height_m=1.5).world_from_plan)
 
-    def items(rows: list[dict[str, float]], kind: str) -> str:
+    def items(rows: Sequence[Mapping[Any, float]], kind: str) -> str:
         fields = [", ".join(f"{name} = {value!r}" for name, value in row.items()) for row in rows]
         return ", ".join(f"new {kind} {{ {row} }}" for row in fields)
 
