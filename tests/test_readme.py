@@ -23,7 +23,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import read_annotation
 from scripts.write_docs import documents
 from service.schemas import GeoPose, LocaliseAnswer
-from service.schemas.oscp import OscpAnswer
+from service.schemas.oscp import OscpAnswer, OscpGeoPose
 from service.schemas.plan_import import ImportReport
 
 ROOT = Path(__file__).parents[1]
@@ -101,6 +101,8 @@ def test_json_examples_are_valid(tmp_path: Path) -> None:
             ImportReport.model_validate(document["import_report"])
         elif "angles" in document:
             GeoPose.model_validate(document)
+        elif "quaternion" in document:
+            OscpGeoPose.model_validate(document)
         elif "lalaloc" in document:
             OscpAnswer.model_validate(document)
         elif "position" in document and "lat" not in document["position"]:

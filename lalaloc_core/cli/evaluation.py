@@ -219,7 +219,7 @@ def _print_scores(report: dict[str, Any]) -> None:
     print(f"{report['label']}, {report['dataset']}: {report['n']} queries, {report['unanswered']} unanswered{skipped}")
     stages = {**report["stages"], "answer": report["final"]}
     print_table(
-        ("stage", "median cm", "< 1 cm", "< 10 cm", "< 1 m", "room", "heading < 2°", "median ms"),
+        ("stage", "median cm", "< 10 cm", "< 50 cm", "< 1 m", "< 1 m, 30°", "room", "heading < 2°", "median ms"),
         [
             (
                 name,

@@ -330,7 +330,8 @@ def test_small_file_takes_little_time(plan: HostilePlan):
     begin_s = time.process_time()
     with suppress(InvalidFloorPlanError):
         import_plans(content, plan.options)
-    assert time.process_time() - begin_s < (40.0 if plan.format in _DRAWN or "mega" in plan.title else 3.0)
+    # Of processor time, for any machine: without their limits such files took minutes.
+    assert time.process_time() - begin_s < (60.0 if plan.format in _DRAWN or "mega" in plan.title else 20.0)
 
 
 def test_outline_that_crosses_itself_is_refused_before_it_is_repaired(monkeypatch: pytest.MonkeyPatch):
