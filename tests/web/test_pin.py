@@ -144,14 +144,15 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     assert moved is not None
     assert moved["x"] == pytest.approx(circle["x"] + 40, abs=6)
     expect(pin.locator(".arrow")).to_have_attribute("transform", turned)
-    # Outside of all rooms the pin goes back.
-    place = pin.get_attribute("transform") or ""
+    # Outside of all rooms the pin goes back. The service rounds places, before or after the page is asked.
+    place = re.sub(r"(\.\d)\d*", r"\1", pin.get_attribute("transform") or "")
+    decimals = re.escape(place).replace(r"\ ", r"\d* ").replace(r"\)", r"\d*\)")
     page.mouse.move(centre[0] + 40, centre[1] + 20)
     page.mouse.down()
     page.mouse.move(5, 5, steps=4)
     page.mouse.up()
     expect(page.locator("#pin-error")).to_contain_text("lies in no room")
-    expect(pin).to_have_attribute("transform", place)
+    expect(pin).to_have_attribute("transform", re.compile(f"^{decimals}$"))
 
 
 def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
