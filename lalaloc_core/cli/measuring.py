@@ -49,7 +49,7 @@ def add_commands(commands: Any) -> None:
         "--annotated",
         type=Path,
         metavar="DIR",
-        help="folder of annotated photographs, for albums and films of real rooms",
+        help="folder of annotated photographs, for albums, bounds and films of real rooms",
     )
     bench.add_argument("--only", choices=_GROUPS, action="append", help="one group of figures; repeat for more")
     bench.add_argument(

@@ -34,7 +34,7 @@ def run_bench(
     """Measure groups of figures with one bundle.
 
     `homes` is the number of test homes, `textures` the folder of textures for the renderer, and `annotated` one of
-    annotated photographs, for albums and films.
+    annotated photographs, for albums, bounds and films.
     """
     bundle = Bundle.open(bundle_folder)
     measure: Mapping[str, Callable[[], dict[str, Any]]] = {
@@ -44,7 +44,7 @@ def run_bench(
         "views": lambda: bench_views(bundle, homes, textures),
         "turns": lambda: bench_turns(bundle, homes, textures),
         "films": lambda: bench_films(bundle, homes, textures, annotated),
-        "bounds": lambda: bench_bounds(bundle, homes, textures),
+        "bounds": lambda: bench_bounds(bundle, homes, textures, annotated),
         "steps": lambda: bench_steps(bundle, homes, textures),
         "albums": lambda: bench_albums(bundle, homes, textures, annotated),
         "localisability": lambda: bench_localisability(bundle, homes, textures),

@@ -7,7 +7,7 @@ encoder can find: other evidence must.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,8 @@ from lalaloc_core.evaluate.calibrate.measured_errors import photograph_of
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, layouts_of_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
+from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
@@ -30,6 +32,8 @@ from lalaloc_core.localise.query import CameraHeight, PredictedCeiling, Predicte
 
 # Fields of view (degrees) of views, and number and field of the views of a turn.
 _FIELDS_DEG, _TURN = (65.0, 80.0, 106.0), (6, 67.0)
+# Fields of view (degrees) of annotated photographs, and views of each.
+_ANNOTATED_DEG, _ANNOTATED_VIEWS = (80.0, 106.0), 4
 # What is predicted, what is true: errors (log) of walls, None for those of the encoder, and whether openings are true.
 _ROWS = {
     "predicted": (None, False),
@@ -52,27 +56,49 @@ class Asked(NamedTuple):
     query: Query
 
 
-def bench_bounds(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+def bench_bounds(bundle: Bundle, homes: int, textures: Path | None, annotated: Path | None = None) -> dict[str, Any]:
     """Measure spheres, views and turns of furnished test homes, heading unknown, with true walls and openings.
 
     Each row has the share within 1 m, and of the others the shares by cause: another place fits equally well, the true
-    place costs more, or it costs less and the search lost it.
+    place costs more, or it costs less and the search lost it. With `annotated`, a folder of annotated photographs, also
+    views of each of them, in the first gallery of its photograph.
     """
     model = LocalModel(bundle)
     kinds = {"sphere": None, **{f"view_{field:g}": (1, field) for field in _FIELDS_DEG}, "turn": _TURN}
-    return {kind: _of_kind(model, homes, textures, shown) for kind, shown in kinds.items()}
+    figures: dict[str, Any] = {
+        kind: _shares(_outcomes(model, _asked(model, homes, textures, shown))) for kind, shown in kinds.items()
+    }
+    if annotated is not None:
+        figures |= {f"annotated_{field:g}": _of_annotated(model, annotated, field) for field in _ANNOTATED_DEG}
+    return figures
 
 
-def _of_kind(
-    model: LocalModel, homes: int, textures: Path | None, shown: tuple[int, float] | None
-) -> dict[str, dict[str, float]]:
+def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str, Any]:
+    """Return the shares of views of annotated photographs, of all and by photograph."""
+    photographs = AnnotatedPhotographs(folder)
+    scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
+    found = {
+        key.photograph: _outcomes(model, _views(model, scenes.load(key.scene)))
+        for key in photographs.keys(galleries=1)
+        if not key.outline
+    }
+    total = {name: sum((each[name] for each in found.values()), Counter[str]()) for name in _ROWS}
+    return _shares(total) | {"by_photograph": {name: _shares(each) for name, each in found.items()}}
+
+
+def _outcomes(model: LocalModel, every: Iterable[Asked]) -> dict[str, Counter[str]]:
+    """Return by row how often each outcome occurs."""
     rng = np.random.default_rng(0)
     outcomes: dict[str, Counter[str]] = {name: Counter() for name in _ROWS}
-    for asked in _asked(model, homes, textures, shown):
+    for asked in every:
         grid = model.grid(asked.plan, asked.query.camera_height.height_m)
         for name, (noise, opened) in _ROWS.items():
             query = with_truth(asked, noise=noise, openings=opened, rng=rng)
             outcomes[name][_outcome(model, asked, grid, query)] += 1
+    return outcomes
+
+
+def _shares(outcomes: Mapping[str, Counter[str]]) -> dict[str, Any]:
     return {
         name: {"n": found.total(), **{cause: count / found.total() for cause, count in sorted(found.items())}}
         for name, found in outcomes.items()
@@ -97,6 +123,13 @@ def _asked(model: LocalModel, homes: int, textures: Path | None, shown: tuple[in
                 query = encoder.query(opened[0], None, height, others=list(zip(opened[1:], turns[1:], strict=True)))
             pose = Pose.at(camera.position_m, camera.room_index, camera.heading)
             yield Asked(scene.plan, pose, query)
+
+
+def _views(model: LocalModel, scene: Scene) -> Iterator[Asked]:
+    for camera in scene.cameras:
+        view = photograph_of(camera).open(patch_size(model.bundle.manifest))
+        query = model.encoder.query(view, None, CameraHeight(camera.camera_height_m))
+        yield Asked(scene.plan, Pose.at(camera.position_m, camera.room_index, camera.heading), query)
 
 
 def with_truth(asked: Asked, *, noise: float | None, openings: bool, rng: np.random.Generator) -> Query:
