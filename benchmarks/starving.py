@@ -4,25 +4,33 @@
 
 Without API keys a tenant is a client address, so the busy tenant connects from 127.0.0.2 (Linux). Prints a Markdown
 table with a row for each attack: the other tenant's queries against alone, its refusals, and the slowest health check.
+The second table has concurrent sessions in a venue: their answers by status, and the waits for each.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import socket
+import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import httpx
 
 from benchmarks import harness
+from benchmarks.large_venue import random_home, upload_files, wait_until_ready
 from examples.truth import PLAN_PATH, read_poses
 
 _MAX_P99_RATIO, _MAX_HEALTH_S = 3.0, 1.0
+# A refused photograph of a session is told so early; its deadline is 10 s.
+_MAX_REFUSAL_S = 5.0
+_VENUE_PLANS, _PHOTOGRAPHS = 62, 3
 _BUSY_ADDRESS = "127.0.0.2"
 _WIDTH, _HEIGHT = 14_000, 7_000
 # A plan whose pose grid takes minutes, so that its event streams stay open.
@@ -36,13 +44,22 @@ def main() -> int:
     """Measure; return 1 when the other tenant is refused, slowed down too much, or answered wrongly."""
     parser = harness.argument_parser(__doc__)
     parser.add_argument("--seconds", type=float, default=8.0, help="duration of each attack")
-    parser.add_argument("--only", choices=_ATTACKS, help="run one attack")
+    parser.add_argument("--sessions", type=int, default=12, help="sessions at the same time")
+    parser.add_argument("--only", choices=[*_ATTACKS, "sessions"], help="run one attack, or the sessions")
     options = parser.parse_args()
-    attacks = {options.only: _ATTACKS[options.only]} if options.only else _ATTACKS
+    attacks = {name: attack for name, attack in _ATTACKS.items() if options.only in (None, name)}
+    failed = bool(attacks) and _is_starved(attacks, options.seconds)
+    if options.only in (None, "sessions"):
+        failed |= _sessions_wait_in_vain(options.sessions)
+    return int(failed)
+
+
+def _is_starved(attacks: Mapping[str, _Attack], seconds: float) -> bool:
+    """Print the row of each attack; return whether one of them starves the other tenant."""
     failed = False
     with harness.example_service() as service:
         harness.run_load(service.url, [service.plan_id], 1, 2.0)
-        alone = harness.run_load(service.url, [service.plan_id], 1, options.seconds)
+        alone = harness.run_load(service.url, [service.plan_id], 1, seconds)
         alone_p99_ms = alone.answered.percentile_ms(99)
         harness.print_table_head(
             "attack", "queries", "p50, p95, p99 in ms", "p99 against alone", "refused", "slowest health check"
@@ -51,11 +68,38 @@ def main() -> int:
         for name, attack in attacks.items():
             with attack(service), harness.HealthWatch(service.url, 0.1) as health:
                 time.sleep(_UNTIL_BUSY_S)
-                result = harness.run_load(service.url, [service.plan_id], 1, options.seconds, pause_s=0.1)
+                result = harness.run_load(service.url, [service.plan_id], 1, seconds, pause_s=0.1)
             print(_row(name, result, alone_p99_ms, health.slowest_s), flush=True)
             failed |= result.failures + result.refused.count > 0 or health.slowest_s > _MAX_HEALTH_S
             failed |= not result.answered.percentile_ms(99) <= _MAX_P99_RATIO * alone_p99_ms
-    return int(failed)
+    return failed
+
+
+def _sessions_wait_in_vain(sessions: int) -> bool:
+    """Print the answers of concurrent sessions in a venue; return whether one came too late."""
+    waits: dict[int, list[float]] = defaultdict(list)
+    with harness.example_service() as service, httpx.Client(base_url=service.url, timeout=60.0) as client:
+        homes = [random_home(number) for number in range(_VENUE_PLANS - 1)]
+        venue_id = upload_files(service, service.plan_id, homes)
+        wait_until_ready(client, venue_id)
+        begun = [client.post("/sessions", json={"venue_id": venue_id}).raise_for_status() for _ in range(sessions)]
+
+        def follow(session: str) -> None:
+            for pose in read_poses()[:_PHOTOGRAPHS]:
+                begin = time.perf_counter()
+                files = {"photo": pose.picture.read_bytes()}
+                answer = client.post(f"/sessions/{session}/photographs", files=files)
+                waits[answer.status_code].append(time.perf_counter() - begin)
+                if answer.status_code == httpx.codes.SERVICE_UNAVAILABLE:
+                    time.sleep(float(answer.headers["Retry-After"]))
+
+        with ThreadPoolExecutor(sessions) as threads:
+            list(threads.map(follow, [answer.json()["id"] for answer in begun]))
+    harness.print_table_head(f"{sessions} sessions, status", "photographs", "median wait", "longest wait")
+    for status, waited in sorted(waits.items()):
+        row = harness.table_row(status, len(waited), f"{statistics.median(waited):.1f} s", f"{max(waited):.1f} s")
+        print(row, flush=True)
+    return not waits.keys() <= {200, 503} or max(waits[503], default=0.0) > _MAX_REFUSAL_S
 
 
 def _row(name: str, result: harness.LoadResult, alone_p99_ms: float, health_s: float) -> str:

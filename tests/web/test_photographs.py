@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 from playwright.sync_api import Page, Route, expect
 
 from lalaloc_core.photograph.cameras import Perspective
+from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.service.conftest import StartApp
 from tests.web.conftest import Visit
@@ -55,6 +56,30 @@ def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_pa
     assert beside == 0
     assert on > 100
     page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+    expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=fault_id)
+def test_photograph_with_a_fault_is_shown_and_what_is_said_about_it(desktop: Visit, fault: Fault) -> None:
+    page = desktop.open_example()
+    page.locator("#photo-file").set_input_files(FOLDER / fault.name)
+    expect(page.locator("#photo-strip li")).to_have_count(1)
+    page.get_by_role("button", name="Find the place").click()
+    expect(page.locator("#answer" if fault.is_usable else "#photo-error")).to_be_visible()
+    # The page has no fields for intrinsics.
+    if fault.said is not None and "intrinsics" not in fault.fields:
+        place = page.locator("#answer-body .warning" if fault.is_usable else "#photo-error")
+        expect(place.filter(has_text=fault.said.replace("hfov_deg", "“Field of view”"))).to_be_visible()
+
+
+def test_photograph_of_which_half_is_lost_is_shown_from_inside(desktop: Visit, tmp_path: Path) -> None:
+    content = (EXAMPLES / "kitchen.jpg").read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
+    page = desktop.open_example()
+    page.locator("#photo-file").set_input_files(tmp_path / "cut.jpg")
+    expect(page.locator("#photo-strip li")).to_have_count(1)
+    desktop.find()
+    expect(page.locator("#answer-body .warning").filter(has_text="the file ends before its picture")).to_be_visible()
     expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
 
 

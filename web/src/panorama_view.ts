@@ -15,6 +15,7 @@ type Shape = "around" | "whole" | "flat";
 const TURN_BY = radians(10);
 // Photo sphere metadata stand before the pixels.
 const METADATA_BYTES = 2 ** 18;
+const END_OF_JPEG = new Uint8Array([0xff, 0xd9]);
 // Pixels of the longer side of a saved photograph.
 const SAVED_PIXELS = 2400;
 
@@ -84,7 +85,7 @@ export class PanoramaView {
   /** Show a photograph; null shows none. Rejects if the file is not a picture. */
   async setPicture(file: Blob | null): Promise<void> {
     this.release(this.url);
-    this.url = file === null ? null : URL.createObjectURL(file);
+    this.url = file === null ? null : URL.createObjectURL(ended(file));
     this.stage.classList.toggle("empty", file === null);
     if (this.url === null) {
       this.picture.removeAttribute("src");
@@ -234,6 +235,11 @@ export class PanoramaView {
   private gaze(): Gaze {
     return this.shape === "around" && this.sphere !== null ? this.sphere.gaze() : { yaw: 0, pitch: 0, verticalFov: 1 };
   }
+}
+
+/** Return a JPEG file with the marker of its end, so that one whose last bytes are lost is decoded as far as it goes. */
+function ended(file: Blob): Blob {
+  return file.type === "image/jpeg" ? new Blob([file, END_OF_JPEG], { type: file.type }) : file;
 }
 
 /** Guess whether a photograph is a full sphere, or a part that its metadata place on one. */

@@ -1,6 +1,6 @@
 /** Photo Sphere Viewer, in a file of its own that is loaded with the first picture. */
 
-import { Viewer } from "@photo-sphere-viewer/core";
+import { type PanoData, Viewer } from "@photo-sphere-viewer/core";
 
 import { radians } from "./layout";
 import type { Gaze } from "./projection";
@@ -21,7 +21,7 @@ export class Sphere {
       moveInertia: false,
       loadingTxt: "",
       // The picture's centre stays at yaw 0, as the service computes the heading; the horizon is levelled as in the service.
-      panoData: (_image, xmp) => ({ ...xmp, poseHeading: 0 }) as never,
+      panoData: (image, xmp) => ({ ...(contradicts(xmp ?? {}) ? centred(image) : xmp), poseHeading: 0 }) as PanoData,
     });
     this.viewer.addEventListener("render", rendered);
   }
@@ -49,4 +49,28 @@ export class Sphere {
   zoomBy(steps: number): void {
     this.viewer.zoom(this.viewer.getZoomLevel() + steps);
   }
+}
+
+/** Return true if a picture is not within the full sphere that its metadata state. */
+function contradicts(place: Partial<PanoData>): boolean {
+  const fullWidth = place.fullWidth ?? 2 * (place.fullHeight ?? Infinity),
+    fullHeight = place.fullHeight ?? 0.5 * fullWidth,
+    left = place.croppedX ?? 0,
+    top = place.croppedY ?? 0;
+  if (Math.min(left, top) < 0 || Math.abs(fullWidth - 2 * fullHeight) > 1) return true;
+  return left + (place.croppedWidth ?? 0) > fullWidth || top + (place.croppedHeight ?? 0) > fullHeight;
+}
+
+/** Return the place of a picture in the middle of a sphere, as large as it can be. */
+function centred({ width, height }: HTMLImageElement): Partial<PanoData> {
+  const fullHeight = Math.max(height, Math.ceil(0.5 * width)),
+    fullWidth = 2 * fullHeight;
+  return {
+    fullWidth,
+    fullHeight,
+    croppedWidth: width,
+    croppedHeight: height,
+    croppedX: Math.floor(0.5 * (fullWidth - width)),
+    croppedY: Math.floor(0.5 * (fullHeight - height)),
+  };
 }
