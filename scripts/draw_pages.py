@@ -30,7 +30,7 @@ _AZIMUTHS_DEG, _PITCH = (-100.0, 20.0, 140.0), math.radians(-3.0)
 # A phone's wide lens in a real bedroom (CC0, examples/real).
 _REAL, _REAL_AZIMUTH_DEG, _REAL_FIELD_DEG = "real/lythwood_room", 30.0, 100.0
 _FOCAL_LENGTH_35MM, _TAKEN = 0xA405, 0x9003
-_SIZE = {"width": 1280, "height": 860}
+_SIZE, _HIGH, _NOTE_MS = {"width": 1280, "height": 860}, 1120, 10_000.0
 _WAIT_MS = 180_000.0
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -58,12 +58,15 @@ def main() -> int:
 
 def _real_phone(page: Page, url: str, folder: Path) -> None:
     photograph = _photograph(_REAL, _REAL_AZIMUTH_DEG, _REAL_FIELD_DEG, folder / "bedroom.jpg")
+    page.set_viewport_size({**_SIZE, "height": _HIGH})
     page.goto(url)
     page.locator("#plan-file").set_input_files(FOLDER / "real" / "rooms.json")
     expect(page.locator("#plan-name")).to_contain_text("photographed rooms")
     page.locator("#photo-file").set_input_files(photograph)
     page.get_by_role("button", name="Find the place").click()
     expect(page.locator("#answer")).to_contain_text("Looks like", timeout=_WAIT_MS)
+    # The note about the stored plan goes.
+    page.wait_for_timeout(_NOTE_MS)
 
 
 def _pinned_folder(page: Page, url: str, folder: Path) -> None:

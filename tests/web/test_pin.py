@@ -170,6 +170,13 @@ def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_
             page.reload()
             expect(page.locator("#plan .pin")).to_have_count(2)
             expect(page.locator(".shot.none")).to_have_count(2)
+            # While another plan is uploaded, photographs wait for that, not for the one that is shown.
+            page.locator("#plan-file").set_input_files(EXAMPLES / "real" / "rooms.json")
+            page.locator("#photo-files").set_input_files(EXAMPLES / "real" / "hotel_room.jpg")
+            expect(page.locator("#pin-state")).to_contain_text("of 1 photographs pinned for sure (solved)")
+            album, plan = client.get("/albums").json()["albums"][0], client.get("/floorplans").json()["floorplans"][0]
+            assert plan["name"] == "Six photographed rooms"
+            assert album["floorplan_id"] == plan["id"]
 
 
 def test_album_of_a_venue_shows_the_plan_of_each_pin(desktop: Visit) -> None:

@@ -130,7 +130,10 @@ class PinPage {
   }
 
   private async upload(file: File): Promise<void> {
-    const plan = await api.uploadPlan(file);
+    // Photographs that are chosen meanwhile wait for this plan.
+    const before = this.shown;
+    this.shown = null;
+    const plan = await api.uploadPlan(file).finally(() => (this.shown = before));
     this.choice.prepend(h("option", { value: `plan:${plan.id}` }, plan.name));
     this.choice.selectedIndex = 0;
     await this.take(plan);
