@@ -1,5 +1,5 @@
-"""Draw the pictures of pages that README.md shows: a phone photograph of a real room with the reason for its answer, and
-a pinned folder.
+"""Draw the pictures of pages that README.md shows: a phone photograph of a real room with the reason for its answer,
+and a pinned folder.
 
     python -m scripts.draw_pages docs/images
 
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import ExifTags, Image
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, ViewportSize, expect, sync_playwright
 
 from examples.launch import ROOT, running_service
 from examples.truth import FOLDER, PLAN_PATH
@@ -30,7 +30,8 @@ _AZIMUTHS_DEG, _PITCH = (-100.0, 20.0, 140.0), math.radians(-3.0)
 # A phone's wide lens in a real bedroom (CC0, examples/real).
 _REAL, _REAL_AZIMUTH_DEG, _REAL_FIELD_DEG = "real/lythwood_room", 30.0, 100.0
 _FOCAL_LENGTH_35MM, _TAKEN = 0xA405, 0x9003
-_SIZE, _HIGH, _NOTE_MS = {"width": 1280, "height": 860}, 1120, 10_000.0
+_SIZE: ViewportSize = {"width": 1280, "height": 860}
+_HIGH, _NOTE_MS = 1120, 10_000.0
 _WAIT_MS = 180_000.0
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -58,7 +59,7 @@ def main() -> int:
 
 def _real_phone(page: Page, url: str, folder: Path) -> None:
     photograph = _photograph(_REAL, _REAL_AZIMUTH_DEG, _REAL_FIELD_DEG, folder / "bedroom.jpg")
-    page.set_viewport_size({**_SIZE, "height": _HIGH})
+    page.set_viewport_size({"width": _SIZE["width"], "height": _HIGH})
     page.goto(url)
     page.locator("#plan-file").set_input_files(FOLDER / "real" / "rooms.json")
     expect(page.locator("#plan-name")).to_contain_text("photographed rooms")
