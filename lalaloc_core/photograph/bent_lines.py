@@ -1,7 +1,7 @@
 """Bend of straight lines in a photograph, which tells a wide lens's picture from one in perspective.
 
 Pieces of a line that a lens bends follow one another with small turns. The bend of such a chain away from the picture's
-centre grows with its distance from it, as the radius of the division model does (Fitzgibbon 2001): p / (1 + k |p|²).
+centre grows with its distance from it, as the radius of the division model does (Fitzgibbon 2001): p / (1 + k p²).
 """
 
 from __future__ import annotations
