@@ -130,9 +130,8 @@ class PinPage {
   }
 
   private async upload(file: File): Promise<void> {
-    // Photographs that are chosen meanwhile wait for this plan.
     const before = this.shown;
-    this.shown = null;
+    this.shown = null; // Photographs that are chosen meanwhile wait for this plan.
     const plan = await api.uploadPlan(file).finally(() => (this.shown = before));
     this.choice.prepend(h("option", { value: `plan:${plan.id}` }, plan.name));
     this.choice.selectedIndex = 0;
