@@ -88,6 +88,14 @@ class BoundedSocket(WebSocketsSansIOProtocol):
         else:
             super().send_receive_event_to_app()
 
+    def handle_parser_exception(self) -> None:
+        """Close; before the handshake is answered no frame can say why, which the server would log as its own error."""
+        if self.conn.close_sent is not None:
+            super().handle_parser_exception()
+        else:
+            self.queue.put_nowait({"type": "websocket.disconnect", "code": CloseCode.PROTOCOL_ERROR})
+            self.transport.close()
+
     def _parse(self, piece: bytes) -> None:
         if piece:
             super().data_received(piece)

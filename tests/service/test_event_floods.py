@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -21,6 +22,7 @@ from service.capacity.cpu_accounts import CpuAccounts
 from service.http import paced_parsing
 from service.http.http_protocol import MAX_HEAD_BYTES
 from service.http.paced_parsing import EVENTS_PER_TURN, PacedParser
+from service.http.socket_protocol import BoundedSocket
 from service.security.permissions import Caller, put_caller
 from service.settings import Settings
 from tests.service.conftest import wait_for
@@ -250,6 +252,18 @@ def test_text_that_is_not_utf_8_is_the_clients_error(
         assert client.recv(4096)[2:4] == (1007).to_bytes(2, "big")
         wait_for(lambda: received == ["closed"])
     assert not caplog.records
+
+
+def test_frames_before_the_handshake_is_answered_end_the_connection_without_an_error() -> None:
+    # Their error has no close frame, as the connection is not open yet.
+    connection = BoundedSocket.__new__(BoundedSocket)
+    closed: list[bool] = []
+    connection.conn = SimpleNamespace(close_sent=None)  # type: ignore[assignment]
+    connection.transport = SimpleNamespace(close=lambda: closed.append(True))  # type: ignore[assignment]
+    connection.queue = asyncio.Queue()
+    connection.handle_parser_exception()
+    assert closed == [True]
+    assert connection.queue.get_nowait()["type"] == "websocket.disconnect"
 
 
 class _Admission:
