@@ -200,12 +200,17 @@ class Caller:
         return answer
 
     def send_bytes(self, head: str, content: bytes) -> Answer:
-        """Send a head, which is completed, and bytes after it on a connection of its own; return the status."""
+        """Send a head, which is completed, and bytes after it on a connection of its own; return the status.
+
+        Bytes after an upgrade wait until it is answered.
+        """
         lines = [head, f"Host: {self._connection.host}", *(f"{name}: {value}" for name, value in self._headers.items())]
         answer = b""
         address = (self._connection.host, self._connection.port)
         with suppress(OSError), socket.create_connection(address, _REQUEST_TIMEOUT_S) as connection:
             connection.sendall("\r\n".join([*lines, "", ""]).encode())
+            if "Upgrade:" in head:
+                answer = connection.recv(4096)
             # The service may answer and close before everything is sent.
             with suppress(ConnectionError):
                 connection.sendall(content)
