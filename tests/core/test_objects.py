@@ -223,3 +223,11 @@ def test_rooms_and_plans_full_of_fixtures_tell_nothing() -> None:
     assert np.ptp(basins[0]) == 0.0
     assert basins[0, 0] < basins[1, 0]
     assert not cost(*(washroom * 39)).any()
+    # All kinds that are seen count together.
+    many = [("stove", 5.2 + 0.2 * k, 2.0) for k in range(13)] * 38
+    drawn = furnished(*many, *washroom)
+    seen = SeenObject("washbasin", 0.9, 0.0), SeenObject("stove", 0.9, 0.0)
+    for objects, tells in ((seen[:1], True), (seen, False)):
+        asked = seen_from_the_middle(drawn, *objects)
+        found = PlaceCost.of(drawn, asked, NO_HINTS, 1.0, np.array([[2.0, 1.5]]), np.array([0]))
+        assert (found is not None) == tells

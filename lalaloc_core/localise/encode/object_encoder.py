@@ -31,7 +31,7 @@ class ObjectEncoder:
     def outputs(self, photograph: Photograph) -> dict[str, Float[np.ndarray, "n"]]:
         """Return the probability of each object, and its azimuth (radians) relative to the photograph's centre.
 
-        The photograph has an thumbnail, a camera and axes.
+        The photograph has a thumbnail, a camera and axes.
         """
         thumbnail = photograph.thumbnail
         assert thumbnail is not None

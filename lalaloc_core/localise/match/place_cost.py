@@ -45,8 +45,9 @@ _ELSEWHERE, _EVEN = 0.5, 0.15
 _FIELD, _AZIMUTH_SD, _MAX_SD = math.radians(70.0), math.radians(12.0), math.radians(45.0)
 # Rooms with more fixtures of a kind, such as the washrooms of a stadium, tell no direction.
 _MAX_FIXTURES = 12
-# Kinds of which a plan has more fixtures, or in rooms of a larger area (m²), tell nothing, which bounds the work.
-_MAX_OF_KIND, _MAX_AREA_M2 = 500, 5000.0
+# More fixtures of the kinds that are seen, or rooms with them of a larger area (m²), tell nothing, which bounds work
+# and memory of a query.
+_MAX_SEEN, _MAX_AREA_M2 = 500, 5000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +104,13 @@ def _seen_fixtures(plan: FloorPlan, objects: tuple[SeenObject, ...]) -> list[See
     best = dict[str, SeenObject]()
     for each in objects:
         kind = _FIXTURES.get(each.name)
-        places = plan.fixtures_by_kind.get(kind) if kind else None
-        if kind is None or places is None or len(places) > _MAX_OF_KIND:
-            continue
-        if plan.areas_m2[np.unique(places.room_index[places.room_index >= 0])].sum() > _MAX_AREA_M2:
+        if kind is None or kind not in plan.fixtures_by_kind:
             continue
         if kind not in best or best[kind].probability < each.probability:
             best[kind] = SeenObject(kind, each.probability, each.azimuth)
+    rooms = np.concatenate([np.empty(0, np.intp), *(plan.fixtures_by_kind[kind].room_index for kind in best)])
+    if len(rooms) > _MAX_SEEN or plan.areas_m2[np.unique(rooms[rooms >= 0])].sum() > _MAX_AREA_M2:
+        return []
     return list(best.values())
 
 
