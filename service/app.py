@@ -28,6 +28,7 @@ from service.http.middleware import (
     TelemetryMiddleware,
 )
 from service.http.problems import install_problem_handlers
+from service.http.server import ServedApp, bound_uvicorn
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.routes import ROUTERS
 from service.runtime import LOCAL_BACKENDS, Backends, start_runtime
@@ -53,7 +54,7 @@ def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACK
     # Exported as 0 from the start, so that the first one shows as an increase.
     for kind in (*PROBLEMS.values(), *HTTP_PROBLEMS.values()):
         telemetry.rejections.labels(kind.slug)
-    app = FastAPI(
+    app = ServedApp(
         title="LaLaLoc",
         version=__version__,
         description=_DESCRIPTION,
@@ -95,6 +96,7 @@ async def _lifespan(
 ) -> AsyncIterator[None]:
     gc.set_threshold(*_COLLECTION_THRESHOLDS)
     settings = settings or Settings.load()
+    bound_uvicorn(app, settings)
     logger = configure_logging(settings.log_level)
     with ExitStack() as cleanup:
         runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup, backends)

@@ -19,6 +19,9 @@ MAX_HEAD_BYTES, _MAX_HEADERS = 16 * 1024, 100
 _TOO_LARGE = 431
 # Bodies in more chunks than this must have this many bytes per chunk on average.
 _MANY_CHUNKS, _MIN_CHUNK_BYTES = 1024, 64
+# A chunk smaller than that counts as this many events, and the rest of a body of more of them is not read after the
+# answer: a client that opens connections for a few chunks each would keep the event loop busy, too.
+_SMALL_CHUNK_EVENTS, _FEW_CHUNKS = 8, 4
 # Time (s) per byte at which bodies of refused requests arrive, of all connections together. They are dropped, so that
 # clients read the refusal; at the speed of a local network they would occupy the event loop.
 _DROPPING_S = 5e-9
@@ -77,11 +80,21 @@ class _CountedConnection(h11.Connection):
     def _check_chunks(self, data: h11.Data) -> None:
         self._chunks += data.chunk_start
         self._body_bytes += len(data.data)
-        if self._chunks > _MANY_CHUNKS and self._body_bytes < _MIN_CHUNK_BYTES * self._chunks:
+        if data.chunk_start and data.chunk_end and len(data.data) < _MIN_CHUNK_BYTES:
+            self._parser().events_left -= _SMALL_CHUNK_EVENTS - 1
+        if self._has_small_chunks(_MANY_CHUNKS):
             raise _RefusedError(
                 f"the body has {self._chunks} chunks of {self._body_bytes / self._chunks:.0f} bytes on average; "
                 f"the minimum is {_MIN_CHUNK_BYTES}"
             )
+
+    @property
+    def is_answered_in_small_chunks(self) -> bool:
+        """True while a body in small chunks arrives whose request is answered."""
+        return self.our_state is h11.DONE and self.their_state is h11.SEND_BODY and self._has_small_chunks(_FEW_CHUNKS)
+
+    def _has_small_chunks(self, many: int) -> bool:
+        return self._chunks > many and self._body_bytes < _MIN_CHUNK_BYTES * self._chunks
 
 
 class _Flow(FlowControl):
@@ -162,6 +175,8 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
         def on_response_complete(self) -> None:
             super().on_response_complete()
             self._idle_since = monotonic()
+            if self.conn.is_answered_in_small_chunks:
+                self.transport.close()
             # Requests that were sent with the last one are handled outside the feeder.
             self._parser.settle()
             self._watch()

@@ -1,10 +1,11 @@
 """HTTP server of the app, with bounded connections and a stop that finishes requests in progress.
 
-The app also runs under other ASGI servers, which must then bound connections and stop by themselves.
+`uvicorn service.app:app` bounds connections alike, and stops by itself. Other ASGI servers must do both.
 """
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import logging
 import math
@@ -17,6 +18,7 @@ from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
+from starlette.types import Receive, Scope, Send
 
 from lalaloc_core.errors import ConfigError
 from service.capacity.admission_control import Admission, AdmissionLimits
@@ -47,30 +49,59 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     Raises:
         ConfigError: the system allows too few file descriptors.
     """
+    config = uvicorn.Config(
+        app,
+        # Not uvloop, even if it is installed, as with the extra `ray`.
+        loop="asyncio",
+        log_level="warning",
+        # By default uvicorn trusts `X-Forwarded-For` of all clients on this machine.
+        proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
+        timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.requests.stop_deadline_s),
+    )
+    _bound(config, settings)
+    return config
+
+
+class ServedApp(FastAPI):
+    """App that keeps the configuration of the uvicorn server that starts it, for `bound_uvicorn`."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request, or the start of the app."""
+        if scope["type"] == "lifespan":
+            # The function is a method of uvicorn's object for the start, which has the configuration.
+            self.state.server = getattr(getattr(receive, "__self__", None), "config", None)
+        await super().__call__(scope, receive, send)
+
+
+def bound_uvicorn(app: FastAPI, settings: Settings) -> None:
+    """Bound connections of the server that starts the app, if it is `uvicorn service.app:app`.
+
+    Raises:
+        ConfigError: the system allows too few file descriptors.
+    """
+    config = getattr(app.state, "server", None)
+    if isinstance(config, uvicorn.Config) and isinstance(config.http, str):
+        # Uvicorn has loaded the classes that were named; it listens after the app has started.
+        config.http_protocol_class, config.ws_protocol_class = _bound(config, settings)
+
+
+def _bound(config: uvicorn.Config, settings: Settings) -> tuple[type[asyncio.Protocol], type[asyncio.Protocol]]:
+    """Bound connections, heads, events and messages; return the protocols of requests and WebSockets."""
     limits = AdmissionLimits.from_settings(settings)
     # More than all slots, so that this service's refusals come before the server's own.
     least = limits.requests + limits.reads + limits.streams + 1
     max_connections = max_connections_of(max(settings.requests.max_connections, least), settings)
-    return uvicorn.Config(
-        app,
-        http=bounded_protocol(_HEAD_DEADLINE_S, max_connections),
-        # Not uvloop, even if it is installed, as with the extra `ray`.
-        loop="asyncio",
-        ws=BoundedSocket,
-        ws_max_size=_MAX_MESSAGE_BYTES,
-        # Photographs are compressed already.
-        ws_per_message_deflate=False,
-        ws_ping_interval=_PING_INTERVAL_S,
-        # The answer to a ping waits behind a photograph that is not read on.
-        ws_ping_timeout=limits.deadline_s,
-        log_level="warning",
-        # Idle connections make room first; this applies if all of them have a request in progress.
-        limit_concurrency=max_connections + 1,
-        # By default uvicorn trusts `X-Forwarded-For` of all clients on this machine.
-        proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
-        timeout_keep_alive=math.ceil(settings.requests.keep_alive_s),
-        timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.requests.stop_deadline_s),
-    )
+    protocols = config.http, config.ws = bounded_protocol(_HEAD_DEADLINE_S, max_connections), BoundedSocket
+    config.ws_max_size = _MAX_MESSAGE_BYTES
+    # Photographs are compressed already.
+    config.ws_per_message_deflate = False
+    config.ws_ping_interval = _PING_INTERVAL_S
+    # The answer to a ping waits behind a photograph that is not read on.
+    config.ws_ping_timeout = limits.deadline_s
+    # Idle connections make room first; this applies if all of them have a request in progress.
+    config.limit_concurrency = max_connections + 1
+    config.timeout_keep_alive = math.ceil(settings.requests.keep_alive_s)
+    return protocols
 
 
 class Server(uvicorn.Server):

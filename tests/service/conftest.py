@@ -22,7 +22,6 @@ from fastapi import FastAPI
 from PIL import Image
 
 from service.app import create_app
-from service.http.socket_protocol import BoundedSocket
 from service.pools.supervisor import Watchdog
 from service.settings import Settings
 from service.storage.statements import CHUNK_BYTES
@@ -152,7 +151,7 @@ def serve(app: FastAPI) -> Iterator[str]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         # Connections inherit it; without, answers wait 40 ms for their heads to be acknowledged.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        server = uvicorn.Server(uvicorn.Config(app, http="h11", loop="asyncio", ws=BoundedSocket, log_level="critical"))
+        server = uvicorn.Server(uvicorn.Config(app, loop="asyncio", log_level="critical"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:

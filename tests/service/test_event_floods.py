@@ -145,6 +145,14 @@ def test_body_in_tiny_chunks_is_refused(port: int, path: str) -> None:
         assert answer.startswith(b"HTTP/1.1 401 ")
 
 
+def test_answer_ends_the_connection_of_a_body_in_small_chunks(port: int) -> None:
+    # Fewer than a turn handles, so that no turn after the answer sees them.
+    with _connected(port) as connection:
+        connection.sendall(_chunked("/refused", b"x", 6))
+        connection.settimeout(3.0)
+        assert _read_all(connection).startswith(b"HTTP/1.1 401 ")
+
+
 def _send_quietly(connection: socket.socket, content: bytes) -> None:
     # The server may close the connection.
     with suppress(OSError):

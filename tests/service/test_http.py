@@ -15,6 +15,7 @@ import yaml
 from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.capacity.admission_control import EXEMPT
+from service.http.http_protocol import MAX_HEAD_BYTES
 from service.openapi import openapi_text
 from service.runtime import Runtime, get_runtime
 from service.settings import Settings
@@ -151,6 +152,13 @@ def test_unexpected_error_reveals_only_the_request_id() -> None:
     assert response.headers["x-content-type-options"] == "nosniff"
     assert "secret" not in response.text
     assert "Traceback" not in response.text
+
+
+def test_uvicorn_itself_bounds_connections(client: httpx.Client) -> None:
+    # The fixture's server knows nothing of the bounds; the app sets them as it starts.
+    response = client.get("/healthz", headers={"x-large": "x" * MAX_HEAD_BYTES})
+    assert response.status_code == 431
+    assert str(MAX_HEAD_BYTES) in response.text
 
 
 class _no_lifespan:
