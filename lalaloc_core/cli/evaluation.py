@@ -44,7 +44,7 @@ def add_commands(commands: Any) -> None:
     )
     evaluate.add_argument("--lighting", choices=("cold", "raw", "warm"), help="lighting (default: by data set)")
     evaluate.add_argument(
-        "--heading", choices=("known", "unknown"), default="known", help="heading of queries (default: %(default)s)"
+        "--heading", choices=("known", "unknown"), help="heading of queries (default: known; that of albums is unknown)"
     )
     evaluate.add_argument(
         "--grid-step",
@@ -58,6 +58,11 @@ def add_commands(commands: Any) -> None:
     )
     evaluate.add_argument(
         "--heading-error", type=positive, metavar="DEG", help="largest error of the known heading of views (default: 0)"
+    )
+    evaluate.add_argument(
+        "--albums",
+        action="store_true",
+        help="solve all photographs of a scene together, as `lalaloc pin`; files can be of any projection",
     )
     evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
     evaluate.add_argument("--limit", type=count, metavar="N", help="maximum number of queries (default: all)")
@@ -153,30 +158,22 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
     method, panorama = arguments.method, arguments.kind == "panorama"
     bundle = None if method in ("oracle", "icp") else arguments.bundle
-    if arguments.data is None and arguments.dataset is not None:
-        raise InvalidInputError(f"--dataset {arguments.dataset} needs --data, which is missing")
-    if arguments.data is not None and arguments.generator != "synth":
-        raise InvalidInputError(f"--generator {arguments.generator} is for generated homes, not for --data")
-    if arguments.refine is not None and method != "lalaloc":
-        raise InvalidInputError(f"--refine {arguments.refine} is for method 'lalaloc', not '{method}'")
-    if arguments.view is not None and not (panorama and method == "lalaloc"):
-        raise InvalidInputError(f"--view is for photographs and method 'lalaloc', not {method} {arguments.kind}")
-    if arguments.heading_error is not None and (arguments.view is None or arguments.heading == "unknown"):
-        raise InvalidInputError("--heading-error is for --view with a known heading")
+    _check_options(arguments)
     given = {"refine": arguments.refine, "heading_error_deg": arguments.heading_error}
     settings = {name: value for name, value in given.items() if value is not None}
     info = RunInfo(
-        label=f"{method} {arguments.kind}",
+        label=f"{method} albums" if arguments.albums else f"{method} {arguments.kind}",
         method=method,
         kind=arguments.kind,
         dataset="",
         split=arguments.split,
         settings=settings,
         views=None if arguments.view is None else {"field_deg": arguments.view},
+        albums=arguments.albums,
         data=None if arguments.data is None else str(arguments.data),
         data_format=arguments.dataset,
         generated=_generated_homes(arguments) if arguments.data is None else None,
-        heading_known=arguments.heading == "known",
+        heading_known=not arguments.albums and arguments.heading != "unknown",
         grid_step_m=arguments.grid_step,
         limit=arguments.limit,
         bundle=None if bundle is None else str(bundle),
@@ -196,6 +193,32 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         print_json(report, _DECIMALS)
     else:
         _print_scores(report)
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Check that the options of `evaluate` belong together.
+
+    Raises:
+        InvalidInputError: one is for other data, queries or methods.
+    """
+    method, kind = arguments.method, arguments.kind
+    photographs = kind == "panorama" and method == "lalaloc"
+    if arguments.data is None and arguments.dataset is not None:
+        raise InvalidInputError(f"--dataset {arguments.dataset} needs --data, which is missing")
+    if arguments.data is not None and arguments.generator != "synth":
+        raise InvalidInputError(f"--generator {arguments.generator} is for generated homes, not for --data")
+    if arguments.refine is not None and method != "lalaloc":
+        raise InvalidInputError(f"--refine {arguments.refine} is for method 'lalaloc', not '{method}'")
+    for option, is_given in {"--view": arguments.view is not None, "--albums": arguments.albums}.items():
+        if is_given and not photographs:
+            raise InvalidInputError(f"{option} is for photographs and method 'lalaloc', not {method} {kind}")
+    if arguments.albums and (arguments.heading == "known" or arguments.refine is not None):
+        option = "--heading known" if arguments.heading == "known" else f"--refine {arguments.refine}"
+        raise InvalidInputError(f"{option} is for photographs one by one; leave it out with --albums")
+    if arguments.heading_error is not None and (
+        arguments.view is None or arguments.albums or arguments.heading == "unknown"
+    ):
+        raise InvalidInputError("--heading-error is for --view with a known heading")
 
 
 def _score(arguments: argparse.Namespace) -> None:
@@ -237,6 +260,9 @@ def _print_scores(report: dict[str, Any]) -> None:
         print(f"answers within 1 m: 95 % interval {100 * interval['low']:.1f} to {100 * interval['high']:.1f} %")
     if report["calibration_error"] is not None:
         print(f"expected calibration error of the confidence: {report['calibration_error']:.3f}")
+    if report["clicks_per_album"] is not None:
+        print(f"expected calibration error of the room: {report['room_calibration_error']:.3f}")
+        print(f"corrections of an album until all rooms are right: {report['clicks_per_album']:.1f}")
 
 
 def _report(arguments: argparse.Namespace) -> None:

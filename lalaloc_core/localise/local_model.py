@@ -31,10 +31,10 @@ class LocalModel:
         self.encoder = PhotographEncoder(bundle, threads=1)
         self.refiner: Refiner = _LocalRefiner(bundle).refine
 
-    def grid(self, plan: FloorPlan, camera_height_m: float) -> PoseGrid:
+    def grid(self, plan: FloorPlan, camera_height_m: float, step_m: float = GRID_STEP_M) -> PoseGrid:
         """Compute the pose grid of a plan, with latents if the model compares only these."""
         latents = not self.encoder.predicts_profile
-        return build_grid(plan, self.encoder, step_m=GRID_STEP_M, camera_height_m=camera_height_m, latents=latents)
+        return build_grid(plan, self.encoder, step_m=step_m, camera_height_m=camera_height_m, latents=latents)
 
     def open(self, content: bytes, stated: StatedCamera | None = None) -> Photograph:
         """Read a photograph in the sizes that the model needs.

@@ -66,7 +66,10 @@ def _chains(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[tuple[float
 
     Lengths are in halves of the picture's diagonal, from its centre; the side is the direction from there.
     """
-    found = [_coefficient(_sampled(pieces[list(chain)])) for chain in _joined(pieces, side)]
+    chains = [pieces[chain] for chain in _joined(pieces, side)]
+    # Most chains are a piece or two, and too short in any direction.
+    long = [chain for chain in chains if np.hypot(*np.ptp(chain.reshape(-1, 2), axis=0)) >= _SHORTEST]
+    found = [_coefficient(_sampled(chain)) for chain in long]
     return [chain for chain in found if chain is not None]
 
 

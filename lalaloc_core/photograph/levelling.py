@@ -9,6 +9,7 @@ ICCV 1999; von Gioi et al., "LSD", PAMI 2010.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -52,6 +53,8 @@ _LONG_FOVS = np.radians([44.0, 48.0, 52.0, 57.0, 62.0, 67.0, 73.0, 79.0, 86.0, 9
 _USUAL_FOV, _FOV_SD = math.radians(72.0), 0.35
 # Steps between values, lenses.
 _FOCAL_FLOOR = 0.03
+# Angles of an attitude (pitch, roll, yaw), its score and covariance.
+_Mode = tuple[np.ndarray, float, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,7 +141,7 @@ def estimate_attitude(lines: Lines) -> Attitude:
     """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
     if not len(lines.length):
         return Attitude(pitch=0.0, roll=0.0, pitch_sd=float(_PRIOR[0]), roll_sd=float(_PRIOR[1]))
-    return _attitude([_refined(lines, start) for start in _starts(lines)])
+    return _attitude(_refined(lines, _starts(lines)))
 
 
 def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, height: int) -> Calibration:
@@ -150,11 +153,11 @@ def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, heig
         height: rows of the picture.
     """
     focals = 0.5 * max(width, height) / np.tan(0.5 * _LONG_FOVS)
-    modes = []
+    modes: list[_Mode] = []
     for focal in focals:
         camera = Perspective(width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
         lines = lines_of(segments, camera)
-        modes.append(_refined(lines, _starts(lines)[0]) if len(lines.length) else (np.zeros(3), 0.0, np.eye(3)))
+        modes += _refined(lines, _starts(lines)[:1]) if len(lines.length) else [(np.zeros(3), 0.0, np.eye(3))]
     log_focal = np.log(focals)
     usual = math.log(0.5 * max(width, height) / math.tan(0.5 * _USUAL_FOV))
     scores = np.array([score for _, score, _ in modes]) - 0.5 * ((log_focal - usual) / _FOV_SD) ** 2
@@ -169,8 +172,8 @@ def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, heig
     )
 
 
-def _attitude(modes: list[tuple[np.ndarray, float, np.ndarray]]) -> Attitude:
-    """Return the best of several modes (angles, score, covariance), with the spread of all."""
+def _attitude(modes: Sequence[_Mode]) -> Attitude:
+    """Return the best of several modes, with the spread of all."""
     best, score, covariance = max(modes, key=lambda mode: mode[1])
     weights = np.array([math.exp(mode[1] - score) for mode in modes])
     offsets = np.array([mode[0][:2] - best[:2] for mode in modes])
@@ -188,22 +191,33 @@ def _attitude(modes: list[tuple[np.ndarray, float, np.ndarray]]) -> Attitude:
     )
 
 
-def _directions(angles: np.ndarray) -> np.ndarray:
-    """Return the vertical and the two horizontal directions (3, 3) in the camera's frame, one per row."""
-    pitch, roll, yaw = angles
-    axes = camera_axes(pitch=pitch, roll=roll)
-    level = np.array([[0.0, 0.0, 1.0], [math.sin(yaw), math.cos(yaw), 0.0], [math.cos(yaw), -math.sin(yaw), 0.0]])
-    return level @ axes.T
+def _directions(angles: Float[np.ndarray, "*a 3"]) -> Float[np.ndarray, "*a 3 3"]:
+    """Return the vertical and the two horizontal directions in the camera's frame, one per row.
+
+    They are those of a level frame, turned by the transpose of `camera_axes`.
+    """
+    (sin_pitch, sin_roll, sin_yaw), (cos_pitch, cos_roll, cos_yaw) = (
+        np.moveaxis(part, -1, 0) for part in (np.sin(angles), np.cos(angles))
+    )
+    right, up = (cos_roll, sin_roll * sin_pitch), (sin_roll, -cos_roll * sin_pitch)
+    rows = [
+        (-sin_roll * cos_pitch, sin_pitch, cos_roll * cos_pitch),
+        *(
+            (x * right[0] + y * right[1], y * cos_pitch, x * up[0] + y * up[1])
+            for x, y in ((sin_yaw, cos_yaw), (cos_yaw, -sin_yaw))
+        ),
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _errors(lines: Lines, directions: np.ndarray) -> np.ndarray:
-    """Return the sine of the angle between each segment and the great circle to each direction, (n, d)."""
-    return (lines.normal @ directions.T) / _distances(lines, directions)
+def _errors(lines: Lines, directions: Float[np.ndarray, "*a d 3"]) -> Float[np.ndarray, "*a n d"]:
+    """Return the sine of the angle between each segment and the great circle to each direction."""
+    return (lines.normal @ directions.swapaxes(-1, -2)) / _distances(lines, directions)
 
 
-def _distances(lines: Lines, directions: np.ndarray) -> np.ndarray:
-    """Return the sine of the angle between the middle of each segment and each direction, (n, d)."""
-    along = lines.middle @ directions.T
+def _distances(lines: Lines, directions: Float[np.ndarray, "*a d 3"]) -> Float[np.ndarray, "*a n d"]:
+    """Return the sine of the angle between the middle of each segment and each direction."""
+    along = lines.middle @ directions.swapaxes(-1, -2)
     return np.sqrt(np.maximum(1.0 - along * along, 1e-3))
 
 
@@ -219,7 +233,7 @@ def _densities(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return np.exp(-0.5 * (error / sigma) ** 2) / (sigma * math.sqrt(2.0 * math.pi))
 
 
-def _starts(lines: Lines) -> list[np.ndarray]:
+def _starts(lines: Lines) -> Float[np.ndarray, "s 3"]:
     """Return the best attitudes (pitch, roll, yaw) of a coarse search."""
     sigma = _sigmas(lines, _COARSE_SIGMA)[:, None]
     weight = _weights(lines)
@@ -244,27 +258,29 @@ def _starts(lines: Lines) -> list[np.ndarray]:
         # Neighbours on the grid lead to the same attitude.
         if all(np.abs(start[:2] - kept[:2]).max() > _APART for kept in starts):
             starts.append(start)
-    return starts[:_REFINED]
+    return np.stack(starts[:_REFINED])
 
 
-def _refined(lines: Lines, angles: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Refine an attitude by expectation maximisation; return it with its score and covariance."""
+def _refined(lines: Lines, angles: Float[np.ndarray, "s 3"]) -> list[_Mode]:
+    """Refine attitudes by expectation maximisation; return them with their scores and covariances."""
     prior = np.array([*(1.0 / _PRIOR**2), 0.0])
     weight = _weights(lines)
+    beside = np.vstack([np.zeros(3), _DELTA * np.eye(3)])
     for step in range(_STEPS):
         sigma = _sigmas(lines, max(_SIGMA, _COARSE_SIGMA * 0.7**step))[:, None]
-        directions = _directions(angles)
+        nearby = _directions(angles[:, None] + beside)
+        directions = nearby[:, 0]
         distance = _distances(lines, directions)
-        error = (lines.normal @ directions.T) / distance
+        error = (lines.normal @ directions.swapaxes(1, 2)) / distance
         density = _SHARES * _densities(error, sigma)
-        share = weight[:, None] * density / (density.sum(axis=1, keepdims=True) + _OUTLIERS) / sigma**2
+        share = weight[:, None] * density / (density.sum(axis=2, keepdims=True) + _OUTLIERS) / sigma**2
         # The distance changes as well, but for small errors it does not matter.
-        change = [(_directions(angles + delta) - directions) / _DELTA for delta in _DELTA * np.eye(3)]
-        slopes = np.stack([(lines.normal @ turn.T) / distance for turn in change])
-        weighted = share * slopes
-        information = np.einsum("ind,jnd->ij", weighted, slopes) + np.diag(prior) + 1e-3 * np.eye(3)
-        gradient = np.einsum("ind,nd->i", weighted, error) + prior * angles
-        angles = angles - np.linalg.solve(information, gradient)
+        change = (nearby[:, 1:] - directions[:, None]) / _DELTA
+        slopes = (lines.normal @ change.swapaxes(2, 3)) / distance[:, None]
+        weighted = (share[:, None] * slopes).reshape(len(angles), 3, -1)
+        information = weighted @ slopes.reshape(weighted.shape).swapaxes(1, 2) + np.diag(prior) + 1e-3 * np.eye(3)
+        gradient = (weighted @ error.reshape(len(angles), -1, 1))[..., 0] + prior * angles
+        angles = angles - np.linalg.solve(information, gradient[..., None])[..., 0]
     density = _SHARES * _densities(_errors(lines, _directions(angles)), sigma)
-    score = float(weight @ np.log(density.sum(axis=1) + _OUTLIERS) - 0.5 * (prior * angles * angles).sum())
-    return angles, score, np.linalg.inv(information)
+    score = np.log(density.sum(axis=2) + _OUTLIERS) @ weight - 0.5 * (prior * angles * angles).sum(axis=1)
+    return list(zip(angles, score.tolist(), np.linalg.inv(information), strict=True))

@@ -16,15 +16,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import csr_array
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.levelling import Attitude, estimate_attitude, lines_of
 from lalaloc_core.photograph.overlap import Features, Link, find_links
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Standard deviation (radians) of the ray of a match, and residual beyond which it counts less and less.
 _RAY_SD, _OUTLIER = 0.006, 3.0
@@ -284,6 +287,9 @@ class _Fit:
 
     def _jacobian(self, values: Float[np.ndarray, "p"]) -> csr_array:
         """Return the derivatives; a match depends on the angles of two photographs only."""
+        # It takes as long to import as all else that reads a photograph.
+        from scipy.sparse import csr_array
+
         angles, log_focal, nearness = self._angles(values), float(values[-3]), float(values[-2])
         pair = angles[self._first], angles[self._second]
         base = self._match_residuals(*pair, log_focal, nearness)

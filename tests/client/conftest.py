@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from lalaloc_client import AsyncClient, Client
-from tests.service.conftest import _clean_environment, database_of, panorama, postgres, start_app
+from tests.service.conftest import _clean_environment, database_of, empty_database, panorama, postgres, start_app
 
-__all__ = ["_clean_environment", "database_of", "panorama", "postgres", "start_app"]
+__all__ = ["_clean_environment", "database_of", "empty_database", "panorama", "postgres", "start_app"]
 
 MakeClient = Callable[..., AbstractContextManager[Any]]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from tests.core.questions import run_info
 from tests.strategies import present
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture
@@ -180,6 +183,45 @@ class TestCommandLine:
         with pytest.raises(InvalidInputError, match="no queries"):
             run_evaluation(folder, dataclasses.replace(layout_run, generated=silent), workers=0)
         assert not folder.path.exists()
+
+
+def test_scene_is_solved_as_one_album(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, run = tmp_path / "data" / "flat", tmp_path / "run"
+    scene.mkdir(parents=True)
+    shutil.copy(EXAMPLES / "flat.json", scene / "plan.json")
+    for name in ("kitchen.jpg", "study.jpg", "phone.jpg"):
+        shutil.copy(EXAMPLES / name, scene)
+    (scene / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
+    # The place of the study's photograph is wrong: one correction makes all rooms right.
+    (scene / "poses.csv").write_text(
+        "panorama,x_m,y_m,heading_deg\nbroken.jpg,2.9,1.5,335\n"
+        "kitchen.jpg,7.1,2.2,250\nstudy.jpg,2.6,6.75,340\nphone.jpg,2.9,1.5,335\n"
+    )
+    command = ["evaluate", "--albums", "--data", str(scene.parent), "--workers", "0", "--out", str(run)]
+    assert main(command) != 0
+    assert "scene 'flat', room 'broken.jpg'" in capsys.readouterr().err
+    assert main([*command[:-1], str(tmp_path / "skipping"), "--skip-bad", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["n"], report["skipped"], report["clicks_per_album"]) == (3, 1, 1.0)
+    for share in ("correct_room", "within_1m_30deg"):
+        assert report["final"][share]["value"] == pytest.approx(2 / 3, abs=1e-3)
+    # Two rooms are right, and all three are sure.
+    assert report["room_calibration_error"] == pytest.approx(1 / 3, abs=0.1)
+    phone = RunFolder(tmp_path / "skipping").read_predictions()[2]
+    assert (phone.room_rank, phone.clicks, list(phone.stages)) == (1, 1, ["album"])
+    assert main(["score", str(tmp_path / "skipping")]) == 0
+    assert "corrections of an album until all rooms are right: 1.0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--heading", "known"], ["--refine", "vdr"], ["--method", "icp"], ["--view", "70", "--heading-error", "5"]],
+)
+def test_options_of_single_photographs_are_refused_for_albums(
+    options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "--albums", *options]) != 0
+    assert ("--albums" if "--method" in options else options[-2]) in capsys.readouterr().err
 
 
 def test_figures_cover_every_panorama_and_azimuth() -> None:

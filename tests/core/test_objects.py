@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import struct
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,6 +78,32 @@ def test_bed_is_seen_where_it_stands() -> None:
     assert beds
     assert math.degrees(beds[0].azimuth) == pytest.approx(15.0, abs=25.0)
     assert next(iter(shown.room_type.shares())) == "bedroom"
+
+
+def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
+    asked, rooms = (view("hotel_room", BED_DEG), 0.0), plan("kitchen", "bedroom")
+    grid = build_grid(rooms, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+    alone = query(asked)
+    found = localise(rooms, grid, encoder(), alone, refine="none")
+    parts: list[str] = []
+
+    class Helper(ThreadPoolExecutor):
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+            parts.append(fn.__name__)
+            return super().submit(fn, *args, **kwargs)
+
+    with Helper(1) as helper:
+        encoder().use_helper(lambda: helper)
+        try:
+            beside = query(asked)
+            again = localise(rooms, grid, encoder(), beside, refine="none")
+        finally:
+            encoder().use_helper(lambda: None)
+    assert parts == ["_seen_objects", "by_chance"]
+    assert beside.objects is not None
+    assert alone.objects is not None
+    assert beside.objects.objects == alone.objects.objects
+    assert again.signals == found.signals
 
 
 def test_room_of_the_seen_type_wins_among_equal_rooms() -> None:

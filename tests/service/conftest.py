@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -97,13 +98,26 @@ def ray_address() -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def start_app(request: pytest.FixtureRequest, tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
+def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """SQLite database without content, to be copied: all migrations take as long as the rest of a start."""
+    path = tmp_path_factory.mktemp("database") / "lalaloc.sqlite3"
+    Store(f"sqlite:///{path}").close()
+    return path
+
+
+@pytest.fixture(scope="session")
+def start_app(
+    request: pytest.FixtureRequest, tiny_bundle: Path, database_of: DatabaseOf, empty_database: Path
+) -> StartApp:
     """Start the production app in this process, by default without LPO workers."""
 
     @contextmanager
     def start(data_dir: Path, **overrides: Any) -> Iterator[httpx.Client]:
         if not (url := database_of(data_dir)).startswith("sqlite"):
             overrides = {"database_url": url} | overrides
+        elif "database_url" not in overrides and not (data_dir / empty_database.name).exists():
+            data_dir.mkdir(parents=True, exist_ok=True)
+            shutil.copy(empty_database, data_dir)
         values = {"data_dir": data_dir, "bundle": tiny_bundle, "workers": 0, "onnx_threads": 1, "log_level": "error"}
         values |= {"decode_workers": 1, "import_workers": 1}
         settings = Settings(**(values | overrides))

@@ -18,6 +18,7 @@ from tests.service.conftest import (
     StartApp,
     _clean_environment,  # noqa: F401
     database_of,  # noqa: F401
+    empty_database,  # noqa: F401
     start_app,  # noqa: F401
 )
 

@@ -5,55 +5,36 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.evaluate.methods.lalaloc import found_pose
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
 from lalaloc_core.learn.data.drawn_rooms import plan_of_rooms
 from lalaloc_core.learn.data.synthetic.albums import taken_album, two_views
 from lalaloc_core.learn.data.views import encode_jpeg
-from lalaloc_core.localise.album.corrections import Correction
-from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry
-from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.memory import AlbumMemory
-from lalaloc_core.localise.album.solve import solve_album
-from lalaloc_core.localise.belief import photograph_heading
-from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import stated_height
-from lalaloc_core.photograph import StatedCamera, open_photograph
+from lalaloc_core.photograph import StatedCamera
 from lalaloc_core.photograph.taken import Taken
 
-_PHOTOGRAPHS, _PLAN = 20, "plan"
+_PHOTOGRAPHS = 20
 # Annotated rooms of an album, their distance (m), and the field of view (degrees) of their two photographs.
 _ROOMS, _APART_M, _FIELD_DEG = 10, 3.0, 70.0
 _BEGIN = datetime(2026, 1, 1, 12)
 _NEAR_M, _TURNED = 1.0, math.radians(30.0)
-
-
-class _Truth(NamedTuple):
-    position_m: Float[np.ndarray, "2"]
-    room_id: str
-    heading: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Case:
-    """An album with the true poses of its photographs."""
-
-    ground: AlbumGround
-    photographs: list[AlbumPhotograph]
-    truth: list[_Truth]
 
 
 class _Score(NamedTuple):
@@ -82,7 +63,7 @@ def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: P
         _add(scores, "without_order", _solved(model, case, memory, by_time=False))
         _add(scores, "each_alone", _alone(model, case))
         begin = time.perf_counter()
-        count = _clicks(model, case, memory)
+        count = case.clicks(model, memory)
         clicks.append(count)
         again_s.append((time.perf_counter() - begin) / (count + 1))
         _add(scores, "spheres", _solved(model, _home(model, index, textures, spheres=True), AlbumMemory()))
@@ -95,18 +76,17 @@ def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: P
     return figures
 
 
-def _home(model: LocalModel, index: int, textures: Path | None, *, spheres: bool) -> _Case:
+def _home(model: LocalModel, index: int, textures: Path | None, *, spheres: bool) -> AlbumCase:
     album = taken_album("test", index, _PHOTOGRAPHS, spheres=spheres, textures=textures)
-    plan, rooms = album.plan, album.plan.rooms
     photographs = [
         _entry(model, number, each.pixels, "equirectangular" if spheres else "perspective", each.taken_s)
         for number, each in enumerate(album.photographs)
     ]
-    truth = [_Truth(each.position_m, rooms[each.room_index].id, each.heading) for each in album.photographs]
-    return _Case(_ground(model, plan), photographs, truth)
+    truth = [Pose.at(each.position_m, each.room_index, each.heading) for each in album.photographs]
+    return AlbumCase.of(model, album.plan, photographs, truth)
 
 
-def _annotated(model: LocalModel, folder: Path) -> list[_Case]:
+def _annotated(model: LocalModel, folder: Path) -> list[AlbumCase]:
     """Return an album for every photograph that counts: its room with nine others, drawn at random."""
     usable = [photograph for photograph in AnnotatedPhotographs(folder).photographs if photograph.counts]
     cases = []
@@ -121,50 +101,33 @@ def _annotated(model: LocalModel, folder: Path) -> list[_Case]:
             left_m += float(np.ptp(outline_m[:, 0])) + _APART_M
         moved = [each.outlines[0].moved(place) for each, place in zip(chosen, places, strict=True)]
         plan = plan_of_rooms(f"rooms with {own.name}", moved, CAMERA_HEIGHT_M)
-        photographs, truth = list[AlbumPhotograph](), list[_Truth]()
+        photographs, truth = list[AlbumPhotograph](), list[Pose]()
         for photograph, place in zip(chosen, places, strict=True):
-            room = plan.rooms[int(plan.room_index_at(place[None])[0])]
+            room_index = int(plan.room_index_at(place[None])[0])
             for pixels, azimuth in two_views(photograph.photograph.image(512, 1024), _FIELD_DEG, rng):
                 photographs.append(_entry(model, len(photographs), pixels, "perspective", None))
-                truth.append(_Truth(place, room.id, azimuth))
-        cases.append(_Case(_ground(model, plan), photographs, truth))
+                truth.append(Pose.at(place, room_index, azimuth))
+        cases.append(AlbumCase.of(model, plan, photographs, truth))
     return cases
-
-
-def _ground(model: LocalModel, plan: FloorPlan) -> AlbumGround:
-    return AlbumGround.of_plan(_PLAN, plan, model.grid(plan, plan.camera_height_m))
 
 
 def _entry(
     model: LocalModel, number: int, pixels: UInt8[np.ndarray, "h w 3"], projection: str, taken_s: float | None
 ) -> AlbumPhotograph:
-    manifest = model.bundle.manifest
-    view = open_photograph(
-        encode_jpeg(pixels),
-        sphere_size=sphere_size(manifest),
-        stated=StatedCamera(projection=projection),
-        patch_size=patch_size(manifest),
-        overview=True,
-    )
     at = None if taken_s is None else _BEGIN + timedelta(seconds=int(taken_s))
     taken = Taken(at=at, width=pixels.shape[1], height=pixels.shape[0])
-    return photograph_entry(f"{number:03d}", model.encoder.with_features(view), taken)
+    return album_entry(model, f"{number:03d}", encode_jpeg(pixels), StatedCamera(projection=projection), taken)
 
 
-def _solved(model: LocalModel, case: _Case, memory: AlbumMemory, *, by_time: bool = True) -> list[_Score]:
-    pins = solve_album(case.ground, model.encoder, case.photographs, memory=memory, by_time=by_time).pins
-    found = []
-    for pin, truth in zip(pins, case.truth, strict=True):
-        pose = pin.pose
-        if pose is None:
-            found.append(_Score(False, False, False, 0.0))
-            continue
-        place = np.array([pose.x_m, pose.y_m])
-        found.append(_score(truth, pose.room_id, place, pose.heading or 0.0, pin.confidence))
-    return found
+def _solved(model: LocalModel, case: AlbumCase, memory: AlbumMemory, *, by_time: bool = True) -> list[_Score]:
+    pins = case.solve(model, memory, by_time=by_time)
+    return [
+        _score(truth, None if pin.pose is None else case.pose(pin.pose), pin.confidence)
+        for pin, truth in zip(pins, case.truth, strict=True)
+    ]
 
 
-def _alone(model: LocalModel, case: _Case) -> list[_Score]:
+def _alone(model: LocalModel, case: AlbumCase) -> list[_Score]:
     """Localise each photograph alone, as the service does."""
     ground, manifest = case.ground, model.bundle.manifest
     found = []
@@ -175,34 +138,16 @@ def _alone(model: LocalModel, case: _Case) -> list[_Score]:
         room_share = float(answer.posterior.pose[ground.grid.poses.room_index == best.room_index].sum())
         confidence = answer.confidence(manifest.confidence_for(view=query.is_view))
         fit = 1.0 if confidence is None else confidence.fit
-        room_id = ground.plan.rooms[best.room_index].id
-        heading = photograph_heading(query, best)
-        found.append(_score(truth, room_id, best.position_m, heading, fit * room_share))
+        found.append(_score(truth, found_pose(query, best), fit * room_share))
     return found
 
 
-def _score(truth: _Truth, room_id: str, place: np.ndarray, heading: float, confidence: float) -> _Score:
-    near = float(np.linalg.norm(place - truth.position_m)) < _NEAR_M
-    turned = abs(float(wrap_angle(heading - truth.heading)))
-    return _Score(room_id == truth.room_id, near and turned < _TURNED, near, confidence)
-
-
-def _clicks(model: LocalModel, case: _Case, memory: AlbumMemory) -> int:
-    """Return how many pins must be corrected, the least sure wrong one first, until all rooms are right."""
-    photographs = list(case.photographs)
-    for count in range(len(photographs)):
-        pins = solve_album(case.ground, model.encoder, photographs, memory=memory).pins
-        wrong = [
-            (pin.confidence, number)
-            for number, (pin, truth) in enumerate(zip(pins, case.truth, strict=True))
-            if pin.pose is None or pin.pose.room_id != truth.room_id
-        ]
-        if not wrong:
-            return count
-        number = min(wrong)[1]
-        stated = Correction(kind="room", plan_id=_PLAN, room_id=case.truth[number].room_id)
-        photographs[number] = replace(photographs[number], correction=stated)
-    return len(photographs)
+def _score(truth: Pose, pose: Pose | None, confidence: float) -> _Score:
+    if pose is None:
+        return _Score(False, False, False, 0.0)
+    near = float(np.linalg.norm(pose.position_m - truth.position_m)) < _NEAR_M
+    turned = abs(float(wrap_angle(pose.heading - truth.heading)))
+    return _Score(pose.room_index == truth.room_index, near and turned < _TURNED, near, confidence)
 
 
 def _add(scores: dict[str, list[_Score]], row: str, found: Sequence[_Score]) -> None:

@@ -129,6 +129,11 @@ def _facts(run: Run) -> dict[str, str]:
         "Grid": f"{info.grid_step_m:g} m",
         "Model": _model(info),
     }
+    if run.scores is not None and run.scores.clicks_per_album is not None:
+        facts["Albums"] = (
+            f"{run.scores.clicks_per_album:.1f} corrections each until all rooms are right; "
+            f"calibration error of the room {run.scores.room_calibration_error:.3f}"
+        )
     if info.generated is not None:
         facts["Generator"] = ", ".join(f"{name} {value}" for name, value in info.generated.items() if value is not None)
     return facts

@@ -25,7 +25,8 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
 from lalaloc_core.evaluate.methods.method import Answer, Method, Pose, Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
-from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
+from lalaloc_core.evaluate.runs.albums import predict_album
+from lalaloc_core.evaluate.runs.factories import build_dataset, build_method, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.learn.data.dataset import (
     Appearance,
@@ -36,6 +37,7 @@ from lalaloc_core.learn.data.dataset import (
     load_scenes,
     photograph_facts,
 )
+from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 # Fields of a run that may differ when it resumes.
@@ -135,18 +137,19 @@ def _localise_scenes(
 
 @dataclass(frozen=True)
 class _Session:
-    """State of a worker process between scenes."""
+    """State of a worker process between scenes; a `LocalModel` solves albums."""
 
     info: RunInfo
     dataset: Dataset
-    method: Method
+    method: Method | LocalModel
 
 
 @lru_cache(maxsize=1)
 def _session(description: str) -> _Session:
     torch.set_num_threads(1)
     info = build_config(RunInfo, json.loads(description))
-    return _Session(info, build_dataset(info), build_method(info))
+    method = LocalModel(require_bundle(info)) if info.albums else build_method(info)
+    return _Session(info, build_dataset(info), method)
 
 
 def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list[DatasetError]]:
@@ -156,6 +159,10 @@ def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list
     problems: list[DatasetError] | None = [] if info.skip_bad else None
     predictions: list[Prediction] = []
     for scene in load_scenes(session.dataset, [name], problems):
+        if isinstance(session.method, LocalModel):
+            with collect_error(problems):
+                predictions += predict_album(scene, info, session.method, problems)
+            continue
         evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
             with collect_error(problems):

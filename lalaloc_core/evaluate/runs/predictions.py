@@ -47,6 +47,8 @@ class Prediction:
         information: curvature of the cost at the final pose, by x and y (m) and, if searched, heading (radians).
         confidence: predicted probability of a position error below 1 m.
         heading_confidence: predicted probability of a heading error below 5°.
+        room_confidence: predicted probability that the room is right; None outside albums.
+        clicks: corrections that its album needs until all rooms are right; None outside albums.
         facts: known difficulties of the photograph, in alphabetical order; see `learn.data.dataset.Described`.
     """
 
@@ -64,6 +66,8 @@ class Prediction:
     candidates: tuple[PredictedCandidate, ...] = ()
     confidence: float | None = None
     heading_confidence: float | None = None
+    room_confidence: float | None = None
+    clicks: int | None = None
     found_height_m: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     facts: tuple[str, ...] = ()
@@ -88,6 +92,7 @@ class RunInfo:
         data_format: one of `DATASET_FORMATS`; None to detect it.
         generated: arguments of the generator if `data` is None.
         views: arguments of `ViewScenes`, which cuts views of the photographs; None for whole spheres.
+        albums: whether the photographs of a scene are solved together, as one album.
         furniture, lighting: appearance of the photographs; None if the data set has no such choice.
         bundle: folder of the model; None for methods without one.
         skipped: skipped scenes and cameras, with reasons.
@@ -103,6 +108,7 @@ class RunInfo:
     data_format: str | None = None
     generated: dict[str, Any] | None = None
     views: dict[str, Any] | None = None
+    albums: bool = False
     furniture: str | None = None
     lighting: str | None = None
     heading_known: bool = True

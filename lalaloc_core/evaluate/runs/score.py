@@ -84,6 +84,8 @@ class Scores:
         layout_recall, pose_recall: Layout R@1 and Pose R@1; None for methods without retrieval.
         stages: accuracy by stage, in order.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
+        room_calibration_error: the same of the right room; None outside albums.
+        clicks_per_album: mean number of corrections until all rooms are right; None outside albums.
         median_ms, mean_ms: duration by stage, over the queries that reached it.
         slices: accuracy by fact (`Prediction.facts`), the smallest share within 1 m first.
     """
@@ -96,6 +98,8 @@ class Scores:
     final: StageScores
     calibration_error: float | None = None
     reliability: tuple[ReliabilityBin, ...] = ()
+    room_calibration_error: float | None = None
+    clicks_per_album: float | None = None
     median_ms: dict[str, float] = field(default_factory=dict)
     mean_ms: dict[str, float] = field(default_factory=dict)
     slices: dict[str, SliceScores] = field(default_factory=dict)
@@ -119,6 +123,7 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
         is_correct = position_errors_m(confident) < 1.0
         reliability = reliability_bins(confidence, is_correct)
         calibration_error = expected_calibration_error(confidence, is_correct)
+    clicks = {p.scene: p.clicks for p in predictions if p.clicks is not None}
     return Scores(
         n=len(predictions),
         unanswered=int(np.isnan(final).sum()),
@@ -128,6 +133,8 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
         final=_stage_scores(bootstrap, predictions, None),
         calibration_error=calibration_error,
         reliability=reliability,
+        room_calibration_error=_room_calibration_error(predictions),
+        clicks_per_album=float(np.mean(list(clicks.values()))) if clicks else None,
         median_ms=_timings(predictions, np.median),
         mean_ms=_timings(predictions, np.mean),
         slices=_slices(bootstrap, predictions),
@@ -243,8 +250,6 @@ class _Bootstrap:
 def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stage: str | None) -> StageScores:
     error = _infinite(position_errors_m(predictions, stage))
     heading = _infinite(heading_errors_deg(predictions, stage))
-    pairs = [(prediction.pose_after(stage), prediction.truth) for prediction in predictions]
-    rooms = [pose is not None and pose.room_index == truth.room_index for pose, truth in pairs]
     return StageScores(
         median_cm=_centimetres(bootstrap.median(error)),
         within_1cm=bootstrap.share(error < 0.01),
@@ -253,10 +258,22 @@ def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stag
         within_50cm=bootstrap.share(error < 0.50),
         within_1m=bootstrap.share(error < 1.0),
         within_1m_30deg=bootstrap.share((error < 1.0) & (heading < 30.0)),
-        correct_room=bootstrap.share(np.array(rooms)),
+        correct_room=bootstrap.share(_right_rooms(predictions, stage)),
         median_heading_error_deg=bootstrap.median(heading),
         heading_within_2deg=bootstrap.share(heading < 2.0),
     )
+
+
+def _right_rooms(predictions: Sequence[Prediction], stage: str | None = None) -> Bool[np.ndarray, "n"]:
+    pairs = [(prediction.pose_after(stage), prediction.truth) for prediction in predictions]
+    return np.array([pose is not None and pose.room_index == truth.room_index for pose, truth in pairs])
+
+
+def _room_calibration_error(predictions: Sequence[Prediction]) -> float | None:
+    confidence = [p.room_confidence for p in predictions if p.room_confidence is not None]
+    if len(confidence) < len(predictions):
+        return None
+    return expected_calibration_error(np.array(confidence), _right_rooms(predictions))
 
 
 def _slices(bootstrap: _Bootstrap, predictions: Sequence[Prediction]) -> dict[str, SliceScores]:

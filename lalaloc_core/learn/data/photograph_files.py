@@ -32,17 +32,25 @@ class FilePhotograph:
     depth_path: Path | None = None
     size: tuple[int, int] | None = None
 
+    def content(self) -> bytes:
+        """Return the file.
+
+        Raises:
+            DatasetError: the file is missing, or not of the data set's size.
+        """
+        content = self._read(self.path)
+        if self.size is not None:
+            self._check_size(self.path, content)
+        return content
+
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size.
 
         Raises:
             DatasetError: the file is missing, damaged, not a panorama, or not of the data set's size.
         """
-        content = self._read(self.path)
-        limits = PhotographLimits()
-        if self.size is not None:
-            self._check_size(self.path, content)
-            limits = PhotographLimits(min_height=self.size[0])
+        content = self.content()
+        limits = PhotographLimits() if self.size is None else PhotographLimits(min_height=self.size[0])
         try:
             return read_sphere(content, height=height, width=width, limits=limits)
         except InvalidPhotographError as error:

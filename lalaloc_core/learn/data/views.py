@@ -139,19 +139,29 @@ class ViewPhotograph(WithoutDepth):
     roll: float
     stated: Stated = "field"
 
-    def open(self, size: PatchSize) -> Photograph:
-        """Read the photograph as the service reads a file."""
+    @property
+    def stated_camera(self) -> StatedCamera:
+        """Return what is known about it as a query states it."""
         tilted = self.stated == "tilt"
-        stated = StatedCamera(
+        return StatedCamera(
             projection="perspective",
             hfov_deg=None if self.stated == "nothing" else self.field_deg,
             pitch_deg=math.degrees(self.pitch) if tilted else None,
             roll_deg=math.degrees(self.roll) if tilted else None,
         )
+
+    def content(self) -> bytes:
+        """Return the photograph as a file."""
+        camera = Perspective.of_hfov(*_VIEW_SIZE, math.radians(self.field_deg))
+        pixels = cut_view(self.sphere.pixels, camera, azimuth=self.azimuth, pitch=self.pitch, roll=self.roll)
+        return encode_jpeg(pixels)
+
+    def open(self, size: PatchSize) -> Photograph:
+        """Read the photograph as the service reads a file."""
         return open_photograph(
-            encode_jpeg(self._pixels()),
+            self.content(),
             sphere_size=_SPHERE_SIZE,
-            stated=stated,
+            stated=self.stated_camera,
             patch_size=size,
             # Disturbed renderings of white walls are as pale as paper.
             refuse_drawings=False,
@@ -161,10 +171,6 @@ class ViewPhotograph(WithoutDepth):
         """Return the whole sphere at the given size, turned to the view."""
         pixels = self.sphere.photograph.image(height, width)
         return np.roll(pixels, -round(self.azimuth / TWO_PI * width), axis=1)
-
-    def _pixels(self) -> UInt8[np.ndarray, "h w 3"]:
-        camera = Perspective.of_hfov(*_VIEW_SIZE, math.radians(self.field_deg))
-        return cut_view(self.sphere.pixels, camera, azimuth=self.azimuth, pitch=self.pitch, roll=self.roll)
 
 
 def encode_jpeg(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:

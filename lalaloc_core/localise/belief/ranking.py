@@ -64,21 +64,24 @@ def suppress(
     distinct if their headings differ. At most `limit` poses are returned; poses below the cost `ceiling` are limited by
     `limit_below` instead, if that is larger.
     """
-    remaining = ranking(cost, position_m, heading)
+    order = ranking(cost, position_m, heading)
+    x_m, y_m = np.ascontiguousarray(position_m[order].T)
+    left, first = np.ones(len(order), bool), 0
     kept: list[int] = []
-    while len(remaining) and len(kept) < max(limit, limit_below):
-        index = int(remaining[0])
+    while len(kept) < max(limit, limit_below) and left[first:].any():
+        first += int(left[first:].argmax())
+        index = int(order[first])
         if len(kept) >= limit and not cost[index] < ceiling:
             break
         kept.append(index)
-        x_m, y_m = (position_m[remaining] - position_m[index]).T
-        near = np.flatnonzero(np.sqrt(x_m * x_m + y_m * y_m) < separation_m)
+        near = first + np.flatnonzero(
+            left[first:]
+            & (np.sqrt(np.square(x_m[first:] - x_m[first]) + np.square(y_m[first:] - y_m[first])) < separation_m)
+        )
         if heading is not None:
-            turned = wrap_angle(heading[remaining[near]] - heading[index])
+            turned = wrap_angle(heading[order[near]] - heading[index])
             near = near[np.abs(turned) <= HEADING_SEPARATION]
-        apart = np.ones(len(remaining), bool)
-        apart[near] = apart[0] = False
-        remaining = remaining[apart]
+        left[near] = left[first] = False
     return kept
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Executor
+
 import numpy as np
 from jaxtyping import Float
 
@@ -22,6 +25,7 @@ class LayoutEncoder:
     Attributes:
         manifest: the bundle's manifest.
         cohort: poses of other homes; None if the bundle has none.
+        helper: returns threads that take over a part of a query, or None if no core is idle.
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
@@ -32,6 +36,7 @@ class LayoutEncoder:
         """
         self.manifest = bundle.manifest
         self.cohort = Cohort.of_bundle(bundle)
+        self.helper: Callable[[], Executor | None] = lambda: None
         self._session = open_session(bundle.read(LAYOUT_ONNX), threads)
 
     def layouts(

@@ -83,6 +83,8 @@ class PhotographEncoder(LayoutEncoder):
         self.check(photograph)
         assert self._views is not None
         turned = [(photograph, 0.0), *others]
+        helper = None if photograph.features is not None or self._objects is None else self.helper()
+        beside = None if helper is None else helper.submit(self._seen_objects, turned)
         if photograph.features is None:
             outputs = self._views.outputs([patch.rgba for view, _ in turned for patch in view.patches], height_m)
         else:
@@ -92,7 +94,7 @@ class PhotographEncoder(LayoutEncoder):
         query = self._views.query_of_outputs(
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
-        objects = self._seen_objects(turned)
+        objects = self._seen_objects(turned) if beside is None else beside.result()
         several = {"objects": objects, "is_turn": bool(others)}
         searched = None if query.searched is None else replace(query.searched, **several)
         return replace(query, **several, searched=searched)
@@ -143,8 +145,8 @@ class PhotographEncoder(LayoutEncoder):
             )
 
     def use_helper(self, helper: Callable[[], Executor | None]) -> None:
-        """Encode spheres on a second thread whenever `helper` returns one; see `SphereEncoder`."""
-        self.spheres.helper = helper
+        """Share the work of a query with a second thread whenever `helper` returns one."""
+        self.helper = self.spheres.helper = helper
 
     def warm_up(self) -> None:
         """Run each network once, because the first run allocates memory."""

@@ -281,7 +281,14 @@ class _Search:
         self._weights = encoder.manifest.evidence_for(view=query.is_view)
         self._clock, self._hints, self._top_k = clock, hints, top_k
         weights, matching = self._weights, config.matching
+        reach_m = matching.grid_reach * grid.step_m
+
+        def by_chance(query: Query) -> float | None:
+            return cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching)
+
         with clock.stage("retrieve"):
+            helper = encoder.helper()
+            beside = None if helper is None else helper.submit(by_chance, query)
             given = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
             self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=given)
             self.query = query = query.searched if self._doubted and query.searched is not None else query
@@ -301,8 +308,7 @@ class _Search:
             )
             self._lpo_count = config.starts(query, self.modes)
             self._grid_cost = float(costs.cost.min())
-            reach_m = matching.grid_reach * grid.step_m
-            self._by_chance = cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching)
+            self._by_chance = by_chance(query) if beside is None or self._doubted else beside.result()
         self.by_walls = matching.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
         # The mode that each candidate of `without_lpo` comes from.

@@ -1,0 +1,156 @@
+"""Albums in evaluation: the photographs of one place, solved together and compared with their true poses."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lalaloc_core.errors import DatasetError, InvalidInputError, InvalidPhotographError
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, collect_error
+from lalaloc_core.learn.data.photograph_files import FilePhotograph
+from lalaloc_core.learn.data.views import ViewPhotograph, encode_jpeg
+from lalaloc_core.localise.album.corrections import Correction
+from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.pins import Pin, PinPose
+from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
+from lalaloc_core.photograph import StatedCamera, open_photograph
+from lalaloc_core.photograph.taken import Taken, read_taken
+
+_PLAN = "plan"
+# Size of generated spheres, pixels.
+_SPHERE_SIZE = (512, 1024)
+
+
+@dataclass(frozen=True, eq=False)
+class AlbumCase:
+    """An album with the true poses of its photographs."""
+
+    ground: AlbumGround
+    photographs: list[AlbumPhotograph]
+    truth: list[Pose]
+
+    @classmethod
+    def of(
+        cls,
+        model: LocalModel,
+        plan: FloorPlan,
+        photographs: list[AlbumPhotograph],
+        truth: list[Pose],
+        step_m: float = GRID_STEP_M,
+    ) -> AlbumCase:
+        """Return the case of one plan, with poses `step_m` apart."""
+        grid = model.grid(plan, plan.camera_height_m, step_m)
+        return cls(AlbumGround.of_plan(_PLAN, plan, grid), photographs, truth)
+
+    def solve(self, model: LocalModel, memory: AlbumMemory, *, by_time: bool = True) -> Sequence[Pin]:
+        """Return a pin for every photograph."""
+        return solve_album(self.ground, model.encoder, self.photographs, memory=memory, by_time=by_time).pins
+
+    def pose(self, pin: PinPose) -> Pose:
+        """Return the pose of a pin; an unknown heading is 0."""
+        rooms = [room.id for room in self.ground.plan.rooms]
+        return Pose(x_m=pin.x_m, y_m=pin.y_m, room_index=rooms.index(pin.room_id), heading_deg=pin.heading_deg or 0.0)
+
+    def clicks(self, model: LocalModel, memory: AlbumMemory) -> int:
+        """Return how many pins must be corrected, the least sure wrong one first, until all rooms are right."""
+        rooms = [self.ground.plan.rooms[truth.room_index].id for truth in self.truth]
+        case = self
+        for count in range(len(rooms)):
+            pins = case.solve(model, memory)
+            wrong = [
+                (pin.confidence, number)
+                for number, (pin, room) in enumerate(zip(pins, rooms, strict=True))
+                if pin.pose is None or pin.pose.room_id != room
+            ]
+            if not wrong:
+                return count
+            number = min(wrong)[1]
+            stated = Correction(kind="room", plan_id=_PLAN, room_id=rooms[number])
+            corrected = replace(case.photographs[number], correction=stated)
+            photographs = [*case.photographs[:number], corrected, *case.photographs[number + 1 :]]
+            case = replace(case, photographs=photographs)
+        return len(rooms)
+
+
+def album_entry(model: LocalModel, id: str, content: bytes, stated: StatedCamera, taken: Taken) -> AlbumPhotograph:
+    """Return the entry of a photograph's file.
+
+    Raises:
+        InvalidPhotographError: the file cannot be read.
+    """
+    manifest = model.bundle.manifest
+    view = open_photograph(
+        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), overview=True
+    )
+    return photograph_entry(id, model.encoder.with_features(view), taken)
+
+
+def predict_album(
+    scene: Scene, info: RunInfo, model: LocalModel, problems: list[DatasetError] | None
+) -> list[Prediction]:
+    """Solve the photographs of a scene as one album; nothing is stated about their poses.
+
+    Photographs that cannot be used are left out and their errors appended to `problems`; None raises the first error.
+
+    Raises:
+        DatasetError: the place is too large for an album, or a photograph cannot be used and `problems` is None.
+    """
+    cameras, photographs = list[Camera](), list[AlbumPhotograph]()
+    for camera in scene.cameras:
+        with collect_error(problems):
+            photograph = scene.photograph(camera, Appearance(info.furniture, info.lighting))
+            try:
+                photographs.append(_entry(model, camera.name, photograph))
+            except InvalidPhotographError as error:
+                raise DatasetError(str(error), scene=scene.name, room=camera.name) from error
+            cameras.append(camera)
+    if not photographs:
+        return []
+    truth = [Pose.at(camera.position_m, camera.room_index, camera.heading) for camera in cameras]
+    case = AlbumCase.of(model, scene.plan, photographs, truth, info.grid_step_m)
+    memory, begin = AlbumMemory(), time.perf_counter()
+    try:
+        pins = case.solve(model, memory)
+    except InvalidInputError as error:
+        raise DatasetError(str(error), scene=scene.name) from error
+    each_ms = 1e3 * (time.perf_counter() - begin) / len(pins)
+    clicks = case.clicks(model, memory)
+    return [_prediction(case, scene, camera, pin, clicks, each_ms) for camera, pin in zip(cameras, pins, strict=True)]
+
+
+def _prediction(case: AlbumCase, scene: Scene, camera: Camera, pin: Pin, clicks: int, each_ms: float) -> Prediction:
+    suggested = [case.pose(suggestion.pose).room_index for suggestion in pin.suggestions]
+    return Prediction(
+        scene=scene.name,
+        camera=camera.name,
+        room=scene.plan.rooms[camera.room_index].name,
+        camera_height_m=camera.camera_height_m,
+        truth=Pose.at(camera.position_m, camera.room_index, camera.heading),
+        stages={} if pin.pose is None else {"album": case.pose(pin.pose)},
+        room_rank=suggested.index(camera.room_index) + 1 if camera.room_index in suggested else None,
+        confidence=pin.within_1m,
+        room_confidence=pin.confidence,
+        clicks=clicks,
+        timings_ms={"album": each_ms},
+    )
+
+
+def _entry(model: LocalModel, name: str, photograph: DatasetPhotograph) -> AlbumPhotograph:
+    """Return the entry of a photograph: a file of any projection, a view, or a generated sphere."""
+    if isinstance(photograph, FilePhotograph):
+        content = photograph.content()
+        return album_entry(model, name, content, StatedCamera(), read_taken(content))
+    if isinstance(photograph, ViewPhotograph):
+        content, stated = photograph.content(), photograph.stated_camera
+    else:
+        content, stated = encode_jpeg(photograph.image(*_SPHERE_SIZE)), StatedCamera(projection="equirectangular")
+    size = read_taken(content)
+    return album_entry(model, name, content, stated, Taken(width=size.width, height=size.height))
