@@ -302,7 +302,9 @@ class _Search:
             self._lpo_count = config.starts(query, self.modes)
             self._grid_cost = float(costs.cost.min())
             reach_m = matching.grid_reach * grid.step_m
-            self._by_chance = cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching)
+            self._by_chance = cost_by_chance(
+                encoder.cohort, plan, query, reach_m, weights, matching, room=self.modes[0].room_index
+            )
         self.by_walls = matching.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
         # The mode that each candidate of `without_lpo` comes from.
