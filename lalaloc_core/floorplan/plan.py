@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
+from lalaloc_core.conventions import OPENING_CLASSES, heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document, read_anchor
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
@@ -66,6 +66,7 @@ class FloorPlan:
         warnings: problems that do not prevent use, such as overlapping rooms.
         north: azimuth of true north (radians), None if unknown.
         opening_trust: probability by kind that an opening that exists is drawn; kinds that are left out have 0.
+        room_trust: the same for each room of a merged plan; empty if `opening_trust` holds for all rooms.
         opening_tolerance_m: maximum distance between an opening's line and its wall.
         opening_faces: the parts of walls that openings occupy.
         camera_height_std_m: standard deviation of `camera_height_m`; None if the plan does not give one.
@@ -80,6 +81,7 @@ class FloorPlan:
     north: float | None = None
     openings: tuple[Opening, ...] = ()
     opening_trust: Mapping[str, float] = field(default_factory=dict)
+    room_trust: tuple[Mapping[str, float], ...] = ()
     opening_tolerance_m: float = DEFAULT_OPENING_TOLERANCE_M
     opening_faces: tuple[OpeningFace, ...] = ()
     camera_height_std_m: float | None = None
@@ -209,6 +211,14 @@ class FloorPlan:
     def opening_kinds(self) -> frozenset[str]:
         """Kinds of openings that the plan shows completely."""
         return frozenset(kind for kind, trust in self.opening_trust.items() if trust == 1.0)
+
+    @cached_property
+    def class_trusts(self) -> tuple[Float[np.ndarray, "t c"], Int[np.ndarray, "r"]]:
+        """The distinct trusts by opening class, walls first, and the number of each room's."""
+        trusts = self.room_trust or (self.opening_trust,) * len(self.rooms)
+        values = np.array([[trust.get(kind, 0.0) for kind in OPENING_CLASSES] for trust in trusts])
+        distinct, number = np.unique(values, axis=0, return_inverse=True)
+        return distinct, number.reshape(-1)
 
     @property
     def area_m2(self) -> float:

@@ -372,7 +372,7 @@ def direct_coarse_costs(binned: BinnedLayouts, cost: MatchingCost, layouts: Layo
     number = np.floor(np.clip(layouts.log_profile[:, binned.columns].astype(np.float32), math.log(0.1), None) / 0.05)
     centre, precision, odds = np.moveaxis(cost.predicted_modes(binned.columns), 2, 0)
     assert (odds == 1.0).all()
-    loss, kind = present(cost.opening_costs(binned.columns)), present(layouts.kind)[:, binned.columns]
+    (loss,), kind = present(cost.opening_costs(binned.columns)), present(layouts.kind)[:, binned.columns]
     found = []
     for k in range(cost.hypotheses):
         residual = (0.05 * (number + 0.5) - centre[k] - cost.offsets[:, None, None]) * precision[k]
@@ -533,7 +533,7 @@ def test_bound_is_at_most_the_coarse_cost(
         matching_cost = matching_cost_of(building, query if azimuths == SPHERE_AZIMUTHS else view_of(query))
         binned, room_index = grid.binned(building.plan, azimuths), grid.poses.room_index
         every = coarse_costs(binned, matching_cost, room_index)
-        bound = CoarseTable(binned, matching_cost).bounds(binned) + matching_cost.room_costs.min(axis=0)[room_index]
+        bound = CoarseTable(binned, matching_cost).bounds(binned, room_index)
         least = every.min(axis=1)
         assert (bound <= least).all()
         ranks.append((bound < bound[least.argmin()]).mean())

@@ -15,6 +15,9 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, layouts_at
+from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
+from lalaloc_core.localise.match.coarse_pass import coarse_costs
+from lalaloc_core.localise.match.coarse_table import CoarseTable
 from lalaloc_core.localise.query import (
     CameraHeight,
     PredictedCeiling,
@@ -542,10 +545,44 @@ def test_merged_costs_equal_those_of_each_plan(merged_plans: MergedPlans) -> Non
     parts = []
     for plan in PLANS:
         grid = grid_of(plan)
-        # Only opening kinds that every plan shows are compared; one plan shows none.
-        compared = replace(plan, opening_trust={})
-        parts.append(MatchingCost(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
+        parts.append(MatchingCost(plan, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
     np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
+
+
+def opening_query() -> Query:
+    """Return a query that sees a door in a third of the horizon."""
+    plain = Query(np.zeros((1, 1)), np.zeros(1), 0.0, True, CameraHeight(1.5))
+    log_m = np.full((1, COLUMNS), np.log(2.0))
+    seen = np.full((COLUMNS, CLASSES), 0.1)
+    seen[np.arange(COLUMNS), np.where(np.arange(COLUMNS) < COLUMNS // 3, OPENING_CLASSES.index("door"), 0)] = 0.7
+    openings = PredictedOpenings(np.log(seen)[None], np.array([0.7, 0.1, 0.1, 0.1]))
+    return replace(plain, profile=PredictedProfile(log_m, np.full_like(log_m, np.log(0.05))), openings=openings)
+
+
+@pytest.mark.parametrize("azimuths", [SPHERE_AZIMUTHS, VIEW_AZIMUTHS])
+def test_each_merged_plan_has_its_own_trust_in_openings(azimuths: int) -> None:
+    trusts = [{"door": 1.0}, {}, {"door": 0.5}]
+    plans = [replace(plan, opening_trust=trust) for plan, trust in zip(PLANS, trusts, strict=True)]
+    merged, query = MergedPlans.of(plans, [grid_of(plan) for plan in plans], 1.5), opening_query()
+    cost = MatchingCost(merged.plan, query, 0.3, WEIGHTS, CONFIG)
+    layouts, room_index = merged.grid.layouts(merged.plan), merged.grid.poses.room_index
+    binned = BinnedLayouts.of(layouts, azimuths)
+    coarse = coarse_costs(binned, cost, room_index)
+    assert (CoarseTable(binned, cost).bounds(binned, room_index) <= coarse.min(axis=1)).all()
+    own = [MatchingCost(plan, query, 0.3, WEIGHTS, CONFIG) for plan in plans]
+    exact = np.split(cost.costs(layouts)[0][0], np.cumsum([len(grid_of(plan).poses) for plan in plans])[:-1])
+    shifts = []
+    for plan, alone, found, part in zip(
+        plans, own, exact, np.split(coarse, np.cumsum(list(map(len, exact)))[:-1]), strict=True
+    ):
+        grid = grid_of(plan)
+        difference = found - alone.costs(grid.layouts(plan))[0][0]
+        np.testing.assert_allclose(difference, difference[0], atol=1e-5)
+        estimate = part[:, 0] - coarse_costs(grid.binned(plan, azimuths), alone, grid.poses.room_index)[:, 0]
+        np.testing.assert_allclose(estimate, estimate[0], atol=1e-5)
+        shifts.append(float(difference[0]))
+    # Without a constant cost, plans that show fewer openings would always cost less.
+    assert shifts[1] > shifts[2] > shifts[0] >= 0.0
 
 
 def test_merged_layouts_equal_those_of_each_plan(merged_plans: MergedPlans) -> None:

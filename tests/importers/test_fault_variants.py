@@ -112,6 +112,18 @@ def test_chimney_in_a_hatched_wall_of_a_dxf():
     assert _areas(import_plan(dxf_file(document))) == [23.5, 22.3]
 
 
+def test_chimney_and_shaft_of_outlined_walls_divide_no_room():
+    document: Any = new_dxf("R2010", units=6)
+    left = [(4.4, 1.6), (4.4, 2.2), (0.8, 2.2), (0.8, 1.6), (0.2, 1.6), (0.2, 0.2), (4.4, 0.2), (4.4, 0.7)]
+    right = [(4.6, 0.7), (4.6, 0.2), (8.8, 0.2), (8.8, 2.2), (7.0, 2.2), (7.0, 1.6), (6.5, 1.6), (6.5, 2.2), (4.6, 2.2)]
+    outer = [(0, 0), (9, 0), (9, 2.4), (0, 2.4)]
+    for ring in (outer, [*left, *right, (4.6, 1.6)]):
+        document.modelspace().add_lwpolyline(ring, close=True)
+    plan = import_plan(dxf_file(document))
+    assert _areas(plan) == [8.1, 8.0]
+    assert len(plan.document["openings"]) == 1
+
+
 def _box(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
     return np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], float)
 

@@ -27,6 +27,10 @@ _OUT_OF_LINE_M, _SLIT_M = 0.35, 0.001
 # Share of the lines' length without a second face from which walls can be single lines, and smallest room that counts
 # in a comparison of readings (m²).
 _MOSTLY_SINGLE, _SMALLEST_COUNTED_M2 = 0.5, 1.0
+# Long outlines (m) bound a wall if they are this slim nearly everywhere, and nowhere wider, relative to the thickest.
+_LONG_M, _USUAL, _WIDEST = 10.0, 0.75, 2.0
+# Piers are so much thicker than the usual ends of walls, and shorter than so many times their own thickness.
+_PIER, _PIER_NIB = 1.6, 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +122,7 @@ def enclose(
     check_network([*bodies, *lines, *closers])
     check_time()
     faces, loose = _faces(lines, config, check_time) if lines else ([], [])
-    thin = [face for face in faces if _is_thin(face, config)]
+    thin = [face for face in faces if _is_wall(face, config)]
     # Lines that were rounded to 1 mm leave slits between the parts of a wall.
     grown = shapely.unary_union([face.buffer(_SLIT_M, join_style="mitre") for face in (*bodies, *thin)])
     solid = grown.buffer(-_SLIT_M, join_style="mitre")
@@ -157,15 +161,19 @@ def find_gaps(
     areas = WallAreas(
         [simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))]
     )
-    found: list[Gap] = []
+    ends: list[_End] = []
     for part in areas.parts:
+        check_time()
         oriented = shapely.geometry.polygon.orient(part)
         for ring in (oriented.exterior, *oriented.interiors):
-            for wall in _ends(np.asarray(ring.coords), config):
-                check_time()
-                gap = _gap_before(wall, areas, config)
-                if gap is not None:
-                    found.append(gap)
+            ends += _ends(np.asarray(ring.coords), config)
+    usual = float(np.median([wall.thickness for wall in ends])) if ends else 0.0
+    found: list[Gap] = []
+    for wall in ends:
+        check_time()
+        gap = _gap_before(wall, areas, config)
+        if gap is not None and (gap.is_between_ends or not wall.is_pier(usual)):
+            found.append(gap)
     ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
     gaps = [gap for _, _, gap in sorted(ranked, key=lambda item: item[:2])]
     tree, is_kept = shapely.STRtree([gap.shape for gap in gaps]), np.zeros(len(gaps), bool)
@@ -185,6 +193,15 @@ class _End:
     end: Float[np.ndarray, "2"]
     outward: Float[np.ndarray, "2"]
     nib: float
+
+    @property
+    def thickness(self) -> float:
+        """Length of the edge."""
+        return float(np.linalg.norm(self.end - self.start))
+
+    def is_pier(self, usual: float) -> bool:
+        """Return whether this is the face of a pier, shaft or chimney, among walls of a usual thickness."""
+        return self.thickness > _PIER * usual and self.nib < _PIER_NIB * self.thickness
 
 
 def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
@@ -394,6 +411,15 @@ def _distinct(rooms: list[shapely.Polygon]) -> list[shapely.Polygon]:
 
 def _is_thin(face: shapely.Polygon, config: WallConfig) -> bool:
     return face.buffer(-0.5 * config.thickest).is_empty
+
+
+def _is_wall(face: shapely.Polygon, config: WallConfig) -> bool:
+    """Return whether the area between lines is a wall, at most widened by shafts, chimneys and acute corners."""
+    if _is_thin(face, config):
+        return True
+    usual = 2.0 * face.area / face.length
+    is_slim = face.length >= _LONG_M and usual <= _USUAL * config.thickest
+    return is_slim and face.buffer(-0.5 * _WIDEST * config.thickest).is_empty
 
 
 def _cross(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "n"]:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI
+from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.binned_ground import BINS, KINDS, BinnedGround, bin_centres
 from lalaloc_core.localise.match import MatchingConfig
-from lalaloc_core.localise.match.cost_terms import class_losses, median_distance_m, precisions, smoothed
+from lalaloc_core.localise.match.cost_terms import median_distance_m, opening_losses, precisions, smoothed
 from lalaloc_core.localise.query import PredictedProfile, Query
 
 _CONFIG = MatchingConfig()
@@ -28,17 +29,17 @@ class Comparison:
     Attributes:
         columns: (s,) azimuth columns that the photograph shows, if it looks along azimuth 0.
         shifts: (k,) columns that each hypothesis of the heading turns it by.
-        cost: (s, b k, j) summed cost of walls and openings by bin, kind, and height error.
-        likelihood: (s, b, j) likelihood of walls alone; at most 1 counts.
-        openings: (s, k) cost of each kind of opening.
+        walls: (s, b, j) cost of walls by bin and height error.
+        likelihood: (s, b, j) likelihood of walls; at most 1 counts.
+        openings: (t, s, k) cost of each kind of opening, by the room's trust.
         factor: log likelihood of a unit of cost.
     """
 
     columns: np.ndarray
     shifts: np.ndarray
-    cost: Float[np.ndarray, "s e j"]
+    walls: Float[np.ndarray, "s b j"]
     likelihood: Float[np.ndarray, "s b j"]
-    openings: Float[np.ndarray, "s c"]
+    openings: Float[np.ndarray, "t s c"]
     factor: float
 
     @classmethod
@@ -64,35 +65,45 @@ class Comparison:
             apart = (centres - centre[:, None, None]) * precision[:, None, None]
             likelihood += odds[:, None, None] / (1.0 + np.square(apart))
         walls = -np.log(np.minimum(likelihood, 1.0))
-        loss = _opening_losses(plan, query, reach_m, weights)[columns]
-        cost = walls[:, :, None, :] + loss[:, None, :, None]
         return cls(
             columns=columns,
             shifts=np.rint(query.roll / TWO_PI * width).astype(int) % width,
-            cost=np.ascontiguousarray(cost.reshape(len(columns), BINS * KINDS, -1), np.float32),
+            walls=walls.astype(np.float32),
             likelihood=np.ascontiguousarray(likelihood, np.float32),
-            openings=loss.astype(np.float32),
+            openings=_opening_losses(plan, query, reach_m, weights)[:, columns],
             factor=weights.temperature / width,
         )
 
-    def log_likelihoods(self, ground: BinnedGround) -> Iterator[tuple[slice, Float[np.ndarray, "m k j"]]]:
-        """Yield the log likelihood of walls and openings under every hypothesis and height error, by some poses."""
-        for first in range(0, len(ground), _CHUNK):
-            part = slice(first, first + _CHUNK)
-            yield part, self._part(ground.part(part))
+    def log_likelihoods(
+        self, ground: BinnedGround, trust_number: Int[np.ndarray, "n"]
+    ) -> Iterator[tuple[slice, Float[np.ndarray, "m k j"]]]:
+        """Yield the log likelihood of walls and openings under every hypothesis and height error, by some poses.
 
-    def _part(self, ground: BinnedGround) -> Float[np.ndarray, "n k j"]:
+        `trust_number` is the number of each pose's trust in openings.
+        """
+        ends = [*(np.flatnonzero(np.diff(trust_number)) + 1).tolist(), len(ground)]
+        for begin, end in pairwise([0, *ends]):
+            openings = self.openings[trust_number[begin]]
+            cost = self.walls[:, :, None, :] + openings[:, None, :, None]
+            cost = cost.reshape(len(cost), BINS * KINDS, -1)
+            for first in range(begin, end, _CHUNK):
+                part = slice(first, min(first + _CHUNK, end))
+                yield part, self._part(ground.part(part), cost, openings)
+
+    def _part(
+        self, ground: BinnedGround, cost: Float[np.ndarray, "s e j"], openings: Float[np.ndarray, "s c"]
+    ) -> Float[np.ndarray, "n k j"]:
         width = ground.columns
-        total = np.zeros((len(ground), width, self.cost.shape[2]), np.float32)
+        total = np.zeros((len(ground), width, cost.shape[2]), np.float32)
         for number, column in enumerate(self.columns.tolist()):
             # A turn by s columns shows the wall of column c + s where the photograph shows it at c.
-            total += self.cost[number].take(ground.index[:, column : column + width], axis=0)
+            total += cost[number].take(ground.index[:, column : column + width], axis=0)
             if len(ground.row):
                 turn = (ground.column - column) % width
                 own, kind = np.divmod(ground.own, KINDS)
                 either = self.likelihood[number][own] + ground.odds[:, None] * self.likelihood[number][ground.behind]
-                either = -np.log(np.minimum(either, 1.0)) + self.openings[number][kind][:, None]
-                total[ground.row, turn] += either - self.cost[number][ground.own]
+                either = -np.log(np.minimum(either, 1.0)) + openings[number][kind][:, None]
+                total[ground.row, turn] += either - cost[number][ground.own]
         total = total if len(self.shifts) == width else total[:, self.shifts]
         total *= -self.factor
         return total
@@ -112,16 +123,15 @@ def _modes(profile: PredictedProfile, columns: np.ndarray) -> list[Mode]:
 
 def _opening_losses(
     plan: FloorPlan, query: Query, reach_m: float, weights: MatchingWeights
-) -> Float[np.ndarray, "w c"]:
-    """Return the weighted cost of every kind of opening by column; zero if openings are not compared."""
+) -> Float[np.ndarray, "t w c"]:
+    """Return the weighted cost of every kind of opening by trust and column; zero if openings are not compared."""
     predicted, profile = query.openings, query.profile
     assert profile is not None
-    trust: Sequence[float] = [plan.opening_trust.get(kind, 0.0) for kind in OPENING_CLASSES]
-    if predicted is None or not any(trust):
-        return np.zeros((profile.log_m.shape[1], KINDS))
+    trusts, _ = plan.class_trusts
+    if predicted is None or not trusts.any():
+        return np.zeros((len(trusts), profile.log_m.shape[1], KINDS), np.float32)
     precision = precisions(profile.log_m[0], profile.log_scale[0], reach_m, weights.tail)
     spread = reach_m / median_distance_m(profile.log_m[0], precision)
     probability = smoothed(np.exp(predicted.log_probability[:1]), spread)[0]
-    loss = class_losses(probability, predicted.prior, trust, _CONFIG.floor, weights.appearance)
-    loss -= loss.min(axis=-1, keepdims=True)
-    return weights.openings * loss
+    loss = opening_losses(probability, predicted.prior, trusts, _CONFIG.floor, weights.appearance)
+    return np.float32(weights.openings) * loss

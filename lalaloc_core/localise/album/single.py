@@ -80,7 +80,8 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
     ceilings = (usual + _ceilings(searched.plan, query, weights)).astype(np.float32)
     best = np.empty((len(searched.poses), len(query.roll)), np.float32)
     heights = np.full(len(OFFSETS), -np.inf)
-    for part, log in compared.log_likelihoods(searched.binned):
+    trusts = searched.plan.class_trusts[1][searched.poses.room_index]
+    for part, log in compared.log_likelihoods(searched.binned, trusts):
         log -= ceilings[searched.poses.room_index[part], None, :]
         heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(OFFSETS))])
         best[part] = log.max(axis=2)
@@ -97,17 +98,20 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
         "log_likelihood": best.ravel()[kept].astype(np.float32),
         "room_types": _room_types(searched, query, weights).astype(np.float32),
         "heights": heights.astype(np.float32),
-        "chance": np.array(_by_chance(encoder, compared, usual), np.float32),
+        "chance": np.array(_by_chance(encoder, compared, usual, int(trusts[best.max(axis=1).argmax()])), np.float32),
     }
 
 
-def _by_chance(encoder: PhotographEncoder, compared: Comparison, usual: Float[np.ndarray, "j"]) -> float:
-    """Return the log likelihood of the best pose of other homes; -inf if the model has none."""
+def _by_chance(
+    encoder: PhotographEncoder, compared: Comparison, usual: Float[np.ndarray, "j"], trust_number: int
+) -> float:
+    """Return the log likelihood of the best pose of other homes, under one trust; -inf if the model has none."""
     cohort = encoder.cohort
     if cohort is None:
         return -math.inf
     layouts = cohort.layouts.rows(np.arange(0, len(cohort.layouts), _EVERY))
-    return max(float((log - usual).max()) for _, log in compared.log_likelihoods(BinnedGround.of(layouts)))
+    ground, trusts = BinnedGround.of(layouts), np.full(len(layouts), trust_number)
+    return max(float((log - usual).max()) for _, log in compared.log_likelihoods(ground, trusts))
 
 
 def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Int[np.ndarray, "m"]:

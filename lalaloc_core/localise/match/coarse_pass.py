@@ -99,8 +99,8 @@ def likeliest(
         every = np.arange(len(binned))
         best.offer(every, cost if place_cost is None else cost + place_cost.of_poses(every))
         return best.ranked()
-    table, room_costs = CoarseTable(binned, matching_cost), matching_cost.room_costs
-    bound = room_costs.min(axis=0)[room_index] + table.bounds(binned)
+    table = CoarseTable(binned, matching_cost)
+    bound = table.bounds(binned, room_index)
     bound = bound if place_cost is None else bound + place_cost.lowest
     possible = np.flatnonzero(np.isfinite(bound))
     # Short integers sort fastest.
@@ -110,7 +110,7 @@ def likeliest(
     lowest, first, count = np.inf, 0, _FIRST_CHUNK
     while first < len(order) and least_after[first] <= min(best.bound, max(lowest + window, least.bound)):
         pose = order[first : first + count]
-        cost = table.costs(binned.part(pose), room_costs[:, room_index[pose]])
+        cost = table.costs(binned.part(pose), room_index[pose])
         cost = cost if place_cost is None else cost + place_cost.of_poses(pose)
         best.offer(pose, cost)
         least.offer(pose, cost)
@@ -123,10 +123,10 @@ def coarse_costs(
     binned: BinnedLayouts, matching_cost: MatchingCost, room_index: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n k"]:
     """Return the coarse costs of all poses under all hypotheses, each at its best δ."""
-    table, room_costs = CoarseTable(binned, matching_cost), matching_cost.room_costs
+    table = CoarseTable(binned, matching_cost)
     costs, first = [], 0
     for part in binned.parts:
-        costs.append(table.costs(part, room_costs[:, room_index[first : first + len(part)]]))
+        costs.append(table.costs(part, room_index[first : first + len(part)]))
         first += len(part)
     return np.concatenate(costs)
 

@@ -6,6 +6,7 @@ table of a sector has just these hypotheses.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -41,40 +42,52 @@ class CoarseTable:
 
     def __init__(self, binned: BinnedLayouts, matching_cost: MatchingCost) -> None:
         self.hypotheses, self._offsets = matching_cost.hypotheses, len(matching_cost.offsets)
+        self._room_costs, self._trust_number = matching_cost.room_costs, matching_cost.trust_number
         azimuths = len(binned.columns)
         cost, which = _wall_costs(binned, matching_cost)
         is_told = np.any(cost != 0.0, axis=(0, 1))[which]
         self._sectors = [
             _sector(cost, which[:, part], np.any(is_told[:, part], axis=1)) for part in binned.sectors_of_azimuths
         ]
-        # A wall costs its loss as an opening class, and an opening the difference.
-        self._openings: Float[np.ndarray, "r k"] | None = None
-        self._without_openings = np.zeros(self.hypotheses, np.float32)
+        # A wall costs its loss as an opening class, and an opening the difference; by trust.
+        self._openings: Float[np.ndarray, "t r k"] | None = None
+        self._without_openings = np.zeros((1, self.hypotheses), np.float32)
         loss = matching_cost.opening_costs(binned.columns)
         if loss is not None:
-            loss = loss.transpose(1, 2, 0) / azimuths
-            self._without_openings = loss[:, WALL_CODE].sum(axis=0)
-            differences = np.delete(loss, WALL_CODE, axis=1) - loss[:, [WALL_CODE]]
-            self._openings = np.ascontiguousarray(differences.reshape(azimuths * OPENING_ROWS, -1), np.float32)
+            loss = loss.transpose(0, 2, 3, 1) / azimuths
+            self._without_openings = loss[:, :, WALL_CODE].sum(axis=1)
+            differences = np.delete(loss, WALL_CODE, axis=2) - loss[:, :, [WALL_CODE]]
+            differences = differences.reshape(len(loss), azimuths * OPENING_ROWS, -1)
+            self._openings = np.ascontiguousarray(differences, np.float32)
 
-    def costs(self, binned: BinnedLayouts, room_costs: Float[np.ndarray, "j n"]) -> Float[np.ndarray, "n k"]:
-        """Return the coarse cost of poses under every hypothesis, each at its best δ, for their rooms' costs."""
+    def costs(self, binned: BinnedLayouts, room_index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n k"]:
+        """Return the coarse cost of poses in some rooms under every hypothesis, each at its best δ."""
         total = np.zeros((len(binned), self._offsets, self.hypotheses), np.float32)
         for rows, sector in zip(binned.walls, self._sectors, strict=True):
             if sector.length:
                 table = sector.walls.reshape(len(sector.walls), -1)
                 _add_around(total, (rows @ table).reshape(len(binned), self._offsets, -1), sector.first)
-        total += room_costs.T[:, :, None]
+        total += self._room_costs.T[room_index, :, None]
         best = total.min(axis=1)
-        best += self._without_openings
-        if self._openings is not None:
-            best += binned.openings @ self._openings
+        if self._openings is None:
+            return best
+        for rows, trust in self._by_trust(room_index):
+            best[rows] += self._without_openings[trust] + binned.openings[rows] @ self._openings[trust]
         return best
 
-    def bounds(self, binned: BinnedLayouts) -> Float[np.ndarray, "n"]:
-        """Return a lower bound of the cost of every pose's walls and openings over all δ and hypotheses."""
+    def _by_trust(self, room_index: Int[np.ndarray, "n"]) -> Iterator[tuple[slice | Int[np.ndarray, "m"], int]]:
+        """Yield the poses of each trust in openings, with its number."""
+        if len(self._without_openings) == 1:
+            yield slice(None), 0
+            return
+        number = self._trust_number[room_index]
+        for trust in np.unique(number).tolist():
+            yield np.flatnonzero(number == trust), trust
+
+    def bounds(self, binned: BinnedLayouts, room_index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return a lower bound of the cost of every pose over all δ and hypotheses."""
         least = [_least(sector.walls.min(axis=1)) for sector in self._sectors if sector.length]
-        openings = None if self._openings is None else _least(self._openings)
+        openings = None if self._openings is None else [_least(table) for table in self._openings]
         # Every azimuth has one row of walls, and at most one of openings.
         highest = max((float(part.max()) for part in least), default=0.0)
         highest += 0.0 if openings is None else float(np.abs(openings).max())
@@ -83,10 +96,14 @@ class CoarseTable:
         told = [(rows, sector.first) for rows, sector in zip(binned.walls, self._sectors, strict=True) if sector.length]
         for (rows, first), part in zip(told, least, strict=True):
             _add_around(total, rows @ _floored(part, scale), first // _NEIGHBOURS)
-        if openings is not None:
-            total += binned.openings @ _floored(openings, scale)
+        bound, without = np.empty(len(binned), np.float32), _least(self._without_openings)
+        for rows, trust in self._by_trust(room_index):
+            part = total[rows]
+            if openings is not None:
+                part = part + binned.openings[rows] @ _floored(openings[trust], scale)
+            bound[rows] = (part / np.float32(scale) + without[trust]).min(axis=1)
         # The costs themselves are rounded to single precision.
-        return (total / np.float32(scale) + _least(self._without_openings[None])).min(axis=1) - 1e-5
+        return bound + self._room_costs.min(axis=0)[room_index] - 1e-5
 
 
 def _wall_costs(

@@ -111,10 +111,12 @@ def cost_by_chance(
     reach_m: float,
     weights: MatchingWeights,
     config: MatchingConfig,
+    *,
+    room: int = 0,
 ) -> float | None:
     """Return the cost of a fit by chance; None without a cohort, or if poses are compared by their latents.
 
-    The plan determines the openings that count; `reach_m` is the reach of the poses of its grid.
+    The plan's trust in openings is that of one of its rooms; `reach_m` is the reach of the poses of its grid.
     """
     if cohort is None or not config.compares_profiles(query):
         return None
@@ -122,10 +124,11 @@ def cost_by_chance(
     general = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
     matching_cost = MatchingCost(plan, query, reach_m, weights, general)
     binned = cohort.binned_for_views if query.is_view else cohort.binned
-    coarse = coarse_costs(binned, matching_cost, cohort.layouts.room_index)
+    layouts = replace(cohort.layouts, room_index=np.full(len(cohort.layouts), room))
+    coarse = coarse_costs(binned, matching_cost, layouts.room_index)
     hypothesis = coarse.argmin(axis=1)
     pose = np.argsort(coarse[np.arange(len(coarse)), hypothesis], kind="stable")[:_COMPARED]
-    by_chance, _ = matching_cost.pairs(cohort.layouts, pose, hypothesis[pose])
+    by_chance, _ = matching_cost.pairs(layouts, pose, hypothesis[pose])
     return float(np.sort(by_chance)[:_BEST].mean())
 
 

@@ -138,6 +138,27 @@ def class_losses(
     return -np.log(floor + (1.0 - floor) * (probability / prior) @ seen.T)
 
 
+def opening_losses(
+    probability: Float[np.ndarray, "*n c"],
+    prior: Float[np.ndarray, "c"],
+    trusts: Float[np.ndarray, "t c"],
+    floor: float,
+    appearance: Sequence[Sequence[float]] | None,
+) -> Float[np.ndarray, "t *n c"]:
+    """Return the `class_losses` of some trusts, over those of the best class.
+
+    A right pose in a plan that draws no openings would always cost less than one in a plan that draws them, so trusts
+    with a lower expected loss at the right pose have the difference to the highest added.
+    """
+    loss = np.empty((len(trusts), *probability.shape), np.float32)
+    for number, trust in enumerate(trusts):
+        loss[number] = class_losses(probability, prior, trust.tolist(), floor, appearance)
+    loss -= loss.min(axis=-1, keepdims=True)
+    expected = np.array([float(np.sum(probability * part, axis=-1).mean()) for part in loss])
+    loss += (expected.max() - expected).astype(np.float32).reshape(-1, *[1] * probability.ndim)
+    return loss
+
+
 def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:
     """Return the Euclidean distance of each target to each latent, both of unit length."""
     return np.sqrt(np.maximum(2.0 - 2.0 * (targets @ latents.T), 0.0))

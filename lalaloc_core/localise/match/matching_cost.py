@@ -20,7 +20,7 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
   door looks like a passage, a patio door like a window. m is the probability that the class k is where the plan draws
   c. The plan draws a share t_c of the openings of a kind (`FloorPlan.opening_trust`; t = 0 for walls), and as many that
   do not exist as it misses: m(k | c) = t_c [k = c] + (1 - t_c) m(k), with m(k) ∝ π(k) (1 - t_k) where no opening is
-  drawn.
+  drawn. Merged plans keep their trusts: constants make the expected losses at the right pose equal (`opening_losses`).
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
 * **Room type.** As openings, once per room.
 * **Objects.** As the room type, by the objects that a classifier of photographs recognises. It replaces the room type,
@@ -45,9 +45,9 @@ from lalaloc_core.localise.match.cost_terms import (
     SeenWalls,
     WallMode,
     ceiling_costs,
-    class_losses,
     mean_log,
     median_distance_m,
+    opening_losses,
     room_type_losses,
     smoothed,
 )
@@ -118,9 +118,9 @@ class Terms(NamedTuple):
 class _Gathered(NamedTuple):
     """Layouts of m poses, ready to be compared.
 
-    `opening` is the place of each azimuth's class in a row of w x c losses. The e azimuths `pose`, `column` have a view
-    through an opening: `log_behind` is the log distance (m) of the wall behind, and `odds` those that the prediction is
-    of that wall.
+    `opening` is the place of each azimuth's class in w x c losses of its trust. The e azimuths `pose`, `column` have a
+    view through an opening: `log_behind` is the log distance (m) of the wall behind, and `odds` those that the
+    prediction is of that wall.
     """
 
     log_profile: Float[np.ndarray, "m w"]
@@ -253,10 +253,15 @@ class MatchingCost:
         values = [np.broadcast_to(part, self._first.centre.shape)[:, columns] for mode in modes for part in mode]
         return np.stack(values, axis=2).reshape(*shape, -1)
 
-    def opening_costs(self, columns: Int[np.ndarray, "a"]) -> Float[np.ndarray, "k a c"] | None:
-        """Return the weighted cost of every opening class at some azimuths; None if openings are not compared."""
+    @property
+    def trust_number(self) -> Int[np.ndarray, "r"]:
+        """Number of each room's trust in openings."""
+        return self._plan.class_trusts[1]
+
+    def opening_costs(self, columns: Int[np.ndarray, "a"]) -> Float[np.ndarray, "t k a c"] | None:
+        """Return the weighted cost of every opening class at some azimuths, by trust; None if none is compared."""
         loss = self._opening_losses
-        return None if loss is None else self._weights.openings * loss[:, columns]
+        return None if loss is None else self._weights.openings * loss[:, :, columns]
 
     def _likelihood(self, log_m: Float[np.ndarray, "n"], place: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Return the likelihood of walls at places (hypothesis, column), over that of the first mode's centre."""
@@ -265,9 +270,11 @@ class MatchingCost:
 
     def _gathered(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Gathered:
         """Gather the layouts of some poses."""
-        opening = None
+        opening, room = None, layouts.room_index[pose]
         if layouts.kind is not None:
             opening = layouts.kind[pose] + np.arange(layouts.kind.shape[1]) * len(OPENING_CLASSES)
+            if len(self._plan.class_trusts[0]) > 1:
+                opening += self.trust_number[room][:, None] * self.hypotheses * opening.shape[1] * len(OPENING_CLASSES)
         row = column = np.empty(0, np.intp)
         log_behind = odds = np.empty(0, np.float32)
         if layouts.seen is not None and self._config.use_see_through:
@@ -277,7 +284,7 @@ class MatchingCost:
             share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
             odds = share / (1.0 - share)
         log_profile = layouts.log_profile[pose].astype(np.float32, copy=False)
-        return _Gathered(log_profile, opening, layouts.room_index[pose], row, column, log_behind, odds)
+        return _Gathered(log_profile, opening, room, row, column, log_behind, odds)
 
     def _compared(
         self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"]
@@ -338,7 +345,7 @@ class MatchingCost:
         loss = self._opening_losses
         if loss is None or gathered.opening is None:
             return np.zeros(len(gathered.room_index), np.float32)
-        return loss.take(hypothesis[:, None] * loss[0].size + gathered.opening).mean(axis=1)
+        return loss.take(hypothesis[:, None] * loss[0, 0].size + gathered.opening).mean(axis=1)
 
     @cached_property
     def _seen_walls(self) -> SeenWalls:
@@ -346,18 +353,17 @@ class MatchingCost:
         return SeenWalls.of([self._first] if self._rival is None else [self._first, self._rival])
 
     @cached_property
-    def _opening_losses(self) -> Float[np.ndarray, "k w c"] | None:
-        """Unweighted cost of each class by hypothesis and azimuth; None if openings are not compared."""
-        predicted = self._query.openings
-        trust = [self._plan.opening_trust.get(kind, 0.0) for kind in OPENING_CLASSES]
-        if predicted is None or not any(trust) or not self._config.use_openings:
+    def _opening_losses(self) -> Float[np.ndarray, "t k w c"] | None:
+        """Unweighted cost of each class by trust, hypothesis and azimuth; None if openings are not compared."""
+        predicted, (trusts, _) = self._query.openings, self._plan.class_trusts
+        if predicted is None or not trusts.any() or not self._config.use_openings:
             return None
         # Openings appear displaced by up to the reach, seen at the median distance.
         median_m = median_distance_m(self._first.centre[0], self._first.precision[0])
         probability = smoothed(np.exp(predicted.log_probability), self._reach_m / median_m)
-        loss = class_losses(probability, predicted.prior, trust, self._config.floor, self._weights.appearance)
-        loss -= loss.min(axis=-1, keepdims=True)
-        return np.ascontiguousarray(loss[:, :: self._stride], np.float32)
+        return opening_losses(
+            probability[:, :: self._stride], predicted.prior, trusts, self._config.floor, self._weights.appearance
+        )
 
     @cached_property
     def _room_types(self) -> Float[np.ndarray, "r"]:

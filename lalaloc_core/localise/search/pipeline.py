@@ -283,12 +283,13 @@ class _Search:
         weights, matching = self._weights, config.matching
         reach_m = matching.grid_reach * grid.step_m
 
-        def by_chance(query: Query) -> float | None:
-            return cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching)
+        def by_chance(query: Query, room: int) -> float | None:
+            return cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching, room=room)
 
         with clock.stage("retrieve"):
-            helper = encoder.helper()
-            beside = None if helper is None else helper.submit(by_chance, query)
+            # Of a merged plan, it depends on the room that is found.
+            helper = None if plan.room_trust else encoder.helper()
+            beside = None if helper is None else helper.submit(by_chance, query, 0)
             given = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
             self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=given)
             self.query = query = query.searched if self._doubted and query.searched is not None else query
@@ -308,7 +309,9 @@ class _Search:
             )
             self._lpo_count = config.starts(query, self.modes)
             self._grid_cost = float(costs.cost.min())
-            self._by_chance = by_chance(query) if beside is None or self._doubted else beside.result()
+            self._by_chance = (
+                by_chance(query, self.modes[0].room_index) if beside is None or self._doubted else beside.result()
+            )
         self.by_walls = matching.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
         # The mode that each candidate of `without_lpo` comes from.

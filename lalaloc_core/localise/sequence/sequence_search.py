@@ -293,7 +293,9 @@ class _SequenceSearch:
         query, weights, matching = picture.query, picture.weights, self.config.matching
         penalty = query.camera_height.penalty(self.height_offsets(query)) / weights.temperature
         grid_cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
-        by_chance = cost_by_chance(self.encoder.cohort, self.plan, query, self._reach_m, weights, matching)
+        by_chance = cost_by_chance(
+            self.encoder.cohort, self.plan, query, self._reach_m, weights, matching, room=answers[0].room_index
+        )
         return Localisation(
             query=query,
             candidates=answers,

@@ -146,7 +146,15 @@ def track_steps(
         compared = compared.regained(starts, refined)
         candidates, posterior = compared.ranked(starts, ends, top_k)
         candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
-        by_chance = cost_by_chance(encoder.cohort, plan, query, matching.grid_reach * grid.step_m, weights, matching)
+        by_chance = cost_by_chance(
+            encoder.cohort,
+            plan,
+            query,
+            matching.grid_reach * grid.step_m,
+            weights,
+            matching,
+            room=candidates[0].room_index,
+        )
         model = encoder.manifest.confidence_for(view=query.is_view)
         signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
         confidence = confidence_of(model, stage, signals, posterior, heading_known=False)

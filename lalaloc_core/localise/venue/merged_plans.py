@@ -6,7 +6,7 @@ covers the poses of all plans, with an equal prior for every square metre of flo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -19,12 +19,15 @@ from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.match.layouts import joined_layouts
 from lalaloc_core.localise.query import Candidate
+from lalaloc_core.localise.venue.prototypes import claims_of_trust, trust_of_claims
 from lalaloc_core.render.sampling import PoseSet
 
 # Candidates, and other poses with the same fields.
 PoseT = TypeVar("PoseT", bound=Any)
 # Gap between the bounding boxes of two plans, larger than any distance at which poses count as one place.
 GAP_M = 10.0
+# Each distinct trust takes a table of costs; beyond these, trusts are rounded to the few levels of the index.
+_MAX_TRUSTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +35,7 @@ class MergedPlans:
     """Merged plan of p plans, and its pose grid.
 
     Attributes:
-        plan: the merged plan. Its trust in a kind of openings is the lowest of all plans, as a kind that only some
-            plans show would make these fit worse than plans without it.
+        plan: the merged plan. Its rooms have the trust in openings of their plans (`FloorPlan.room_trust`).
         grid: poses of all plans in the merged frame, in the order of the plans.
         shift_m: (p, 2) translation (m) of each plan into the merged frame.
     """
@@ -63,9 +65,7 @@ class MergedPlans:
                 for plan, shift in zip(plans, shift_m, strict=True)
                 for opening in plan.openings
             ),
-            opening_trust={
-                kind: min(plan.opening_trust.get(kind, 0.0) for plan in plans) for kind in OPENING_CLASSES[1:]
-            },
+            room_trust=_room_trust(plans),
             opening_faces=_faces(plans),
             fixtures=tuple(
                 replace(fixture, outline_m=fixture.outline_m + shift)
@@ -121,6 +121,15 @@ def _moved(room: Room, shift_m: Float[np.ndarray, "2"]) -> Room:
         holes_m=tuple(hole + shift_m for hole in room.holes_m),
         inner_walls_m=room.inner_walls_m + np.tile(shift_m, 2),
     )
+
+
+def _room_trust(plans: Sequence[FloorPlan]) -> tuple[Mapping[str, float], ...]:
+    """Return the trust in openings of each room's plan."""
+    trusts: list[Mapping[str, float]] = [plan.opening_trust for plan in plans]
+    if len({frozenset(trust.items()) for trust in trusts}) > _MAX_TRUSTS:
+        levels = [trust_of_claims(claims_of_trust(trust)) for trust in trusts]
+        trusts = [dict(zip(map(str, OPENING_CLASSES), level, strict=True)) for level in levels]
+    return tuple(trust for plan, trust in zip(plans, trusts, strict=True) for _ in plan.rooms)
 
 
 def _faces(plans: Sequence[FloorPlan]) -> tuple[OpeningFace, ...]:
