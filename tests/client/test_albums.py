@@ -80,9 +80,7 @@ def busy_for(calls: int) -> Callable[..., Any]:
     return encode
 
 
-def test_photographs_that_a_busy_service_refuses_are_sent_again(
-    service: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_that_a_busy_service_refuses_are_sent_again(service: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(HOME).id).id
     album = service.create_album(plan_id)
     monkeypatch.setattr(AlbumSearch, "entry", busy_for(3))
