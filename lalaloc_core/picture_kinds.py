@@ -1,7 +1,8 @@
 """Photographs and drawings, told apart by their tones, for error messages.
 
 Drawings and scans of them are ink on paper: almost everywhere most pixels of a small block have the tone of the paper,
-also where light is uneven. In photographs this holds for at most four fifths of the blocks.
+also where light is uneven. In photographs this holds for at most four fifths of the blocks. Plans with coloured rooms
+have areas of one tone with sharp edges between them.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ _PAPER_PERCENTILE, _NOISE, _MOSTLY = 80, 10, 0.5
 # Bounds, with a margin to scans and photographs of rooms (spheres, views, renderings) that were measured.
 _MAX_FLAT_OF_PHOTOGRAPHS, _MIN_SPREAD_OF_PHOTOGRAPHS = 0.72, 90.0
 _MIN_FLAT_OF_DRAWINGS, _MAX_SPREAD_OF_DRAWINGS, _MIN_PAPER, _MIN_UNIFORM = 0.94, 40.0, 230.0, 0.36
+# Plans with coloured rooms: differences of neighbours that are none, and that are an edge; shares of such pixels, and of
+# the most frequent tone, which overexposed photographs exceed.
+_SAME, _EDGE, _MIN_STILL, _MIN_EDGES, _UNIFORM = 1, 40, 0.75, 0.035, (0.3, 0.7)
 # Step of the sample of a photograph, and the smallest share of its most frequent tone in drawings.
 _SAMPLE, _MIN_SAMPLED = 4, 0.3
 _INK, _INK_SHARES = 70, (0.005, 0.4)
@@ -34,6 +38,8 @@ class Tones:
         darkest: tone of the paper in a dark block.
         uniform: share of pixels of the most frequent tone.
         ink: share of pixels that are much darker than the paper around them.
+        still: share of pixels with the tone of their neighbours.
+        edges: share of pixels with another tone than a neighbour.
     """
 
     flat: float
@@ -41,6 +47,8 @@ class Tones:
     darkest: float
     uniform: float
     ink: float
+    still: float
+    edges: float
 
     @classmethod
     def of(cls, gray: UInt8[np.ndarray, "h w"]) -> Tones | None:
@@ -58,12 +66,15 @@ class Tones:
         dark, bright = np.percentile(paper, [5, 95])
         counts = np.bincount(small.ravel(), minlength=256)
         frequent = int(counts.argmax())
+        step = np.maximum(np.abs(np.diff(small, axis=0))[:, 1:], np.abs(np.diff(small, axis=1))[1:])
         return cls(
             flat=float((is_paper.mean(axis=1) > _MOSTLY).mean()),
             spread=float(bright - dark),
             darkest=float(dark),
             uniform=float(counts[max(frequent - 3, 0) : frequent + 4].sum() / small.size),
             ink=float((blocks < paper[:, None] - _INK).mean()),
+            still=float((step <= _SAME).mean()),
+            edges=float((step >= _EDGE).mean()),
         )
 
     @property
@@ -73,8 +84,12 @@ class Tones:
 
     @property
     def is_drawing(self) -> bool:
-        """True for ink on white paper, as a plan or a text, and for no photograph of a room; scans can give False."""
-        return (
+        """True for ink on white paper or coloured areas, as a plan or a text; scans can give False.
+
+        Overexposed photographs of white rooms can give True.
+        """
+        is_coloured = self.still >= _MIN_STILL and self.edges >= _MIN_EDGES
+        return (is_coloured and _UNIFORM[0] <= self.uniform <= _UNIFORM[1]) or (
             self.flat >= _MIN_FLAT_OF_DRAWINGS
             and self.spread <= _MAX_SPREAD_OF_DRAWINGS
             and self.darkest >= _MIN_PAPER

@@ -6,6 +6,8 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
+from random import random
 from time import monotonic
 from typing import Any, Unpack
 
@@ -93,7 +95,9 @@ class Albums(Transport):
         """Add photographs to an album; yield an answer for each, in order, as they are stored.
 
         The same picture is stored once, so that sending photographs again is safe. A photograph that cannot be read
-        does not stop the others; `AddedPhotograph.result` raises its error.
+        does not stop the others; `AddedPhotograph.result` raises its error. Photographs that the service is too busy
+        for are sent again, as the client's `RetryPolicy` allows, where `total_s` limits the waits; their answers come
+        last.
 
         Args:
             album_id: id of the album.
@@ -103,16 +107,37 @@ class Albums(Transport):
             ConnectionFailedError: the connection broke off before the last answer.
         """
         path = f"{resource_path('albums', album_id)}/photographs"
+        left, attempt, waited_s = list(range(len(panoramas))), 0, 0.0
         with self._concurrency.hold():
-            request = run_blocking(query_request, path, panoramas, {}, accept=NDJSON, streamed=True)
-            with closing(self._send(request)) as response:
-                try:
-                    for line in response.iter_lines():
-                        yield parse(AddedPhotograph, line, "line")
-                except httpx.TransportError as error:
-                    raise ConnectionFailedError(
-                        f"POST {path} broke off: {type(error).__name__} {error}".rstrip()
-                    ) from error
+            while left:
+                attempt += 1
+                busy = list[AddedPhotograph]()
+                part = [panoramas[index] for index in left]
+                request = run_blocking(query_request, path, part, {}, accept=NDJSON, streamed=True)
+                with closing(self._send(request)) as response:
+                    try:
+                        for text in response.iter_lines():
+                            line = parse(AddedPhotograph, text, "line")
+                            line = replace(line, index=left[line.index])
+                            if line.retry_after_s is None:
+                                yield line
+                            else:
+                                busy.append(line)
+                    except httpx.TransportError as error:
+                        raise ConnectionFailedError(
+                            f"POST {path} broke off: {type(error).__name__} {error}".rstrip()
+                        ) from error
+                after_s = max((line.retry_after_s or 0.0 for line in busy), default=0.0)
+                wait_s = self._retry.wait_s(attempt, waited_s, after_s, random())
+                left = [line.index for line in busy]
+                if not left:
+                    return
+                if wait_s is None:
+                    for line in busy:
+                        yield line
+                    return
+                waited_s += wait_s
+                sleep(wait_s)
 
     def album_photographs(self, album_id: str, *, page_size: int = 100) -> Iterator[AlbumPhotograph]:
         """Yield the photographs of an album with their pins, in the order in which they were added."""

@@ -168,7 +168,12 @@ class AlbumSolver:
             return
         context = QueryContext.starting(album.tenant, self._settings.requests.request_deadline_s)
         query = AlbumQuery(
-            album_id=album.id, document=document, photographs=job.photographs, context=context, progress=progress
+            album_id=album.id,
+            document=document,
+            photographs=job.photographs,
+            is_same_place=album.place_revision_id == place.revision_id,
+            context=context,
+            progress=progress,
         )
         try:
             outcome = await self._localiser.solve_album(place, query)

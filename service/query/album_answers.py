@@ -23,7 +23,13 @@ from service.schemas.albums import (
 
 
 def compose_outcome(
-    album: Album, ground: Ground, before: Mapping[str, str | None], dropped: Mapping[str, str], default_height_m: float
+    album: Album,
+    ground: Ground,
+    before: Mapping[str, str | None],
+    dropped: Mapping[str, str],
+    default_height_m: float,
+    *,
+    is_same_place: bool,
 ) -> AlbumOutcome:
     """Return a solution as JSON.
 
@@ -33,9 +39,10 @@ def compose_outcome(
         before: pins of the solution before as JSON, by photograph.
         dropped: why corrections were left out, by photograph.
         default_height_m: camera height (m) of poses on Earth, if the album tells none.
+        is_same_place: the pins before are of this revision of the plan or venue.
     """
     height_m = album.camera_height_m if album.camera_height_m is not None else default_height_m
-    places = _Places(ground, height_m)
+    places = _Places(ground, height_m, is_same_place=is_same_place)
     pins = dict[str, PinAnswer]()
     for pin in album.pins:
         text = before.get(pin.photograph_id)
@@ -68,12 +75,13 @@ def compose_outcome(
 class _Places:
     """Places of a ground as answers name them."""
 
-    def __init__(self, ground: Ground, camera_height_m: float) -> None:
+    def __init__(self, ground: Ground, camera_height_m: float, *, is_same_place: bool) -> None:
         ids = [record.id for record in ground.records]
         self._revisions = dict(zip(ids, [record.revision_id for record in ground.records], strict=True))
         self._levels = dict(zip(ids, ground.levels, strict=True))
         self._anchors = dict(zip(ids, ground.anchors, strict=True))
         self._height_m = camera_height_m
+        self._is_same_place = is_same_place
 
     def pin(self, pin: Pin, earlier: PinAnswer | None, dropped: str | None) -> PinAnswer:
         """Return a pin, with what changed since `earlier`."""
@@ -123,7 +131,11 @@ class _Places:
             return None
         before = earlier.place
         # Without a place, the revision is not known.
-        if before is None or self._revisions.get(before.floorplan_id) == before.floorplan_revision:
+        if before is None:
+            return earlier.moved
+        revision = self._revisions.get(before.floorplan_id)
+        # Of large venues, the plans that are searched depend on the photographs: others are left out unchanged.
+        if revision == before.floorplan_revision or (revision is None and self._is_same_place):
             return earlier.moved
         return MovedFrom(before=before, distance_m=None, new_room=True) if after is None else _change(before, after)
 

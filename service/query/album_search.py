@@ -139,7 +139,9 @@ class AlbumSearch:
             album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
         self._memories.put(query.album_id, memory)
         before = {part.id: part.pin for part in query.photographs}
-        return compose_outcome(album, ground, before, dropped, places.plan.camera_height_m)
+        return compose_outcome(
+            album, ground, before, dropped, places.plan.camera_height_m, is_same_place=query.is_same_place
+        )
 
     def _take(self, album_id: str) -> AlbumMemory:
         memory = self._memories.get(album_id) or AlbumMemory()

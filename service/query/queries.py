@@ -141,6 +141,7 @@ class AlbumQuery:
         album_id: id of the album.
         document: the request that created it.
         photographs: its photographs, with corrections and earlier pins.
+        is_same_place: the earlier pins are of this revision of the plan or venue.
         context: client, deadline of the preparation, and clock.
         progress: progress of the solve.
     """
@@ -148,6 +149,7 @@ class AlbumQuery:
     album_id: str
     document: AlbumDocument
     photographs: Sequence[AlbumPart]
+    is_same_place: bool
     context: QueryContext
     progress: AlbumProgress
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx
 import pytest
 
-from lalaloc_client import ConflictError, InvalidError, NotFoundError
+from lalaloc_client import ConflictError, InvalidError, NotFoundError, RetryPolicy
 from lalaloc_core.bundle import default_bundle
+from service.errors import DeadlineExceededError
+from service.query.album_search import AlbumSearch
 from tests.client.conftest import MakeClient
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import StartApp
@@ -64,3 +66,40 @@ def test_folder_is_pinned_corrected_and_taken_away(service: Any) -> None:
     service.delete_album(album.id)
     with pytest.raises(NotFoundError):
         service.album(album.id)
+
+
+def busy_for(calls: int) -> Callable[..., Any]:
+    """Return an `AlbumSearch.entry` that misses its deadline in so many calls after the first."""
+    left, entry = [0, *([1] * calls)], AlbumSearch.entry
+
+    async def encode(self: AlbumSearch, query: Any) -> Any:
+        if left and left.pop(0):
+            raise DeadlineExceededError(1.0)
+        return await entry(self, query)
+
+    return encode
+
+
+def test_photographs_that_a_busy_service_refuses_are_sent_again(service: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan_id = service.wait_until_ready(service.upload_floorplan(HOME).id).id
+    album = service.create_album(plan_id)
+    monkeypatch.setattr(AlbumSearch, "entry", busy_for(3))
+    added = list(service.add_to_album(album.id, [*FILES, b"no picture", EXAMPLES / "study.jpg"]))
+    assert sorted((line.index, line.status) for line in added) == [(0, 201), (1, 201), (2, 422), (3, 201)]
+    names = {line.index: line.name for line in added}
+    assert (names[0], names[1], names[3]) == ("kitchen.jpg", "bedroom.jpg", "study.jpg")
+    service.delete_album(album.id)
+
+
+def test_photographs_are_sent_again_as_often_as_the_policy_allows(
+    app: httpx.Client, make_client: MakeClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = busy_for(100)
+    with make_client(str(app.base_url), retry=RetryPolicy(attempts=2)) as service:
+        plan_id = service.wait_until_ready(service.upload_floorplan(HOME).id).id
+        album = service.create_album(plan_id)
+        monkeypatch.setattr(AlbumSearch, "entry", calls)
+        added = list(service.add_to_album(album.id, FILES))
+        assert sorted(line.status for line in added) == [201, 504]
+        assert added[-1].retry_after_s == 1
+        service.delete_album(album.id)

@@ -14,10 +14,12 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.corrections import Correction, read_correction
 from lalaloc_core.localise.album.entry import MAX_ENTRY_BYTES, AlbumPhotograph, photograph_entry, read_entry
 from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.links import pair_odds
 from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.pins import Pin, PinPose, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
 from lalaloc_core.localise.album.solve import MAX_ROOMS, solve_album
+from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
@@ -200,6 +202,36 @@ def test_an_id_is_added_once(
     with pytest.raises(InvalidInputError, match="same id"):
         solve_album(ground, encoder, [photographs[0], photographs[0]])
     assert solve_album(ground, encoder, []).pins == ()
+
+
+def test_evidence_of_photographs_of_one_spot_counts_once() -> None:
+    rng = np.random.default_rng(2)
+    logs = rng.normal(-3.0, 1.0, (3, 6))
+    pose, room = np.arange(6), np.array([0, 0, 0, 1, 1, 1])
+    states = [
+        States.of(
+            {"pose": pose, "position_m": np.zeros((6, 2)), "room": room, "hypothesis": 0 * pose, "log_likelihood": log},
+            128,
+        )
+        for log in logs
+    ]
+    turned = turned_together(states, {(0, 1): 0.0, (0, 2): 0.0, (1, 2): 0.0}, 6)
+    of_rooms = np.array([state.best_of_rooms(2) for state in turned])
+    # Room against room, all three together have the evidence of their best common pose.
+    total = logs.sum(axis=0)
+    assert np.diff(of_rooms.sum(axis=0)) == pytest.approx(total[3:].max() - total[:3].max(), abs=0.2)
+    # Rooms against none of them, it is as without the others.
+    np.testing.assert_allclose(of_rooms.max(axis=1), logs.max(axis=1))
+
+
+def test_pairs_of_many_photographs_of_a_room_weigh_no_more_than_those_of_few(
+    photographs: list[AlbumPhotograph],
+) -> None:
+    def weight(count: int) -> float:
+        alike = [photographs[number % 2] for number in range(count)]
+        return float(np.abs(pair_odds(alike, {}, 2)).sum(axis=1).max())
+
+    assert weight(120) < 1.3 * weight(6)
 
 
 def _exhaustive(evidence: RoomEvidence) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from benchmarks.plan_drawing import STYLES, Style, draw_plan
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidPhotographError
@@ -44,6 +44,18 @@ def test_drawn_and_scanned_plans_are_not_taken_for_photographs(style: Style) -> 
     tones = Tones.of(np.asarray(Image.open(io.BytesIO(content)).convert("L")))
     assert tones is not None
     assert not tones.is_photograph
+
+
+@pytest.mark.parametrize("style", ["thin", "thick", "hatched", "coloured"])
+def test_plans_with_coloured_rooms_are_drawings(style: Style) -> None:
+    picture = Image.open(io.BytesIO(draw_plan(style, 3).png())).convert("RGB")
+    rng = np.random.default_rng(0)
+    for x, y in rng.integers(picture.size, size=(60, 2)).tolist():
+        if min(picture.getpixel((x, y))) > 235:
+            ImageDraw.floodfill(picture, (x, y), tuple(rng.integers(150, 245, 3).tolist()), thresh=30)
+    stream = io.BytesIO()
+    picture.resize((picture.width // 2, picture.height // 2)).save(stream, "JPEG", quality=70)
+    assert is_drawing(np.asarray(Image.open(stream)))
 
 
 def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked() -> None:

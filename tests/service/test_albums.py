@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -18,10 +19,13 @@ from sqlalchemy import update
 
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.album.pins import Album, Pin, PinPose
 from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
-from service.query import album_search
+from service.query import AlbumOutcome, album_search
+from service.query.album_answers import compose_outcome
+from service.schemas.albums import PinAnswer
 from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
@@ -592,3 +596,17 @@ def test_album_that_cannot_be_solved_states_why(
         add(client, album_id, pictures[1:2])
         wait_until_solved(client, album_id)
         assert client.get(f"/albums/{album_id}").json()["reason"] is None
+
+
+@pytest.mark.parametrize("is_same_place", [True, False])
+def test_pin_in_a_plan_that_is_not_searched_now_moved_only_if_the_venue_changed(is_same_place: bool) -> None:
+    def outcome(plan_id: str, before: dict[str, str | None], *, is_same: bool) -> AlbumOutcome:
+        pose = PinPose(plan_id=plan_id, room_id="r", room="R", x_m=0.0, y_m=0.0, heading=None)
+        pin = Pin(photograph_id="p", state="sure", pose=pose, confidence=1.0, within_1m=1.0)
+        record: Any = SimpleNamespace(id=plan_id, revision_id="revision")
+        ground: Any = SimpleNamespace(records=[record], levels=[0.0], anchors=[None], warnings=[])
+        return compose_outcome(Album(pins=(pin,)), ground, before, {}, 1.5, is_same_place=is_same)
+
+    first = outcome("a", {}, is_same=False)
+    moved = PinAnswer.model_validate_json(outcome("b", dict(first.pins), is_same=is_same_place).pins["p"]).moved
+    assert (moved is None) == is_same_place

@@ -18,9 +18,6 @@ type Line = Schemas["AlbumLine"];
 const WIDTH = 480;
 const AT_ONCE = 20;
 const PORTION_BYTES = 60e6;
-// Photographs that a busy service refuses are sent again.
-const ATTEMPTS = 4;
-const MAX_WAIT_S = 30;
 
 /** Return the photographs among some files in the order of their names, and a sentence on the others. */
 export function photographsOf(files: File[]): { photographs: File[]; note: string | null } {
@@ -39,23 +36,8 @@ export async function* added(album: string, files: File[]): AsyncGenerator<{ fil
     for (const file of files) yield { file, line: await fromDevice(album, file) };
     return;
   }
-  let left = files;
-  for (let attempt = 1; left.length > 0; attempt++) {
-    const busy: File[] = [];
-    let waitS = 0;
-    for (const part of portions(left)) {
-      for await (const line of api.addToAlbum(album, part)) {
-        const retryS = line.retry_after_s ?? null;
-        if (retryS === null || attempt === ATTEMPTS) yield { file: part[line.index]!, line };
-        else {
-          busy.push(part[line.index]!);
-          waitS = Math.max(waitS, retryS);
-        }
-      }
-    }
-    if (busy.length > 0) await new Promise((done) => setTimeout(done, 1000 * Math.min(waitS, MAX_WAIT_S)));
-    left = busy;
-  }
+  for (const part of portions(files))
+    for await (const line of api.addToAlbum(album, part)) yield { file: part[line.index]!, line };
 }
 
 function* portions(files: File[]): Generator<File[]> {

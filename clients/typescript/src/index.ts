@@ -66,7 +66,8 @@ export class Client {
       if (response.ok || response.status === 304) return response;
       const failure = await ServiceError.of(response);
       if (response.status === 401 && (await this.hasNewKey(sent, failure))) continue;
-      const waitMs = this.waitMs(failure, attempt++, Date.now() - begin);
+      const isBusy = response.status === 429 || response.status === 503;
+      const waitMs = isBusy ? this.waitMs(failure.retryAfterS, attempt++, Date.now() - begin) : null;
       if (waitMs === null) throw failure;
       await pause(waitMs, init.signal);
     }
@@ -148,11 +149,26 @@ export class Client {
   createAlbum = (album: Schemas["AlbumDocument"]) => this.json<Schemas["AlbumAnswer"]>("/albums", json("POST", album));
   album = (id: string) => this.json<Schemas["AlbumAnswer"]>(of("albums", id));
   deleteAlbum = (id: string) => this.delete(of("albums", id));
-  /** Add photographs to an album; yield a line for each, in order, as they are stored. The same picture is stored once. */
+  /** Add photographs to an album; yield a line for each, in order, as they are stored. The same picture is stored once.
+   * Those that the service is too busy for are sent again, as the options allow; their lines come last. */
   async *addToAlbum(id: string, photos: Picture[], options: CallOptions = {}): AsyncGenerator<Schemas["AlbumLine"]> {
-    const init = { timeoutMs: 0, ...options, onProgress: undefined, ...query({}, ...photos) };
-    for await (const line of linesOf(await this.request(of("albums", id, "/photographs"), init)))
-      yield JSON.parse(line);
+    let left = photos.map((_, index) => index);
+    for (let attempt = 1, waitedMs = 0; left.length > 0; attempt++) {
+      const sent = query({}, ...left.map((index) => photos[index]!));
+      const init = { timeoutMs: 0, ...options, onProgress: undefined, ...sent };
+      const busy: Schemas["AlbumLine"][] = [];
+      for await (const text of linesOf(await this.request(of("albums", id, "/photographs"), init))) {
+        const line = JSON.parse(text);
+        line.index = left[line.index];
+        if ((line.retry_after_s ?? null) === null) yield line;
+        else busy.push(line);
+      }
+      const waitMs = this.waitMs(Math.max(0, ...busy.map((line) => line.retry_after_s!)), attempt, waitedMs);
+      if (waitMs === null) yield* busy;
+      left = waitMs === null ? [] : busy.map(({ index }) => index);
+      if (left.length > 0) await pause(waitMs!, options.signal);
+      waitedMs += waitMs ?? 0;
+    }
   }
   /** Return the photographs of an album with their pins, at most 500. */
   albumPhotographs = (id: string) =>
@@ -226,9 +242,9 @@ export class Client {
   }
 
   /** Return the time until the next attempt; null if there is none. */
-  private waitMs({ status, retryAfterS }: ServiceError, attempt: number, spentMs: number): number | null {
+  private waitMs(retryAfterS: number | null, attempt: number, spentMs: number): number | null {
     const { attempts = 4, retryMs = 60_000 } = this.options;
-    if ((status !== 429 && status !== 503) || attempt >= attempts) return null;
+    if (attempt >= attempts) return null;
     // Clients that failed together are spread.
     const waitMs = (retryAfterS === null ? 250 * 2 ** attempt : 1000 * retryAfterS) + 250 * Math.random();
     return spentMs + waitMs <= retryMs ? waitMs : null;

@@ -29,8 +29,9 @@ _MATCHES, _MATCH_ODDS, _TURN_ODDS = (0.0, 6.0, 14.0, 18.0, 24.0, 32.0), (-0.3, -
 # Share of the pairs of one room that are among the most similar ones, and limits of similarity and log odds.
 _FOUND, _ALIKE, _UNLIKE = 0.65, 0.4, 0.25
 _COLOUR_ODDS = (-2.0, 3.0)
-# Each photograph of a room has pairs with all others, which are no independent signs.
-_WEIGHT = 0.25
+# Each photograph of a room has pairs with all others, which are no independent signs: weight for up to so many
+# photographs of a room on average; with more, the weight of all pairs of a photograph together stays the same.
+_WEIGHT, _FEW = 0.25, 3.0
 # Matches of a pair, and turn (radians; NaN if none was found).
 Found = tuple[int, float]
 
@@ -63,8 +64,10 @@ def find_links(
     return found
 
 
-def pair_odds(photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int], Found]) -> Float[np.ndarray, "n n"]:
-    """Return the log odds that two photographs are of one room, symmetric, with zeros on the diagonal."""
+def pair_odds(
+    photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int], Found], rooms: int
+) -> Float[np.ndarray, "n n"]:
+    """Return the log odds that two photographs are of one of some rooms, symmetric, with zeros on the diagonal."""
     count = len(photographs)
     total = _colour_odds(photographs)
     for (first, second), (matches, turn) in links.items():
@@ -72,7 +75,7 @@ def pair_odds(photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int
         total[first, second] += odds
         total[second, first] += odds
     total[np.arange(count), np.arange(count)] = 0.0
-    return _WEIGHT * total
+    return _WEIGHT * min(_FEW * rooms / count, 1.0) * total
 
 
 def _pairs(photographs: Sequence[AlbumPhotograph]) -> list[tuple[int, int]]:

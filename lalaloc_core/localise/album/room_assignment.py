@@ -148,14 +148,19 @@ class _Chains:
         size = mask.sum(axis=1)
         others = self._counts.copy()
         others[self._each, own] -= size
-        log = mask @ self._alone + np.einsum("ct,ctr->cr", mask, self._linked)
+        log = mask @ self._alone + (mask[:, None, :] @ self._linked)[:, 0]
         # Pairs within the set stay pairs wherever it goes.
-        log[self._each, own] -= np.einsum("ct,tu,cu->c", mask, self._pairs, mask)
+        log[self._each, own] -= ((mask @ self._pairs) * mask).sum(axis=1)
         log += self._prior(others + size[:, None]) - self._prior(others)
         first, second = mask[:, :-1], mask[:, 1:]
         log += (first & second).sum(axis=1)[:, None] * np.diag(self._walk)
-        log += np.einsum("ct,ctr->cr", first & ~second, self._walk.T[room[:, 1:]])
-        log += np.einsum("ct,ctr->cr", ~first & second, self._walk[room[:, :-1]])
+        # The ends of the set, whose neighbours are of other rooms or not of the set.
+        for ends, neighbours, walk in (
+            (first & ~second, room[:, 1:], self._walk.T),
+            (~first & second, room[:, :-1], self._walk),
+        ):
+            chain, number = np.nonzero(ends)
+            np.add.at(log, chain, walk[neighbours[chain, number]])
         if whole:
             log[others > 0.0] = -np.inf
         self._relabel(mask, self._drawn(log, heat))

@@ -39,7 +39,7 @@ _SUGGESTIONS, _ROOMS = 5, 8
 # Share of photographs that must have a time for the order to count.
 _TIMED = 0.8
 # Log odds of a photograph of none of the rooms, beside the best pose of other homes.
-_ELSEWHERE = -3.0
+_ELSEWHERE = -2.0
 _CERTAIN = 1e4
 # How much the number of photographs of a room keeps to what its size lets expect.
 _TIGHTNESS = 2.5
@@ -191,7 +191,7 @@ def _room_shares(
     evidence = RoomEvidence(
         alone=alone,
         walk=walk_of(ground) if has_order else None,
-        pairs=pair_odds(photographs, links),
+        pairs=pair_odds(photographs, links, rooms),
         expected=expected_photographs(ground, len(photographs)),
         tightness=_TIGHTNESS,
     )

@@ -33,6 +33,8 @@ class States:
         room: (m,) number of its room.
         heading: (m,) azimuth of the photograph's centre, radians.
         log: (m,) log likelihood.
+        photographs: number of photographs whose evidence `log` sums up.
+        highest: highest log likelihood of the photograph alone.
     """
 
     pose: Int[np.ndarray, "m"]
@@ -40,6 +42,8 @@ class States:
     room: Int[np.ndarray, "m"]
     heading: Float[np.ndarray, "m"]
     log: Float[np.ndarray, "m"]
+    photographs: int
+    highest: float
 
     @classmethod
     def of(cls, arrays: Arrays, headings: int) -> States:
@@ -50,13 +54,19 @@ class States:
             room=arrays["room"],
             heading=arrays["hypothesis"] * (TWO_PI / headings),
             log=arrays["log_likelihood"].astype(float),
+            photographs=1,
+            highest=float(arrays["log_likelihood"].max()),
         )
 
     def best_of_rooms(self, rooms: int) -> Float[np.ndarray, "r"]:
-        """Return the highest log likelihood in every room."""
+        """Return the log likelihood of every room at its best state: this photograph's share of the joint evidence.
+
+        Each photograph of a spot has the evidence of all, which counts once for all of them. Their best state fits each
+        one worse than its own best; rooms of other buildings would, too, so the highest value stays.
+        """
         best = np.full(rooms, self.log.min(initial=0.0) - 10.0)
         np.maximum.at(best, self.room, self.log)
-        return best
+        return self.highest + (best - best.max()) / self.photographs
 
     def modes(self, room: int) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
         """Return distinct states of a room, best first, and their shares of its probability."""
@@ -84,7 +94,7 @@ def turned_together(states: Sequence[States], turns: Mapping[tuple[int, int], fl
 
     A state counts by the best state of the other photograph at its pose with the heading that the turn tells.
     """
-    found = [state.log.copy() for state in states]
+    found, photographs = [state.log.copy() for state in states], [state.photographs for state in states]
     step = TWO_PI / _HEADINGS
     spread = -0.5 * np.square(np.arange(-2, 3) * step / _TURN_SD)
     for (first, second), turn in turns.items():
@@ -97,7 +107,10 @@ def turned_together(states: Sequence[States], turns: Mapping[tuple[int, int], fl
             wanted = np.rint((states[own].heading + change) / step).astype(int) % _HEADINGS
             seen = table[states[own].pose, wanted] - float(states[other].log.max())
             found[own] += np.logaddexp(seen + math.log1p(-_WRONG_TURN), math.log(_WRONG_TURN) + seen.min())
-    return [replace(state, log=log) for state, log in zip(states, found, strict=True)]
+            photographs[own] += 1
+    return [
+        replace(state, log=log, photographs=count) for state, log, count in zip(states, found, photographs, strict=True)
+    ]
 
 
 def by_compass(
