@@ -19,7 +19,7 @@ from time import process_time
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidFilmError
@@ -32,6 +32,7 @@ from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
 from lalaloc_core.photograph.projection import find_lens
 from lalaloc_core.photograph.stated_camera import StatedCamera
 from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
+from lalaloc_core.photograph.turn_order import LIKELY_SD, Step
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 
 # Demuxers of FFmpeg by the kind of file; a kind is told by its first bytes.
@@ -49,12 +50,8 @@ _TIME_ROUNDED_S = 0.002
 _LONG_SIDE = 960
 # Mean grey level of frames that are too dark.
 _DARK = 12.0
-# Standard deviation (radians) of turns by optical flow: constant, and as a share of the turn.
-_FLOW_SD, _FLOW_SHARE = math.radians(2.0), 0.04
-# Standard deviation (radians) of angles that count as exact; see `localise.sequence.turn_localisation`.
-_SURE_SD = math.radians(5.0)
-# Frames of groups that are left out at most.
-_ALONE = 2
+# Standard deviation (radians) of turns by optical flow, besides what the tracker tells.
+_FLOW_SD = math.radians(3.0)
 # Largest turn (radians, by optical flow, which can be wrong by a third) whose frames are kept.
 _MOST_TURN = 1.5 * TWO_PI
 # Turn (radians) that a film shows at least.
@@ -88,11 +85,11 @@ class Film:
 
 @dataclass(eq=False)
 class _Sample:
-    """A frame that can be kept: its time, angle by optical flow and the guessed part of it, sharpness and picture."""
+    """A frame that can be kept: its time, number, angle by optical flow, sharpness and picture."""
 
     time_s: float
+    number: int
     heading: float
-    doubt: float
     sharpness: float
     picture: UInt8[np.ndarray, "h w 3"]
 
@@ -152,18 +149,17 @@ def read_film(
     kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
     if not kept:
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
-    photographs, angles = _turned([sample.picture for sample in kept], samples.full_size, stated, size)
-    tracker.calibrate(photographs[0].hfov.value, samples.full_size)
-    tracked, doubt = (
-        tracker.scale * np.array([getattr(sample, name) for sample in kept]) for name in ("heading", "doubt")
-    )
-    joined = _joined(angles, tracked, doubt)
+    photographs, angles = _turned(kept, samples.full_size, stated, size, tracker)
+    joined = _likely(angles)
+    first = angles[joined[0]].heading
     if len(joined) < len(kept):
         samples.dropped["blank, at an unknown angle"] += len(kept) - len(joined)
     return Film(
         photographs=tuple(photographs[index] for index in joined),
         times_s=tuple(kept[index].time_s for index in joined),
-        angles=tuple(joined.values()),
+        angles=tuple(
+            replace(angles[index], heading=float(wrap_angle(angles[index].heading - first))) for index in joined
+        ),
         frames=samples.frames,
         dropped=dict(samples.dropped),
         duration_s=samples.last_s,
@@ -173,9 +169,12 @@ def read_film(
 
 
 def _turned(
-    pictures: Sequence[UInt8[np.ndarray, "h w 3"]], full_size: tuple[int, int], stated: StatedCamera, size: PatchSize
+    kept: Sequence[_Sample], full_size: tuple[int, int], stated: StatedCamera, size: PatchSize, tracker: FlowTracker
 ) -> tuple[list[Photograph], list[TurnAngles]]:
-    """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
+    """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles.
+
+    Frames that do not overlap are joined by the turns that the tracker tells.
+    """
 
     def photograph(picture: np.ndarray, statement: StatedCamera, *, overview: bool) -> Photograph:
         nothing = ExifLens(), PhotoSphere()
@@ -184,48 +183,28 @@ def _turned(
         )
         return photograph_of_picture(picture, full_size, lens, statement, size, overview=overview)
 
-    photographs = [photograph(picture, stated, overview=True) for picture in pictures]
+    photographs = [photograph(sample.picture, stated, overview=True) for sample in kept]
     views = turn_views(photographs)
-    angles = angles_of_turn(views)
+    tracker.calibrate(views[0].camera.hfov, full_size)
+    numbers = [sample.number for sample in kept]
+    heading, error = (values[numbers] for values in tracker.reckoned())
+    steps = [
+        Step(float(turn), math.hypot(_FLOW_SD, float(sd)))
+        for turn, sd in zip(np.diff(heading), np.diff(error), strict=True)
+    ]
+    angles = angles_of_turn(views, steps)
     for index, found in enumerate(turned_photographs(photographs, views, stated, angles)):
         if found.stated is not None:
-            again = photograph(pictures[index], found.stated, overview=False)
+            again = photograph(kept[index].picture, found.stated, overview=False)
             photographs[index] = found.applied(again)
+    tracker.calibrate(photographs[0].hfov.value, full_size)
     return photographs, angles
 
 
-def _joined(
-    angles: Sequence[TurnAngles], tracked: Float[np.ndarray, "n"], doubt: Float[np.ndarray, "n"]
-) -> dict[int, TurnAngles]:
-    """Return the angles of frames as one group, by number: groups are joined by the turns that optical flow tells.
-
-    `doubt` is the part (radians) of `tracked` that was guessed. If most frames overlap, those that overlap with none
-    and whose angles would be guesses, of blank walls, are left out: all angles of a turn count as exact, or none.
-    """
-    heading = np.array([angle.heading for angle in angles])
-    group = np.array([angle.group for angle in angles])
-    size = np.bincount(group)
-    main = int(size.argmax())
-    members = np.flatnonzero(group == main)
-    offset = {
-        number: float(np.angle(np.exp(1j * (tracked - heading)[group == number]).sum()))
-        for number in set(group.tolist())
-    }
-    joined: dict[int, TurnAngles] = {}
-    for index, angle in enumerate(angles):
-        turn, heading_sd = angle.heading + offset[angle.group] - offset[main], angle.heading_sd
-        if angle.group != main:
-            apart = np.abs(tracked[index] - tracked[members])
-            guessed = np.abs(doubt[index] - doubt[members])
-            flow_sd = float((_FLOW_SHARE * apart + guessed).min())
-            heading_sd = math.hypot(heading_sd, _FLOW_SD + flow_sd)
-        if heading_sd <= _SURE_SD or size[angle.group] > _ALONE or 2 * len(members) <= len(angles):
-            joined[index] = replace(angle, group=0, heading=turn, heading_sd=heading_sd)
-    first = min(joined)
-    turned = {
-        index: replace(a, heading=float(wrap_angle(a.heading - joined[first].heading))) for index, a in joined.items()
-    }
-    return turned | {first: replace(turned[first], heading_sd=0.0)}
+def _likely(angles: Sequence[TurnAngles]) -> list[int]:
+    """Return the numbers of the frames to keep: if most angles are likely, the others, of blank walls, are left out."""
+    likely = [index for index, angle in enumerate(angles) if angle.heading_sd <= LIKELY_SD]
+    return likely if 2 * len(likely) > len(angles) else list(range(len(angles)))
 
 
 def _warnings(tracker: FlowTracker) -> list[str]:
@@ -303,7 +282,7 @@ def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples,
     heading = tracker.follow(grey)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
     samples.add(
-        _Sample(time_s, heading, tracker.doubt, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
+        _Sample(time_s, tracker.number, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
     )
 
 

@@ -15,9 +15,15 @@ _LONG_SIDE, _CORNERS, _QUALITY, _APART = 400, 200, 0.01, 6
 _LEAST, _TOGETHER = 8, 3.0
 # Field of view of the shorter side of phones' films, and the step of kept frames as a share of the field.
 _USUAL_FIELD, _STEP_SHARE = math.radians(53.0), 0.25
-# Error of the turn (radians) to a sample that shows nothing to follow: as a share of the turn before, at least, and
-# where nothing was followed before.
-_GUESSED_SHARE, _GUESSED, _GUESSED_FIRST = 0.3, math.radians(1.0), math.radians(4.0)
+# Blank pictures: gradient (grey levels per pixel of a Sobel kernel, blurred by so many pixels) of the strongest
+# hundredth. Codecs copy blank parts from sample to sample, as if the camera stood still.
+_BLANK, _BLUR = 4.0, 2.0
+# Upright edges: largest shift (share of the width), least correlation and gradient of the columns' means.
+_SHIFT, _CORRELATION, _EDGE = 0.2, 0.85, 2.0
+# Corners that contradict upright edges, by so much (radians, share): fewer than so many, or still ones, are wrong.
+_UNLIKE, _UNLIKE_SHARE, _FEW, _STILL = math.radians(1.5), 0.4, 20, math.radians(0.5)
+# Errors of the turn to a sample as a share: by corners, by upright edges, which near things mislead, and guessed.
+_CORNER_SHARE, _EDGE_SHARE, _GUESSED_SHARE = 0.1, 0.3, 0.35
 # Walking: change of size (natural logarithm) over the film, or of the share of corners that move together.
 _GROWN, _APART_SHARE = math.log(1.6), 0.45
 # Shaking: nod (radians) between samples.
@@ -28,8 +34,7 @@ class FlowTracker:
     """Angle that the camera of a film has turned through, about.
 
     Attributes:
-        heading: angle (radians) since the first sample, clockwise.
-        doubt: sum of the errors (radians) that guesses of lost samples can have made.
+        heading: angle (radians) since the first sample, clockwise, if the turn goes on where nothing can be followed.
         step: angle (radians) between frames that are kept.
         scale: factor that makes headings those of the true field of view; see `calibrate`.
     """
@@ -37,16 +42,16 @@ class FlowTracker:
     def __init__(self, hfov: float | None = None) -> None:
         """Begin with the horizontal field of view (radians); None for that of phones."""
         self.heading, self.step = 0.0, _STEP_SHARE * (hfov or _USUAL_FIELD)
-        self.doubt = 0.0
         self.scale = 1.0
         self._hfov = hfov
         self._before: UInt8[np.ndarray, "h w"] | None = None
         self._speed = 0.0
+        self._turns: list[float] = []
+        self._errors: list[float] = []
         self._least = self._most = 0.0
         self._nods: list[float] = []
         self._shares: list[float] = []
         self._grown = 0.0
-        self._steps = self._lost = 0
 
     def follow(self, grey: UInt8[np.ndarray, "h w"]) -> float:
         """Return the heading (radians) of the next sample."""
@@ -55,23 +60,48 @@ class FlowTracker:
         before, self._before = self._before, small
         if before is None:
             return self.heading
-        self._steps += 1
-        moved = _moved(before, small)
-        if moved is None:
-            # Blank or blurred: the turn goes on as before.
-            self._lost += 1
-            self.doubt += max(_GUESSED_SHARE * abs(self._speed), _GUESSED) if self._shares else _GUESSED_FIRST
-        else:
-            # Angles, because pixels near the border are narrower.
-            angles = np.arctan(moved.places / self._focal(small))
-            across, down = np.median(angles[1] - angles[0], axis=0)
-            self._speed = -float(across)
-            self._nods.append(float(down))
-            self._shares.append(moved.share)
-            self._grown += moved.growth
+        turn, error = self._turn(before, small)
+        self._turns.append(turn)
+        self._errors.append(error)
+        if not math.isnan(turn):
+            self._speed = turn
         self.heading += self._speed
         self._least, self._most = min(self._least, self.heading), max(self._most, self.heading)
         return self.heading
+
+    def _turn(self, before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
+        """Return the turn (radians) between samples with its error as a share; not a number if nothing tells it."""
+        gradients = [_gradient(picture) for picture in (before, after)]
+        if min(float(np.percentile(np.abs(gradient), 99)) for gradient in gradients) < _BLANK:
+            return math.nan, _GUESSED_SHARE
+        moved, focal = _moved(before, after), self._focal(after)
+        shift = _edges_shift(*gradients)
+        swept = None if shift is None else math.atan(-shift / focal)
+        if moved is None:
+            return (math.nan, _GUESSED_SHARE) if swept is None else (swept, _EDGE_SHARE)
+        # Angles, because pixels near the border are narrower.
+        angles = np.arctan(moved.places / focal)
+        across, down = np.median(angles[1] - angles[0], axis=0)
+        turn = -float(across)
+        if moved.places.shape[1] < _FEW or abs(turn) < _STILL:
+            if swept is None:
+                return math.nan, _GUESSED_SHARE
+            if abs(turn - swept) > max(_UNLIKE, _UNLIKE_SHARE * abs(swept)):
+                return swept, _EDGE_SHARE
+        self._nods.append(float(down))
+        self._shares.append(moved.share)
+        self._grown += moved.growth
+        return turn, _CORNER_SHARE
+
+    def reckoned(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Return headings of all samples (radians), and their errors summed up; where lost, the speed is the usual."""
+        turns, errors = np.array(self._turns), np.array(self._errors)
+        lost = np.isnan(turns)
+        turns[lost] = 0.0 if lost.all() else np.median(turns[~lost])
+        turns = self.scale * turns
+        summed = np.cumsum([turns, errors * np.abs(turns)], axis=1)
+        heading, error = np.concatenate([np.zeros((2, 1)), summed], axis=1)
+        return heading, error
 
     def _focal(self, grey: UInt8[np.ndarray, "h w"]) -> float:
         height, width = grey.shape
@@ -83,6 +113,11 @@ class FlowTracker:
         """Set the scale by the true horizontal field of view (radians) of pictures of a size (width, height)."""
         presumed = _focal_of(self._hfov, size[0]) if self._hfov else _focal_of(_USUAL_FIELD, min(size))
         self.scale = presumed / _focal_of(hfov, size[0])
+
+    @property
+    def number(self) -> int:
+        """Number of the last sample."""
+        return len(self._turns)
 
     @property
     def turned(self) -> float:
@@ -108,11 +143,32 @@ class FlowTracker:
     @property
     def lost_share(self) -> float:
         """Share of the samples that could not be followed."""
-        return self._lost / self._steps if self._steps else 0.0
+        return float(np.isnan(self._turns).mean()) if self._turns else 0.0
 
 
 def _focal_of(hfov: float, width: int) -> float:
     return 0.5 * width / math.tan(0.5 * min(hfov, 0.9 * math.pi))
+
+
+def _gradient(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return how much a picture, blurred, changes from column to column."""
+    return cv2.Sobel(cv2.GaussianBlur(grey, (0, 0), _BLUR), cv2.CV_32F, 1, 0)
+
+
+def _edges_shift(before: Float[np.ndarray, "h w"], after: Float[np.ndarray, "h w"]) -> float | None:
+    """Return the shift (pixels to the right) of upright edges by their gradients; None if nothing tells it.
+
+    Edges of plain walls have no corners. The means of columns are compared.
+    """
+    one, other = before.mean(axis=0), after.mean(axis=0)
+    if np.abs(one).max() < _EDGE:
+        return None
+    width, best = len(one), (0.0, 0)
+    for shift in range(-round(_SHIFT * width), round(_SHIFT * width) + 1):
+        kept, met = one[max(-shift, 0) : width - max(shift, 0)], other[max(shift, 0) : width - max(-shift, 0)]
+        alike = float(kept @ met) / max(float(np.linalg.norm(kept) * np.linalg.norm(met)), 1e-9)
+        best = max(best, (alike, shift))
+    return float(best[1]) if best[0] > _CORRELATION else None
 
 
 class _Moved(NamedTuple):

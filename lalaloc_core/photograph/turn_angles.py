@@ -25,6 +25,7 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.levelling import Attitude, estimate_attitude, lines_of
 from lalaloc_core.photograph.overlap import Features, Link, find_links
+from lalaloc_core.photograph.turn_order import Step, agreeing_links, headings_in_order, usual_steps
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -90,6 +91,7 @@ class TurnAngles:
         attitude: tilt.
         focal_factor: factor of the camera's focal length.
         focal_sd: relative standard deviation of the resulting focal length.
+        is_assumed: the heading does not follow from overlap with the most photographs of the group, but from the order.
     """
 
     group: int
@@ -98,13 +100,20 @@ class TurnAngles:
     attitude: Attitude
     focal_factor: float = 1.0
     focal_sd: float = 0.0
+    is_assumed: bool = False
 
 
-def angles_of_turn(views: Sequence[TurnView]) -> list[TurnAngles]:
-    """Return the angles of photographs of one spot, in the order in which they were taken."""
+def angles_of_turn(views: Sequence[TurnView], steps: Sequence[Step] | None = None) -> list[TurnAngles]:
+    """Return the angles of photographs of one spot, in the order in which they were taken.
+
+    Groups that do not overlap are joined by `steps` from each photograph to the next, by default by equal steps if the
+    photographs go once around; see `turn_order`.
+    """
     attitudes = [_attitude_of(view) for view in views]
     cameras = [view.camera for view in views]
     links = find_links([view.overview.features for view in views], cameras, attitudes, np.random.default_rng(0))
+    steps = steps or usual_steps(len(views), links)
+    links = links if steps is None else agreeing_links(links, len(views), steps)
     found: list[TurnAngles] = []
     for _ in range(_ROUNDS):
         found = _fitted(views, attitudes, links)
@@ -112,7 +121,21 @@ def angles_of_turn(views: Sequence[TurnView]) -> list[TurnAngles]:
         if len(kept) == len(links):
             break
         links = kept
-    return found
+    return found if steps is None else _joined(found, steps)
+
+
+def _joined(found: list[TurnAngles], steps: Sequence[Step]) -> list[TurnAngles]:
+    """Return the angles as one group."""
+    group, heading = (np.array([getattr(angle, name) for angle in found]) for name in ("group", "heading"))
+    if not group.any():
+        return found
+    turned, placed_sd = headings_in_order(group, heading, steps)
+    return [
+        replace(
+            angle, group=0, heading=float(turn), heading_sd=math.hypot(angle.heading_sd, sd), is_assumed=bool(sd > 0.0)
+        )
+        for angle, turn, sd in zip(found, turned, placed_sd, strict=True)
+    ]
 
 
 def _turn(found: Sequence[TurnAngles], link: Link) -> float:

@@ -3,7 +3,8 @@
 Costs are means over all azimuths, and those that are not seen cost nothing: the more a turn shows, the higher its cost
 at the right place, and the less a model that was fitted on single views believes it. Turns have a model of their own,
 fitted on turns once around and on parts of them, on the same after disturbances, and on turns in other buildings. A
-phone is held at arm's length, and its angles have the errors of those that overlap tells.
+phone is held at arm's length. Its angles have the errors of those that overlap tells, those of a run of photographs the
+errors of angles that are assumed by their order, and its field of view the error of an estimated one.
 """
 
 from __future__ import annotations
@@ -50,9 +51,10 @@ _SPLIT = SPLIT_NUMBERS["validation"]
 _UPRIGHT, _LYING = Phone(width=360, height=480), Phone(width=480, height=360, hfov_deg=67.0)
 _UPRIGHT_SHARE = 0.7
 # Photographs once around, and the fewest of a part of a turn.
-_PHOTOGRAPHS, _FEWEST = 12, 3
-# Spots of a home, and standard deviation of the relative headings.
-_SPOTS, _ANGLE_SD = 2, math.radians(0.5)
+_PHOTOGRAPHS, _FEWEST = 9, 3
+# Spots of a home, and standard deviations of the relative headings by overlap and of those that are assumed, and of the
+# logarithm of the field of view.
+_SPOTS, _ANGLE_SD, _ASSUMED_SD, _FIELD_SD = 2, math.radians(0.5), math.radians(4.0), 0.03
 # Ratio of homes to those whose disturbed turns are searched in plans without openings.
 _PER_UNOPENED_HOME = 4
 # Relative error of the camera height of a disturbed turn.
@@ -76,12 +78,12 @@ class TurnSettings:
 
 
 class _Taken(NamedTuple):
-    """Pictures of a turn with their headings (radians) minus that of the shot."""
+    """Pictures of a turn with their headings (radians) minus that of the shot, and the field of view in use (degrees)."""
 
     shot: Shot
     pictures: list[UInt8[np.ndarray, "h w 3"]]
     turns: list[float]
-    phone: Phone
+    hfov_deg: float
 
 
 class TurnPredictions(NamedTuple):
@@ -164,12 +166,16 @@ def _turns_of_home(settings: TurnSettings, index: int) -> Iterator[_Taken]:
         phone = _UPRIGHT if rng.random() < _UPRIGHT_SHARE else _LYING
         frames = photographs_of_turn(shot, renderers, phone, _PHOTOGRAPHS, rng)
         turns = [float(wrap_angle(frame.heading - shot.heading)) for frame in frames]
-        turns = [turns[0], *(turn + rng.normal(0.0, _ANGLE_SD) for turn in turns[1:])]
+        # Walls of a part of the room are plain: their photographs overlap with no other.
+        plain = rng.integers(1, _PHOTOGRAPHS) + np.arange(rng.integers(_PHOTOGRAPHS))
+        sd = np.where(np.isin(np.arange(_PHOTOGRAPHS), plain), _ASSUMED_SD, _ANGLE_SD)
+        turns = [turns[0], *(turns[1:] + rng.normal(0.0, sd[1:])).tolist()]
         pictures = [frame.pixels for frame in frames]
-        yield _Taken(shot, pictures, turns, phone)
+        hfov_deg = phone.hfov_deg * math.exp(rng.normal(0.0, _FIELD_SD))
+        yield _Taken(shot, pictures, turns, hfov_deg)
         step, count = int(rng.integers(1, 4)), int(rng.integers(_FEWEST, 9))
         part = slice(0, min(step * count, _PHOTOGRAPHS), step)
-        yield _Taken(shot, pictures[part], turns[part], phone)
+        yield _Taken(shot, pictures[part], turns[part], hfov_deg)
 
 
 def _disturbed(taken: _Taken, rng: np.random.Generator) -> _Taken:
@@ -186,17 +192,19 @@ class _Turn:
         """Read the photographs."""
         self._model, self._taken = model, taken
         manifest = model.bundle.manifest
-        self._photographs = [
+        photographs = [
             open_photograph(
                 encode_jpeg(picture),
                 sphere_size=sphere_size(manifest),
-                stated=StatedCamera(projection="perspective", hfov_deg=taken.phone.hfov_deg),
+                stated=StatedCamera(projection="perspective", hfov_deg=taken.hfov_deg),
                 patch_size=patch_size(manifest),
                 # Disturbed renderings of white walls are as pale as paper.
                 refuse_drawings=False,
             )
             for picture in taken.pictures
         ]
+        # One reading serves all searches.
+        self._photographs = [model.encoder.with_features(photograph) for photograph in photographs]
 
     def located(
         self, plan: FloorPlan, scene: str, number: int, *, known: bool, height_factor: float = 1.0

@@ -14,6 +14,7 @@ from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.measured_motion import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from lalaloc_core.photograph.turn_angles import TurnAngles
+from lalaloc_core.photograph.turn_order import LIKELY_SD
 
 # Phones move about the person who turns.
 ON_THE_SPOT = Motion(distance_m=0.0, distance_std_m=0.15)
@@ -40,8 +41,8 @@ class LinkedTurn:
 
     @property
     def turns(self) -> list[float] | None:
-        """Headings (radians) minus that of the first photograph; None unless all are known well enough to be exact."""
-        if any(angle.group or angle.heading_sd > EXACT for angle in self.angles):
+        """Headings (radians) minus that of the first photograph; None unless all are likely enough to be one query."""
+        if any(angle.group or angle.heading_sd > LIKELY_SD for angle in self.angles):
             return None
         return [angle.heading for angle in self.angles]
 
