@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -234,22 +234,24 @@ def _densities(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def _starts(lines: Lines) -> Float[np.ndarray, "s 3"]:
-    """Return the best attitudes (pitch, roll, yaw) of a coarse search."""
-    sigma = _sigmas(lines, _COARSE_SIGMA)[:, None]
-    weight = _weights(lines)
+    """Return the best attitudes (pitch, roll, yaw) of a coarse search, in single precision, which is faster."""
+    sigma = _sigmas(lines, _COARSE_SIGMA)[:, None].astype(np.float32)
+    weight = _weights(lines).astype(np.float32)
+    lines = replace(lines, normal=lines.normal.astype(np.float32), middle=lines.middle.astype(np.float32))
     pitch, roll = (grid.ravel() for grid in np.meshgrid(_PITCHES, _ROLLS, indexing="ij"))
     vertical = np.stack([-np.sin(roll) * np.cos(pitch), np.sin(pitch), np.cos(roll) * np.cos(pitch)], axis=-1)
-    upright = _SHARES[0] * _densities(_errors(lines, vertical), sigma)
+    upright = float(_SHARES[0]) * _densities(_errors(lines, vertical.astype(np.float32)), sigma)
     prior = -0.5 * ((pitch / _PRIOR[0]) ** 2 + (roll / _PRIOR[1]) ** 2)
     score = weight @ np.log(upright + _OUTLIERS + 0.4 / math.pi) + prior
     found = []
     for index in np.argsort(-score)[:_STARTS]:
         axes = camera_axes(pitch=float(pitch[index]), roll=float(roll[index]))
         level = np.stack([np.sin(_YAWS), np.cos(_YAWS), np.zeros_like(_YAWS)], axis=-1)
-        first = _densities(_errors(lines, level @ axes.T), sigma)
+        first = _densities(_errors(lines, (level @ axes.T).astype(np.float32)), sigma)
         across = np.stack([np.cos(_YAWS), -np.sin(_YAWS), np.zeros_like(_YAWS)], axis=-1)
-        second = _densities(_errors(lines, across @ axes.T), sigma)
-        full = weight @ np.log(upright[:, index, None] + _SHARES[1] * first + _SHARES[2] * second + _OUTLIERS)
+        second = _densities(_errors(lines, (across @ axes.T).astype(np.float32)), sigma)
+        horizontal = float(_SHARES[1]) * first + float(_SHARES[2]) * second
+        full = weight @ np.log(upright[:, index, None] + horizontal + _OUTLIERS)
         best = int(np.argmax(full))
         found.append((full[best] + prior[index], np.array([pitch[index], roll[index], _YAWS[best]])))
     found.sort(key=lambda start: -start[0])
