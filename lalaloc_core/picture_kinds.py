@@ -20,8 +20,8 @@ _PAPER_PERCENTILE, _NOISE, _MOSTLY = 80, 10, 0.5
 # Bounds, with a margin to scans and photographs of rooms (spheres, views, renderings) that were measured.
 _MAX_FLAT_OF_PHOTOGRAPHS, _MIN_SPREAD_OF_PHOTOGRAPHS = 0.72, 90.0
 _MIN_FLAT_OF_DRAWINGS, _MAX_SPREAD_OF_DRAWINGS, _MIN_PAPER, _MIN_UNIFORM = 0.94, 40.0, 230.0, 0.36
-# Plans with coloured rooms: differences of neighbours that are none, and that are an edge; shares of such pixels, and of
-# the most frequent tone, which overexposed photographs exceed.
+# Plans with coloured rooms: differences of neighbours that are none, and that are an edge; shares of such pixels, and
+# of the most frequent tone, which overexposed photographs exceed.
 _SAME, _EDGE, _MIN_STILL, _MIN_EDGES, _UNIFORM = 1, 40, 0.75, 0.035, (0.3, 0.7)
 # Step of the sample of a photograph, and the smallest share of its most frequent tone in drawings.
 _SAMPLE, _MIN_SAMPLED = 4, 0.3

@@ -173,7 +173,7 @@ def write_pin_files(
     *,
     copies: bool,
 ) -> list[str]:
-    """Write all files; return notes on what could not be written.
+    """Write all files; return notes on what could not be written, which `document` gets as well.
 
     Raises:
         OSError: a file cannot be written.
@@ -183,29 +183,30 @@ def write_pin_files(
     from lalaloc_core.draw.pins import draw_pins
 
     entries, notes = document["photographs"], list[str]()
+    if all(plan.anchor is None for plan in plans):
+        notes.append("the plan has no anchor (docs/reference/plan-format.md), so pins.geojson is left out")
+    else:
+        write_text(out / "pins.geojson", json.dumps(_collection(plans, ids, entries)) + "\n")
+    copied = _write_copies(out / COPIES, plans, ids, files, entries) if copies else []
+    notes += copied
+    document["notes"] += notes
     write_text(out / "pins.json", json.dumps(document, indent=2) + "\n")
     write_text(out / "pins.csv", _csv(entries))
-    if any(plan.anchor is not None for plan in plans):
-        write_text(out / "pins.geojson", json.dumps(_collection(plans, ids, entries)) + "\n")
-    else:
-        notes.append("the plan has no anchor (docs/reference/plan-format.md), so pins.geojson is left out")
     rows = list(_report_rows(ids, files, entries))
     for number, plan in enumerate(plans):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
         write_text(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
     title = " / ".join(dict.fromkeys(plan.name for plan in plans))
-    write_pdf(report_pages(title, plans, rows, _summary(document)), out / "report.pdf", DPI)
-    if copies:
-        notes += _write_copies(out / COPIES, plans, ids, files, entries)
+    write_pdf(report_pages(title, plans, rows, _summary(document, copied)), out / "report.pdf", DPI)
     return notes
 
 
-def _summary(document: dict[str, Any]) -> list[str]:
+def _summary(document: dict[str, Any], copied: Sequence[str]) -> list[str]:
     counts, lines = document["counts"], []
     lines.append(", ".join(f"{count} {state.replace('_', ' ')}" for state, count in counts.items() if count))
     if document["camera_height_m"] is not None:
         lines.append(f"Cameras were {document['camera_height_m']:.2f} m above the floor.")
-    return lines
+    return [*lines, *copied]
 
 
 def _csv(entries: Sequence[dict[str, Any]]) -> str:

@@ -1,1 +1,1 @@
-import{a,b}from"./chunk-2SKLSZE4.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
+import{a,b}from"./chunk-PAUOIMV7.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};

@@ -224,7 +224,10 @@ def test_files_of_one_name_get_files_beside_them_of_two(
             picture.resize((512, 256)).save(folder / f"{name}.webp")
     (folder / "study.webp").rename(folder / "kitchen.WEBP")
     assert main(["pin", str(pinned[0].parent / "flat.json"), str(folder), "--out", str(out)]) == 0
-    assert "an .xmp file beside them: 2" in capsys.readouterr().err
+    beside = "copies with their place in an .xmp file beside them: 2"
+    assert beside in capsys.readouterr().err
+    assert beside in json.loads((out / "pins.json").read_text())["notes"]
+    assert beside in pypdfium2.PdfDocument(out / "report.pdf")[0].get_textpage().get_text_range()
     copies = sorted(path.name for path in (out / "photographs").iterdir())
     assert copies == ["kitchen.WEBP", "kitchen.webp", "kitchen.webp.xmp", "kitchen.xmp"]
 

@@ -84,6 +84,8 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
     expect(page.locator("#plan .pin")).to_have_count(1)
     assert page.locator(".card").count() == 1
     page.locator("#room-filter").select_option("")
+    page.get_by_text("Other places").first.click()
+    expect(page.locator("details[open] .choices button").first).to_be_visible()
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     # The same folder again adds nothing.
     page.locator("#photo-files").set_input_files(FILES)
@@ -156,7 +158,8 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
 
 
 def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, bundle=default_bundle(), request_deadline_s=90.0, sweep_s=0.2) as client:
+    settings = {"request_deadline_s": 90.0, "sweep_s": 0.2, "max_album_photographs": 2}
+    with start_app(tmp_path, bundle=default_bundle(), **settings) as client:
         for visited in visit(browser, client, color_scheme="dark", reduced_motion="reduce"):
             page = visited.open("/pin")
             page.locator("#photo-files").set_input_files(FILES[:2])
@@ -177,6 +180,8 @@ def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_
             album, plan = client.get("/albums").json()["albums"][0], client.get("/floorplans").json()["floorplans"][0]
             assert plan["name"] == "Six photographed rooms"
             assert album["floorplan_id"] == plan["id"]
+            page.locator("#photo-files").set_input_files(FILES[:2])
+            expect(page.locator("#problems")).to_contain_text("An album has at most 2 photographs; left out: 1.")
 
 
 def test_album_of_a_venue_shows_the_plan_of_each_pin(desktop: Visit) -> None:

@@ -5,7 +5,7 @@ import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
 import { clearError, InputError, say, showError } from "./notices";
-import { type CardActions, cardOf, movedOf } from "./pin_card";
+import { type CardActions, cardOf, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { Floors, type Row } from "./pin_floors";
 import { type PinActions, pinOf } from "./pin_map";
@@ -28,7 +28,6 @@ const GROUPS = [
   ["Pinned", ["sure", "corrected"]],
   ["Waiting", ["waiting"]],
 ] as const;
-
 const wait = (milliseconds: number): Promise<void> => new Promise((done) => setTimeout(done, milliseconds));
 
 class PinPage {
@@ -47,6 +46,7 @@ class PinPage {
   private readonly drawnPins = new Map<string, Drawn<SVGElement | null>>();
   private shown: string | null = null;
   private title = "";
+  private reading = "";
   private waiting: File[] = [];
   private album: Schemas["AlbumAnswer"] | null = null;
   private rows: Row[] = [];
@@ -157,8 +157,7 @@ class PinPage {
     this.levels.hidden = this.floors.venue === null;
     byId("pin-state").textContent = "";
     await this.showPlan(planId);
-    const files = this.waiting.splice(0);
-    if (files.length > 0) await this.add(files);
+    await this.add(this.waiting.splice(0));
   }
 
   private async showPlan(id: string): Promise<void> {
@@ -203,9 +202,10 @@ class PinPage {
     const place = this.floors.venue === null ? { floorplan_id: this.shown } : { venue_id: this.floors.venue };
     const album = (this.album ??= await api.createAlbum({ ...place, name: this.title } as Schemas["AlbumDocument"]));
     history.replaceState(null, "", `#album=${album.id}`);
-    const free = Math.max((await api.limits()).max_album_photographs - this.rows.length, 0);
+    const most = (await api.limits()).max_album_photographs;
+    const free = Math.max(most - this.rows.length, 0);
     if (photographs.length > free)
-      tell(`The album has room for ${free} more photographs, so that ${photographs.length - free} were left out.`);
+      tell(`An album has at most ${most} photographs; left out: ${photographs.length - free}. Open /pin again.`);
     let sent = 0,
       copies = 0;
     for await (const { file, line } of added(album.id, photographs.slice(0, free))) {
@@ -216,9 +216,11 @@ class PinPage {
         const picture = this.thumbnails.has(line.photograph.id) ? null : await thumbnailOf(file);
         if (picture !== null) this.thumbnails.set(line.photograph.id, picture);
       }
-      byId("pin-state").textContent = `${++sent} of ${Math.min(photographs.length, free)} photographs read`;
+      this.reading = `${++sent} of ${Math.min(photographs.length, free)} photographs read, `;
+      byId("pin-state").textContent = `${this.reading}${sureOf(this.rows)} pinned for sure`;
       if (sent % 5 === 0) void this.guarded(() => this.follow());
     }
+    this.reading = "";
     if (copies > 0) tell(`Photographs that the album has already: ${copies}`);
     await this.polling;
     await this.follow();
@@ -230,24 +232,22 @@ class PinPage {
   }
 
   private async poll(): Promise<void> {
-    for (let album = this.album; album !== null && album.id === this.album?.id; await wait(POLL_MS)) {
+    for (let album = this.album, seen = ""; album !== null && album.id === this.album?.id; await wait(POLL_MS)) {
       const now = await api.album(album.id);
-      const { photographs } = await api.albumPhotographs(album.id);
+      const key = [now.revision, now.solved_revision_number, now.place_revision].join();
+      const photographs = key === seen ? this.rows : (await api.albumPhotographs(album.id)).photographs;
+      seen = key;
       const places = photographs.flatMap(({ pin }) => [
         ...(pin?.place ? [pin.place] : []),
         ...(pin?.suggestions ?? []),
       ]);
       await this.floors.load(places.map((place) => place.floorplan_id));
       if (album.id !== this.album?.id) return;
-      this.album = now;
-      this.rows = photographs;
-      const sure = photographs.filter(({ pin }) => pin?.state === "sure" || pin?.state === "corrected").length;
-      const states = { outdated: "outdated: it can only be read", failed: now.reason ?? "failed" } as Record<
-        string,
-        string
-      >;
-      byId("pin-state").textContent =
-        `${sure} of ${now.photographs} photographs pinned for sure (${states[now.state] ?? now.state})`;
+      [this.album, this.rows] = [now, photographs];
+      const state = now.state === "outdated" ? "outdated: it can only be read" : (now.reason ?? now.state);
+      if (this.reading === "")
+        byId("pin-state").textContent =
+          `${sureOf(this.rows)} of ${now.photographs} photographs pinned for sure (${state})`;
       this.draw();
       if (now.state !== "solving") return;
     }

@@ -21,6 +21,10 @@ export interface CardActions {
 const WIDTH = 400;
 export const percent = (share: number): string => `${Math.round(100 * share)} %`;
 
+/** Return the number of photographs whose place is sure. */
+export const sureOf = (rows: Row[]): number =>
+  rows.filter(({ pin }) => pin?.state === "sure" || pin?.state === "corrected").length;
+
 /** Return the words on a pin. */
 export function factsOf({ pin }: Row): string {
   if (pin === null) return "Waiting for its pin";
@@ -78,24 +82,36 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
   const isOpen = pin !== null && pin.state !== "corrected" && row.correction === null;
   const choices = isOpen ? pin.suggestions : [];
   const preview = (at: PinnedAt | null) => (): void => shot.draw(at);
-  const suggestions = choices.map((suggestion, index) =>
+  const suggestions = (): HTMLElement =>
     h(
-      "button",
-      {
-        type: "button",
-        id: `choice-${row.number}-${index}`,
-        "aria-label": `${index + 1}: ${suggestion.room}, ${percent(suggestion.probability)}`,
-        onclick: () => act.choose(row, suggestion, false),
-        onpointerenter: preview(suggestion),
-        onpointerleave: preview(place),
-        onfocus: preview(suggestion),
-        onblur: preview(place),
-      },
-      floors.smallPlan(suggestion),
-      h("span", {}, h("kbd", {}, index + 1), ` ${suggestion.room} ${percent(suggestion.probability)}`),
-    ),
-  );
-  const others = suggestions.length > 0 && h("div", { class: "choices" }, ...suggestions);
+      "div",
+      { class: "choices" },
+      ...choices.map((suggestion, index) =>
+        h(
+          "button",
+          {
+            type: "button",
+            id: `choice-${row.number}-${index}`,
+            "aria-label": `${index + 1}: ${suggestion.room}, ${percent(suggestion.probability)}`,
+            onclick: () => act.choose(row, suggestion, false),
+            onpointerenter: preview(suggestion),
+            onpointerleave: preview(place),
+            onfocus: preview(suggestion),
+            onblur: preview(place),
+          },
+          floors.smallPlan(suggestion),
+          h("span", {}, h("kbd", {}, index + 1), ` ${suggestion.room} ${percent(suggestion.probability)}`),
+        ),
+      ),
+    );
+  // Small plans of hundreds of sure photographs would take seconds.
+  const onOpen = (event: Event): void => {
+    const details = event.currentTarget as HTMLElement;
+    if (details.childElementCount === 1) details.append(suggestions());
+  };
+  const others =
+    choices.length > 0 &&
+    (pin?.state === "uncertain" ? suggestions() : h("details", { ontoggle: onOpen }, h("summary", {}, "Other places")));
   const label = `Photograph ${row.number}, ${row.name ?? ""}: ${factsOf(row)}`;
   const onkeydown = ((event: KeyboardEvent) => {
     if (!isOpen || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -118,7 +134,7 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
       h("p", { class: "hint" }, row.view.taken_at?.replace("T", " ").slice(0, 16)),
       ...(pin?.warnings ?? []).map((text) => h("p", { class: "hint" }, text)),
     ),
-    pin?.state === "uncertain" ? others : others && h("details", {}, h("summary", {}, "Other places"), others),
+    others,
     h(
       "div",
       { class: "acts" },
