@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import cv2
@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from shapely.geometry.base import BaseGeometry
 
+from benchmarks.plan_symbols import Symbol, place_symbols
 from lalaloc_core.learn.synth.homes.plans import Home, HomeConfig, generate_home
 
 Style = Literal["thin", "thick", "hatched", "coloured", "scanned"]
@@ -42,12 +43,13 @@ class OpeningSymbol:
 
 @dataclass(frozen=True, eq=False)
 class DrawnPlan:
-    """Picture with its rooms and openings, in metres from its lower left corner."""
+    """Picture with its rooms, openings and symbols, in metres from its lower left corner."""
 
     picture: UInt8[np.ndarray, "h w 3"]
     metres_per_pixel: float
     rooms: list[shapely.Polygon]
     openings: list[OpeningSymbol]
+    symbols: list[Symbol] = field(default_factory=list)
 
     def noisy(self, sigma: float, seed: int) -> DrawnPlan:
         """Return the picture with noise of a standard deviation (of 255)."""
@@ -89,7 +91,13 @@ class Model:
 
 
 def draw_plan(
-    style: Style, seed: int, *, has_texts: bool = True, is_furnished: bool = False, pixels_per_m: float | None = None
+    style: Style,
+    seed: int,
+    *,
+    has_texts: bool = True,
+    is_furnished: bool = False,
+    has_symbols: bool = False,
+    pixels_per_m: float | None = None,
 ) -> DrawnPlan:
     """Draw a generated home in one of the styles; the same for the same seed.
 
@@ -98,6 +106,7 @@ def draw_plan(
         seed: seed of the home and of the drawing.
         has_texts: write names, areas and dimensions in the styles that have them.
         is_furnished: draw furniture in every style.
+        has_symbols: draw symbols of fixtures and furniture instead of boxes and circles.
         pixels_per_m: resolution; that of the style by default.
     """
     rng = np.random.default_rng([seed, STYLES.index(style)])
@@ -106,13 +115,12 @@ def draw_plan(
     sheet = _Sheet(model, pixels_per_m or _PIXELS_PER_M[style])
     if style == "coloured":
         sheet.colour(rng)
-    if style in ("coloured", "scanned"):
+    symbols = sheet.furnish_with_symbols(rng) if has_symbols else []
+    if not has_symbols and (is_furnished or style in ("coloured", "scanned")):
         sheet.furnish(rng)
-        if has_texts:
-            sheet.letter()
-            sheet.dimension()
-    elif is_furnished:
-        sheet.furnish(rng)
+    if has_texts and style in ("coloured", "scanned"):
+        sheet.letter()
+        sheet.dimension()
     sheet.draw_walls(style, rng)
     sheet.draw_openings()
     picture = sheet.picture
@@ -121,7 +129,7 @@ def draw_plan(
         degrees = float(rng.uniform(1.0, 4.0) * rng.choice([-1.0, 1.0]))
         picture = scan(picture, degrees, rng)
         # The importer turns a skewed drawing back about its centre, so the truth stays as drawn.
-    return DrawnPlan(picture, 1.0 / sheet.pixels_per_m, rooms, openings)
+    return DrawnPlan(picture, 1.0 / sheet.pixels_per_m, rooms, openings, symbols)
 
 
 def model_of(home: Home, thickness: float) -> Model:
@@ -208,9 +216,25 @@ class _Sheet:
         for room in self._model.rooms:
             self._fill(room, _PALE[int(rng.integers(len(_PALE)))])
 
+    def _swings(self) -> list[BaseGeometry]:
+        return [o.shape.buffer(math.dist(o.start, o.end)) for o in self._model.openings if o.kind == "door"]
+
+    def furnish_with_symbols(self, rng: np.random.Generator) -> list[Symbol]:
+        """Draw symbols of fixtures and furniture, none of them where a door swings, and return them."""
+        symbols = []
+        for room in self._model.rooms:
+            middle = shapely.maximum_inscribed_circle(room, 0.05).coords[0]
+            name = shapely.Point(middle).buffer(0.5)
+            symbols += place_symbols(room, [*self._swings(), name], rng)
+        tone, pen = int(rng.integers(0, 120)), int(rng.integers(1, 3))
+        for symbol in symbols:
+            for line in symbol.lines:
+                self._strokes(line, (tone, tone, tone), pen, closed=False)
+        return symbols
+
     def furnish(self, rng: np.random.Generator) -> None:
         """Draw furniture, none of it where a door swings."""
-        swings = [o.shape.buffer(math.dist(o.start, o.end)) for o in self._model.openings if o.kind == "door"]
+        swings = self._swings()
         for room in self._model.rooms:
             taken: list[BaseGeometry] = list(swings)
             x0, y0, x1, y1 = room.bounds

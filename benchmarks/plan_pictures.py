@@ -1,7 +1,8 @@
 """Importing drawn floor plans: rooms, doors and windows found in pictures, by style and by condition.
 
 `python -m benchmarks.plan_pictures` prints the figures of docs/results.md by style; `--conditions` those with noise,
-shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that are estimated without any text.
+shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that are estimated without any text;
+`--symbols` the precision and recall of fixtures, drawn as symbols among furniture.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import numpy as np
 import shapely
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, OpeningSymbol, Style, draw_plan
+from benchmarks.plan_symbols import FIXTURES
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
 
-_IOU = 0.9
+_IOU, _SYMBOL_IOU = 0.9, 0.6
 # An imported opening matches when it overlaps the true one by half of the longer, at most this far (m) beside it.
 _OVERLAP, _APART_M = 0.5, 0.3
 Condition = Literal["clean", "noise, σ = 5", "shadow, 40 %", "noise and shadow", "furniture", "JPEG, 1:100 at 150 dpi"]
@@ -121,6 +123,37 @@ def measure_condition(condition: Condition, plans: int, first_seed: int = 0) -> 
     return score
 
 
+def measure_symbols(style: Style, plans: int, first_seed: int = 0) -> dict[str, tuple[int, int, int]]:
+    """Return by kind of fixture how many are drawn, imported, and imported with their kind at their place."""
+    counts: dict[str, tuple[int, int, int]] = dict.fromkeys(FIXTURES, (0, 0, 0))
+    for seed in range(first_seed, first_seed + plans):
+        drawn = draw_plan(style, seed, has_symbols=True)
+        try:
+            content = drawn.jpeg() if style == "scanned" else drawn.png()
+            document = import_plan(content, ImportOptions(metres_per_pixel=drawn.metres_per_pixel)).document
+        except InvalidFloorPlanError:
+            document = {}
+        fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in document.get("fixtures", [])]
+        for kind in FIXTURES:
+            truth = [symbol.outline for symbol in drawn.symbols if symbol.kind == kind]
+            found = [outline for name, outline in fixtures if name == kind]
+            matched = sum(any(_iou(outline, other) >= _SYMBOL_IOU for other in truth) for outline in found)
+            drawn_before, found_before, matched_before = counts[kind]
+            counts[kind] = drawn_before + len(truth), found_before + len(found), matched_before + matched
+    return counts
+
+
+def symbol_table(counts: Sequence[dict[str, tuple[int, int, int]]]) -> str:
+    """Return the precision and the recall of fixtures, summed over styles, as a Markdown table."""
+    lines = ["| fixture | drawn | imported | precision | recall |", "|---|---|---|---|---|"]
+    for kind in (*FIXTURES, "all"):
+        chosen = FIXTURES if kind == "all" else (kind,)
+        drawn, found, matched = np.sum([part[name] for part in counts for name in chosen], axis=0).tolist()
+        precision = f"{100.0 * matched / found:.1f}%" if found else "-"
+        lines.append(f"| {kind} | {drawn} | {found} | {precision} | {100.0 * matched / max(drawn, 1):.1f}% |")
+    return "\n".join(lines)
+
+
 @dataclass
 class ScaleScore:
     """Relative errors of estimated scales, as logarithms, with their estimates; and the number of plans refused."""
@@ -190,9 +223,13 @@ def main() -> None:
         "--conditions", action="store_true", help="also measure plans with noise, shadow, furniture, JPEG"
     )
     parser.add_argument("--scale", action="store_true", help="measure the errors of estimated scales instead")
+    parser.add_argument("--symbols", action="store_true", help="measure the symbols of fixtures that are found instead")
     arguments = parser.parse_args()
     if arguments.plans < 1:
         parser.error(f"--plans is {arguments.plans}, the minimum is 1")
+    if arguments.symbols:
+        print(symbol_table([measure_symbols(style, arguments.plans, arguments.seed) for style in STYLES]))
+        return
     if arguments.scale:
         print(scale_table({style: measure_scale(style, arguments.plans, arguments.seed) for style in STYLES}))
         return

@@ -1,7 +1,8 @@
-"""Write the font for East Asian names, a subset of Droid Sans Fallback.
+"""Write the fonts for East Asian names, subsets of Droid Sans Fallback.
 
-`python -m scripts.make_fallback_font DroidSansFallbackFull.ttf` (Debian: fonts-droid-fallback). It keeps the characters
-of the Chinese and Japanese standards GB 2312, Big5 and JIS X 0208; it has no Korean syllables.
+`python -m scripts.make_fallback_font DroidSansFallbackFull.ttf DroidSansFallback.ttf` (Debian: fonts-droid-fallback).
+The first has the characters of the Chinese and Japanese standards GB 2312, Big5 and JIS X 0208; the second, which alone
+has Korean syllables, gives those of KS X 1001.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from pathlib import Path
 
 from fontTools import subset
 
-FONT = Path(__file__).parents[1] / "lalaloc_core/draw/fonts/DroidSansFallback-subset.ttf"
-_CODECS = ("gb2312", "big5", "shift_jis")
+FOLDER = Path(__file__).parents[1] / "lalaloc_core/draw/fonts"
+FONT, KOREAN_FONT = FOLDER / "DroidSansFallback-subset.ttf", FOLDER / "DroidSansFallback-korean.ttf"
+_CODECS, _KOREAN_CODEC = ("gb2312", "big5", "shift_jis"), "euc_kr"
 
 
 def characters(codec: str) -> set[int]:
@@ -21,15 +23,32 @@ def characters(codec: str) -> set[int]:
     return {ord(character) for pair in pairs for character in pair.decode(codec, "ignore")}
 
 
-def main() -> None:
-    """Read the whole font and write the subset."""
+def syllables() -> set[int]:
+    """Return the Korean syllables of KS X 1001."""
+    return {code for code in characters(_KOREAN_CODEC) if 0xAC00 <= code <= 0xD7A3}
+
+
+def write_subset(source: str, codes: set[int], target: Path) -> None:
+    """Write the characters of a font with some codes."""
     options = subset.Options(layout_features=[], hinting=False)
     options.drop_tables += ["GSUB", "GPOS", "GDEF", "vhea", "vmtx"]
-    font = subset.load_font(sys.argv[1], options)
+    font = subset.load_font(source, options)
     subsetter = subset.Subsetter(options)
-    subsetter.populate(unicodes=set.union(*map(characters, _CODECS)))
+    subsetter.populate(unicodes=codes)
     subsetter.subset(font)
-    subset.save_font(font, str(FONT), options)
+    if target == KOREAN_FONT:
+        # Renderers take fonts of one name for one font.
+        for record in font["name"].names:
+            name = record.toUnicode().replace("Droid Sans Fallback", "Droid Sans Korean")
+            record.string = name.encode(record.getEncoding())
+    subset.save_font(font, str(target), options)
+
+
+def main() -> None:
+    """Read the whole fonts and write the subsets."""
+    full, korean = sys.argv[1:]
+    write_subset(full, set.union(*map(characters, _CODECS)), FONT)
+    write_subset(korean, syllables(), KOREAN_FONT)
 
 
 if __name__ == "__main__":

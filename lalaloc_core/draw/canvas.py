@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Iterable
 from html import escape
+from itertools import groupby
 from pathlib import Path
 from typing import Final
 
@@ -31,11 +32,13 @@ FONT_FAMILY = "DejaVu Sans, Verdana, sans-serif"
 
 _FONT_FOLDER = Path(__file__).parent / "fonts"
 _FONTS = [str(path) for path in sorted(_FONT_FOLDER.glob("DejaVu*.ttf"))]
-# Chinese and Japanese characters, and those of scripts that no bundled font has.
-_EAST_ASIAN = re.compile("[\u2e80-\ua4cf\uf900-\ufaff\uff00-\uffef]")
-_EAST_ASIAN_FONT = str(_FONT_FOLDER / "DroidSansFallback-subset.ttf")
+# Fonts of Chinese and Japanese characters and of Korean syllables, and characters that no bundled font has.
+_EAST_ASIAN = {
+    _FONT_FOLDER / "DroidSansFallback-subset.ttf": re.compile("[\u2e80-\ua4cf\uf900-\ufaff\uff00-\uffef]"),
+    _FONT_FOLDER / "DroidSansFallback-korean.ttf": re.compile("[\uac00-\ud7a3]"),
+}
 _OTHER_SCRIPTS = re.compile(
-    "[\u0700-\u07bf\u0800-\u0e7f\u0f00-\u109f\u1100-\u13ff\u1680-\u1cff\u3130-\u318f\ua4d0-\ud7ff\U00010000-\U0010ffff]"
+    "[\u0700-\u07bf\u0800-\u0e7f\u0f00-\u109f\u1100-\u13ff\u1680-\u1cff\u3130-\u318f\ua4d0-\uabff\ud7a4-\ud7ff\U00010000-\U0010ffff]"
 )
 _JPEG_QUALITY = 90
 
@@ -57,12 +60,12 @@ def document(width: Number, height: Number, title: str, parts: Iterable[str]) ->
 def rasterise(svg: str) -> bytes:
     """Rasterise a drawing as PNG.
 
-    The bundled fonts cover Latin, Greek, Cyrillic, Arabic, Hebrew, Chinese, Japanese and a few more scripts, so that
-    pictures are the same on every machine. For others, such as Korean, Thai and Devanagari, the system's fonts are
-    used; without one, the characters are boxes. External references are not loaded.
+    The bundled fonts cover Latin, Greek, Cyrillic, Arabic, Hebrew, Chinese, Japanese, the 2,350 common Korean syllables
+    and a few more scripts, so that pictures are the same on every machine. For others, such as Thai and Devanagari, the
+    system's fonts are used; without one, the characters are boxes. External references are not loaded.
     """
-    # Reading the font takes as long as drawing a plan.
-    east_asian = [_EAST_ASIAN_FONT] if _EAST_ASIAN.search(svg) else []
+    # Reading a font takes as long as drawing a plan.
+    east_asian = [str(path) for path, script in _EAST_ASIAN.items() if script.search(svg)]
     return resvg_py.svg_to_bytes(
         svg_string=svg,
         skip_system_fonts=_OTHER_SCRIPTS.search(svg) is None,
@@ -73,8 +76,7 @@ def rasterise(svg: str) -> bytes:
 
 def font_runs(text: str) -> list[tuple[Path, str]]:
     """Return the parts of a text with the bundled font of each."""
-    plain, parts = _FONT_FOLDER / "DejaVuSans.ttf", re.split(f"({_EAST_ASIAN.pattern}+)", text)
-    return [(Path(_EAST_ASIAN_FONT) if number % 2 else plain, part) for number, part in enumerate(parts) if part]
+    return [(path, "".join(letters)) for path, letters in groupby(text, font_file)]
 
 
 def pixels(svg: str) -> Image.Image:
@@ -85,7 +87,8 @@ def pixels(svg: str) -> Image.Image:
 
 def font_file(text: str) -> Path:
     """Return the bundled font that has most letters of a text."""
-    return Path(_EAST_ASIAN_FONT if _EAST_ASIAN.search(text) else _FONT_FOLDER / "DejaVuSans.ttf")
+    plain = _FONT_FOLDER / "DejaVuSans.ttf"
+    return next((path for path, script in _EAST_ASIAN.items() if script.search(text)), plain)
 
 
 def xml_text(text: str) -> str:

@@ -251,7 +251,9 @@ def test_confidence_words_are_distinct() -> None:
     assert len(set(descriptions)) == 5
 
 
-@pytest.mark.parametrize("names", [("台所", "寝室"), ("厨房间", "卧室床"), ("مطبخ", "حمام"), ("κουζίνα", "λουτρό!")])
+@pytest.mark.parametrize(
+    "names", [("台所", "寝室"), ("부엌", "침실"), ("厨房间", "卧室床"), ("مطبخ", "حمام"), ("κουζίνα", "λουτρό!")]
+)
 def test_names_in_any_bundled_script_are_drawn_and_not_boxes(names: tuple[str, str]) -> None:
     def drawn(text: str) -> np.ndarray:
         return np.asarray(canvas.pixels(canvas.document(200, 60, "", [canvas.words(5, 45, text, 40)])))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 
 import pytest
+import shapely
+from ezdxf.filemanagement import new as new_dxf
 from PIL import Image, ImageDraw
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
-from tests.importers.conftest import shapes
+from tests.importers.conftest import dxf_file, shapes
 
 SCALE = 0.02
 
@@ -57,6 +59,27 @@ def test_crop_cuts_the_lines_of_a_drawing():
     options = ImportOptions(metres_per_pixel=0.01, crop=(850.0, -20.0, 1400.0, 350.0))
     (room,) = shapes(import_plan(svg.encode(), options).document)
     assert room.area == pytest.approx(12.0, abs=0.2)
+
+
+@pytest.mark.parametrize("format", ["svg", "dxf"])
+def test_storeys_of_a_vector_drawing_are_named_with_their_crop(format: str):
+    storeys = [(0.0, 0.0, 5.0, 4.0), (9.0, 0.0, 13.0, 3.5)]
+    if format == "svg":
+        rooms = "".join(f'<rect x="{x0}" y="{y0}" width="{x1 - x0}" height="{y1 - y0}"/>' for x0, y0, x1, y1 in storeys)
+        content = f'<svg xmlns="http://www.w3.org/2000/svg"><g id="rooms">{rooms}</g></svg>'.encode()
+        options = {"metres_per_pixel": "1"}
+    else:
+        document = new_dxf("R2010", units=6)
+        for box in storeys:
+            points = list(shapely.box(*box).exterior.coords)[:-1]
+            document.modelspace().add_lwpolyline(points, close=True, dxfattribs={"layer": "ROOM"})
+        content, options = dxf_file(document), {}
+    plan = import_plan(content, ImportOptions.from_text(options))
+    (warning,) = (warning for warning in plan.report.warnings if "storeys seem to be drawn" in warning)
+    assert "they were read as one" in warning
+    crop = warning.split("m² at crop=")[2].split(";")[0]
+    (room,) = shapes(import_plan(content, ImportOptions.from_text({**options, "crop": crop})).document)
+    assert room.area == pytest.approx(14.0, abs=0.1)
 
 
 def _read_part(crop: str) -> ImportedPlan:

@@ -264,5 +264,16 @@ def test_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
     assert "page 1 was read as a picture" in imported.report.notes
     with pytest.raises(InvalidFloorPlanError, match="page is 2; the PDF has 1 pages"):
         import_plan(stream.getvalue(), ImportOptions(scale=125.0, page=2))
-    with pytest.raises(InvalidFloorPlanError, match="the PDF gives no scale"):
-        import_plan(stream.getvalue())
+    assert "estimated" in import_plan(stream.getvalue()).report.scale_source
+
+
+@pytest.mark.slow
+def test_clear_symbols_become_fixtures_and_other_shapes_are_counted():
+    plan = draw_plan("thick", 0, has_symbols=True)
+    draft = import_plan(plan.png(), ImportOptions(metres_per_pixel=plan.metres_per_pixel))
+    fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in draft.document["fixtures"]]
+    assert len({kind for kind, _ in fixtures}) >= 3
+    for kind, outline in fixtures:
+        assert any(symbol.kind == kind and _iou(symbol.outline, outline) > 0.6 for symbol in plan.symbols)
+    assert any("fixtures are taken from their symbols" in line for line in draft.report.unsure)
+    assert any("no clear symbols of fixtures" in line for line in draft.report.notes)

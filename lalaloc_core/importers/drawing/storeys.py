@@ -58,6 +58,17 @@ def choose_storey(sketch: Sketch, builder: ReportBuilder, in_file: Callable[[Box
     return sketch
 
 
+def name_storeys(sketch: Sketch, builder: ReportBuilder, *, flip_y: bool) -> Sketch:
+    """Warn of storeys that are drawn side by side in a vector drawing, which can also be buildings of one site."""
+    unit = builder.metres_per_unit
+
+    def in_units(box: Box) -> Box:
+        x0, y0, x1, y1 = (number / unit for number in box)
+        return (x0, -y1, x1, -y0) if flip_y else (x0, y0, x1, y1)
+
+    return choose_storey(sketch, builder, in_units, is_chosen=False)
+
+
 def _around(part: shapely.Polygon) -> Box:
     x0, y0, x1, y1 = part.buffer(_MARGIN_M - 0.5 * _APART_M).bounds
     return x0, y0, x1, y1

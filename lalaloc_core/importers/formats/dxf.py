@@ -40,6 +40,7 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.storeys import name_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
@@ -88,7 +89,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
     drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis == "down")
-    sketch = sketch_drawing(drawing, builder, budget)
+    sketch = name_storeys(sketch_drawing(drawing, builder, budget), builder, flip_y=options.y_axis == "down")
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 

@@ -122,7 +122,8 @@ def _guess(
     dimensions = written_dimensions(scan.drawing, budget.check_time)
 
     def measure(scale: float) -> Measures:
-        sketch = _as_picture(page, found, scale, crop, ReportBuilder(), budget)
+        # Symbols that are found by their size tell nothing about the scale.
+        sketch = _as_picture(page, found, scale, crop, ReportBuilder(), budget, has_symbols=False)
         letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
         return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
 
@@ -145,9 +146,16 @@ def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budge
 
 
 def _as_picture(
-    page: pypdfium2.PdfPage, found: PageContent, factor: float, crop: Box | None, builder: ReportBuilder, budget: Budget
+    page: pypdfium2.PdfPage,
+    found: PageContent,
+    factor: float,
+    crop: Box | None,
+    builder: ReportBuilder,
+    budget: Budget,
+    *,
+    has_symbols: bool = True,
 ) -> Sketch:
-    """Render the page and read it as a picture."""
+    """Render the page and read it as a picture; `has_symbols` looks for fixtures."""
     width, height = found.size_pt
     metres_per_pixel = max(_FINEST_M, factor * 0.25)
     scale = min(factor / metres_per_pixel, _COARSEST_PT)
@@ -157,7 +165,7 @@ def _as_picture(
             f"the limit is {budget.limits.max_plan_pixels} (max_plan_pixels); check the scale"
         )
     gray = _cropped(_gray(page.render(scale=scale, grayscale=True)), crop, scale)  # type: ignore[arg-type]
-    return sketch_picture(gray, factor / scale, builder, budget)
+    return sketch_picture(gray, factor / scale, builder, budget, has_symbols=has_symbols)
 
 
 def _cropped(gray: UInt8[np.ndarray, "h w"], crop: Box | None, scale: float) -> UInt8[np.ndarray, "h w"]:

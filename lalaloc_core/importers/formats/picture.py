@@ -74,7 +74,8 @@ def _read_plan(
     measured = scale_by_dimensions(dimensions, texts.drawing.extent) if texts.drawing.shapes else None
 
     def measure(metres_per_pixel: float) -> Measures:
-        sketch = sketch_picture(gray, metres_per_pixel, ReportBuilder(), budget, warmth)
+        # Symbols that are found by their size tell nothing about the scale.
+        sketch = sketch_picture(gray, metres_per_pixel, ReportBuilder(), budget, warmth, has_symbols=False)
         return measures_of(sketch, metres_per_pixel, texts.placed(metres_per_pixel), texts.drawing, dimensions)
 
     factor, source = builder.metres_per_unit, builder.scale_source = drawing_scale(

@@ -31,6 +31,7 @@ from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, sketch_drawing
+from lalaloc_core.importers.drawing.storeys import name_storeys
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     Area,
@@ -120,7 +121,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
     drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis != "up")
-    sketch = sketch_drawing(drawing, builder, budget)
+    sketch = name_storeys(sketch_drawing(drawing, builder, budget), builder, flip_y=options.y_axis != "up")
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 

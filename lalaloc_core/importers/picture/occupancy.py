@@ -129,7 +129,9 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
 
     # Its report gives places in the picture.
     inner = ReportBuilder()
-    sketch = sketch_picture(np.where(walls > 0, 0, 255).astype(np.uint8), fine_m, inner, budget, straighten=False)
+    sketch = sketch_picture(
+        np.where(walls > 0, 0, 255).astype(np.uint8), fine_m, inner, budget, straighten=False, has_symbols=False
+    )
     inner.no_room = [shapely.transform(area, to_map) for area in inner.no_room]
     rooms = []
     for room in sketch.rooms:

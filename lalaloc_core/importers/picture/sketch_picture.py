@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,10 +15,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
+from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
+from lalaloc_core.importers.picture.symbols import Symbol, find_symbols, fixtures_in, is_taken, without_symbols
 from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
 from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 
@@ -39,6 +42,8 @@ _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M = 1.2
 # Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
 _WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
+# Smallest shape (m²) inside a room that is counted if it is not used.
+_COUNTED_M2 = 0.05
 # Usual width of lines (pixels).
 _PEN_PX = 2.0
 # Smallest warmth of coloured lines (of 255): glass is blue, wood is brown.
@@ -67,18 +72,25 @@ def sketch_picture(
     warmth: UInt8[np.ndarray, "h w"] | None = None,
     *,
     straighten: bool = True,
+    has_symbols: bool = True,
 ) -> Sketch:
     """Find the rooms that walls enclose, and classify gaps in walls by their content.
 
     Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used.
     Rows of `gray` are from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards
-    blue. Without `straighten`, the coordinates are those of the picture even if its lines are skew.
+    blue. Without `straighten`, the coordinates are those of the picture even if its lines are skew; without
+    `has_symbols`, fixtures are not looked for.
 
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
     """
     budget.begin("straightening the picture")
     ink = read_ink(gray, metres_per_pixel, warmth, straighten=straighten)
+    shapes, symbols = list[Shape](), list[Symbol]()
+    if has_symbols:
+        shapes = closed_shapes(ink)
+        symbols = find_symbols(shapes, closed_shapes(ink, is_faint=True), budget.check_time)
+        ink = without_symbols(ink, symbols)
     hypotheses = (dark_walls(ink), True), (outlined_walls(ink), False)
     readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in hypotheses if walls is not None]
     if not readings:
@@ -106,11 +118,13 @@ def sketch_picture(
     openings = _openings(best, ink, builder, budget)
     outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
     swings = [best.contents[id(gap)] for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
+    fixtures = _fixtures(symbols, shapes, best, builder) if has_symbols else []
     # Faces of walls are the middles of their lines.
     pen_m = 0.0 if best.is_dark else _PEN_PX * ink.metres_per_pixel
     return Sketch(
         rooms=rooms,
         openings=openings,
+        fixtures=fixtures,
         recall=_RECALL,
         drawn=best.enclosed.walls.envelope,
         leaves_m=[swing.leaf_m + pen_m for swing in swings if swing.leaf_m > 0.0],
@@ -145,6 +159,33 @@ def _without_islands(room: shapely.Polygon, builder: ReportBuilder) -> shapely.P
         builder.unsure.append(f"{len(small)} dark shapes inside a room are taken for furniture, not for columns")
     large = [ring for ring in room.interiors if shapely.Polygon(ring).area > _MAX_ISLAND_M2]
     return shapely.Polygon(room.exterior, large)
+
+
+def _fixtures(
+    symbols: Sequence[Symbol], shapes: Sequence[Shape], reading: _Reading, builder: ReportBuilder
+) -> list[SketchedFixture]:
+    """Return the fixtures that clear symbols show; report them as guesses, and the number of other shapes in rooms."""
+    rooms = reading.enclosed.rooms
+    found = fixtures_in(symbols, rooms)
+    if found:
+        counts = Counter(fixture.kind for fixture in found)
+        named = ", ".join(f"{count} x {kind}" for kind, count in sorted(counts.items()))
+        builder.unsure.append(f"fixtures are taken from their symbols: {named}; check them")
+    taken = shapely.union_all([reading.enclosed.walls, *(gap.shape.buffer(0.1) for gap in reading.enclosed.gaps)])
+    large = [shape for shape in shapes if shape.area >= _COUNTED_M2 and not is_taken(shape.outline, found)]
+    inner = shapely.STRtree([room.buffer(-0.05) for room in rooms])
+    unused = [
+        shape
+        for shape in large
+        if len(inner.query(shape.outline.representative_point(), predicate="within"))
+        and not shape.outline.intersects(taken)
+        and not any(other.holds(shape) for other in large)
+    ]
+    if unused:
+        builder.notes.append(
+            f"{len(unused)} drawn shapes inside rooms are no clear symbols of fixtures and were not used"
+        )
+    return found
 
 
 def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder, budget: Budget) -> list[SketchedOpening]:
