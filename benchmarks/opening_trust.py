@@ -2,7 +2,8 @@
 
 `python -m benchmarks.opening_trust` draws the openings of generated validation homes in whole, in half and not at all,
 and searches them for furnished spheres with unknown heading. Plans state the exact openings, no kind, all kinds, the
-trust that importers estimate, or the true share.
+trust that importers estimate, or the true share. `--venues` searches venues of ten homes instead, of which every second
+one draws no openings.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import Query
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 
 _STATED_HEIGHT = StatedHeight()
 _KINDS = ("door", "window", "passage")
 _NEAR_M = 1.0
 _SHARES = (1.0, 0.5, 0.0)
 _RECALL = 0.95
+_VENUE = 10
 
 
 def plans_of(plan: FloorPlan, share: float, rng: np.random.Generator) -> dict[str, FloorPlan]:
@@ -84,13 +87,43 @@ def measure(model: LocalModel, scenes: GeneratedScenes) -> Mapping[tuple[float, 
     return found
 
 
+def measure_venues(model: LocalModel, scenes: GeneratedScenes) -> dict[str, list[tuple[bool, bool]]]:
+    """Return by kind of plan whether the plan and the place of each photograph were found in its venue."""
+    loaded = [scenes.load(name) for name in scenes.scenes("validation")]
+    found: dict[str, list[tuple[bool, bool]]] = {"all openings drawn": [], "none drawn": []}
+    for begin in range(0, len(loaded), _VENUE):
+        venue = loaded[begin : begin + _VENUE]
+        bare = {"openings": [], "opening_kinds": []}
+        plans = [
+            FloorPlan.from_dict(scene.plan.to_dict() | (bare if number % 2 else {}))
+            for number, scene in enumerate(venue)
+        ]
+        for number, scene in enumerate(venue):
+            for camera in scene.cameras:
+                query = query_of(model, scene, camera, model.grid(scene.plan, camera.camera_height_m).poses)
+                height_m = query.camera_height.height_m
+                merged = MergedPlans.of(plans, [model.grid(plan, height_m) for plan in plans], height_m)
+                best = model.localise(merged.plan, merged.grid, query).candidates[0]
+                plan, place = merged.in_own_plan(best)
+                is_near = plan == number and math.dist(place.position_m, camera.position_m) < _NEAR_M
+                found["none drawn" if number % 2 else "all openings drawn"].append((plan == number, is_near))
+    return found
+
+
 def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--homes", type=int, default=40)
+    parser.add_argument("--venues", action="store_true", help="search venues of ten homes")
     parser.add_argument("--bundle", type=Path, default=Path("models/default"))
     arguments = parser.parse_args()
     scenes = GeneratedScenes(homes=arguments.homes, shots_per_home=4)
+    if arguments.venues:
+        print_table_head("plan of the photograph", "n", "plan", "within 1 m")
+        for stated, pairs in measure_venues(LocalModel(Bundle.open(arguments.bundle)), scenes).items():
+            plan, near = 100.0 * np.mean(pairs, axis=0)
+            print(table_row(stated, len(pairs), f"{plan:.1f} %", f"{near:.1f} %"))
+        return
     found = measure(LocalModel(Bundle.open(arguments.bundle)), scenes)
     print_table_head("openings drawn", "stated", "n", "within 1 m")
     for (share, stated), hits in found.items():

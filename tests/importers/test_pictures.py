@@ -277,3 +277,10 @@ def test_clear_symbols_become_fixtures_and_other_shapes_are_counted():
         assert any(symbol.kind == kind and _iou(symbol.outline, outline) > 0.6 for symbol in plan.symbols)
     assert any("fixtures are taken from their symbols" in line for line in draft.report.unsure)
     assert any("no clear symbols of fixtures" in line for line in draft.report.notes)
+
+
+@pytest.mark.slow
+def test_walls_that_are_unreadable_without_symbols_are_read_with_them():
+    plan = draw_plan("thin", 2, has_symbols=True)
+    draft = import_plan(plan.png(), ImportOptions(metres_per_pixel=plan.metres_per_pixel))
+    assert len(draft.document["rooms"]) == len(plan.rooms)

@@ -341,6 +341,11 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
             expect(page.locator("#answer .room")).to_have_text(room)
             expect(page.locator("#answer .where")).to_have_text(place)
             expect(page.locator("#fit-state")).to_contain_text("Add the photograph")
+            # The page has the plan and the answer: nothing is asked again.
+            page.route("**/localise*", lambda route: route.abort())
+            with page.expect_download() as saving:
+                page.get_by_role("button", name="Save picture").click()
+            assert saving.value.suggested_filename == "lalaloc-answer.png"
             page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
             expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
             page.goto("about:blank")

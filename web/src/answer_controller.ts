@@ -144,8 +144,10 @@ export class AnswerController {
       select: (index) => this.select(index),
       save: async (shown, answered) => {
         clearError(this.error, this.fields);
-        await savePicture(answered.file.name, this.panorama.toCanvas(), this.scene.svg, captionWords(shown)).catch(
-          (error: unknown) => showError(this.error, error),
+        // An answer that a link opened has no photograph until one is added.
+        const name = answered?.file.name ?? "answer";
+        await savePicture(name, this.panorama.toCanvas(), this.scene.svg, captionWords(shown)).catch((error: unknown) =>
+          showError(this.error, error),
         );
       },
     });

@@ -32,7 +32,7 @@ export interface AnswerActions {
   /** Move the marker to a candidate. */
   select: (index: number) => void;
   /** Save the answer to a photograph as a picture. */
-  save: (answer: Answer, photo: Photo) => Promise<void>;
+  save: (answer: Answer, photo: Photo | null) => Promise<void>;
 }
 
 /** Show an answer; null removes the previous one. */
@@ -256,11 +256,13 @@ function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): 
     { class: "sharing" },
     button("Copy as curl", () => void copy(curlSnippet(asked), "curl command"), { id: "copy-curl" }),
     button("Copy as Python", () => void copy(pythonSnippet(asked), "Python code"), { id: "copy-python" }),
-    photo !== null &&
-      button("Save picture", () => void save(answer, photo), {
-        id: "save-picture",
-        title: "The photograph with the layout, and the plan with the place, as PNG",
-      }),
+    button("Save picture", () => void save(answer, photo), {
+      id: "save-picture",
+      title:
+        photo === null
+          ? "The plan with the place, as PNG"
+          : "The photograph with the layout, and the plan with the place, as PNG",
+    }),
     button("Copy link", () => void copyLink(answer), {
       id: "copy-link",
       title:

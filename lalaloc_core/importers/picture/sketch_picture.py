@@ -90,9 +90,14 @@ def sketch_picture(
     if has_symbols:
         shapes = closed_shapes(ink)
         symbols = find_symbols(shapes, closed_shapes(ink, is_faint=True), budget.check_time)
-        ink = without_symbols(ink, symbols)
-    hypotheses = (dark_walls(ink), True), (outlined_walls(ink), False)
-    readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in hypotheses if walls is not None]
+    readings: list[_Reading] = []
+    # Walls that cannot be read without the symbols are read with them.
+    for part in (without_symbols(ink, symbols), ink) if symbols else (ink,):
+        hypotheses = (dark_walls(part), True), (outlined_walls(part), False)
+        readings = [_read(walls, part, is_dark, budget) for walls, is_dark in hypotheses if walls is not None]
+        if any(reading.area_m2 > 0.0 for reading in readings):
+            ink = part
+            break
     if not readings:
         builder.use("ink", "ignored (no possible walls)", 1)
         return Sketch()
