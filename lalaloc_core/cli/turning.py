@@ -84,7 +84,7 @@ def turn_document(turn: Turn, found: SequenceLocalisation) -> dict[str, Any]:
         relative = {
             "value_deg": math.degrees(angles.heading),
             "std_deg": math.degrees(angles.heading_sd),
-            "source": "estimated",
+            "source": "assumed" if angles.is_assumed else "estimated",
         }
         poses.append(
             {

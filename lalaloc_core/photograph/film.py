@@ -164,7 +164,7 @@ def read_film(
         dropped=dict(samples.dropped),
         duration_s=samples.last_s,
         turned=tracker.turned,
-        warnings=tuple(_warnings(tracker)),
+        warnings=(*_warnings(tracker), *_assumed([angles[index] for index in joined])),
     )
 
 
@@ -205,6 +205,18 @@ def _likely(angles: Sequence[TurnAngles]) -> list[int]:
     """Return the numbers of the frames to keep: if most angles are likely, the others, of blank walls, are left out."""
     likely = [index for index, angle in enumerate(angles) if angle.heading_sd <= LIKELY_SD]
     return likely if 2 * len(likely) > len(angles) else list(range(len(angles)))
+
+
+def _assumed(angles: Sequence[TurnAngles]) -> list[str]:
+    """Return a warning about frames whose angles overlap does not tell."""
+    assumed = [angle.heading_sd for angle in angles if angle.is_assumed]
+    if not assumed:
+        return []
+    return [
+        f"nothing links {len(assumed)} of the {len(angles)} frames that were kept to most others, as on plain walls: "
+        f"their angles were assumed by the speed of the turn, within ± {math.degrees(2.0 * max(assumed)):.0f}°; turn "
+        "slowly at an even speed, and step back from plain walls"
+    ]
 
 
 def _warnings(tracker: FlowTracker) -> list[str]:

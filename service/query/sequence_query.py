@@ -94,7 +94,8 @@ class SequenceSearch:
             answers = _with_relative_headings(answers, form, linked)
             share = min(ground.share(picture) for picture in found.pictures)
             answer = compose_sequence_answer(answers, found, form.steps(count), self._parts.bundle.manifest, share)
-            warnings = [*_angle_warnings(photographs, form, linked), *answer.warnings, *ground.warnings]
+            angles = _angle_warnings(photographs, form, linked) if film is None else []
+            warnings = [*angles, *answer.warnings, *ground.warnings]
             extras: dict[str, object] = {"warnings": warnings}
             if isinstance(where, VenueRecord):
                 extras["venue_id"] = where.id
@@ -210,7 +211,9 @@ def _with_relative_headings(
             None
             if angle.group
             else AssumedAngle(
-                value_deg=math.degrees(angle.heading), std_deg=math.degrees(angle.heading_sd), source="estimated"
+                value_deg=math.degrees(angle.heading),
+                std_deg=math.degrees(angle.heading_sd),
+                source="assumed" if angle.is_assumed else "estimated",
             )
             for angle in linked.angles
         ]

@@ -19,6 +19,7 @@ from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.photograph import StatedCamera
 from lalaloc_core.photograph.film import Film, read_film
 from lalaloc_core.photograph.film_limits import FilmLimits
+from lalaloc_core.photograph.film_motion import FlowTracker
 from tests.core.filmed import HEVC, RATE, STEP_DEG, VP9, encode, needs_ffmpeg, run, turn
 
 pytestmark = needs_ffmpeg
@@ -89,15 +90,50 @@ def test_frames_at_the_rate_of_samples_are_all_used(tmp_path: Path) -> None:
     assert "between samples" not in film.dropped
 
 
-def test_blank_frames_at_unknown_angles_are_left_out(tmp_path: Path) -> None:
+def test_plain_wall_is_passed_at_the_usual_speed(tmp_path: Path) -> None:
     blank = np.full_like(turn()[0], 128)
     frames = [*turn()[:31], *[blank] * 12, *turn()[43:61]]
     film = read_film(encode(frames, tmp_path / "wall.mp4"), stated=FIELD)
-    assert film.dropped["blank, at an unknown angle"] >= 2
-    assert len(film.photographs) + sum(film.dropped.values()) == film.frames
+    assumed = [time_s for time_s, angle in zip(film.times_s, film.angles, strict=True) if angle.is_assumed]
+    assert len(assumed) >= 3
+    assert min(assumed) >= 3.1
+    assert max(assumed) < 4.3
     # The two sides of the wall overlap where the turn closes.
     assert misses_deg(film).max() < 4.0
-    assert max(angle.heading_sd for angle in film.angles) < math.radians(5.0)
+    assert max(angle.heading_sd for angle in film.angles) < math.radians(12.0)
+    assert any(f"nothing links {len(assumed)} of the" in warning for warning in film.warnings)
+
+
+def test_blank_frames_at_unknown_angles_are_left_out(tmp_path: Path) -> None:
+    blank = np.full_like(turn()[0], 128)
+    film = read_film(encode([*turn()[:36], *[blank] * 25], tmp_path / "wall.mp4"), stated=FIELD)
+    assert film.dropped["blank, at an unknown angle"] >= 2
+    assert len(film.photographs) + sum(film.dropped.values()) == film.frames
+    assert max(angle.heading_sd for angle in film.angles) < math.radians(12.0)
+
+
+def test_upright_edges_of_plain_walls_are_followed() -> None:
+    def wall(edge: int) -> np.ndarray:
+        """Return a corner of two plain walls, as a blurred edge without a corner point."""
+        grey = np.full((400, 300), 120, np.uint8)
+        grey[:, edge:] = 150
+        return cv2.GaussianBlur(grey, (0, 0), 3.0)
+
+    tracker, step = FlowTracker(math.radians(53.0)), 20
+    for index in range(6):
+        tracker.follow(wall(220 - step * index))
+    heading, error = tracker.reckoned()
+    per_step = math.atan(step / (150.0 / math.tan(math.radians(26.5))))
+    assert heading == pytest.approx(per_step * np.arange(6), abs=math.radians(0.5))
+    assert error[-1] > 0.0
+    assert tracker.lost_share == 0.0
+    # Nothing to follow: the turn goes on at the usual speed, with more doubt.
+    for _ in range(3):
+        tracker.follow(np.full((400, 300), 150, np.uint8))
+    later, doubt = tracker.reckoned()
+    assert later[-1] == pytest.approx(8.0 * per_step, abs=math.radians(1.0))
+    assert doubt[-1] - error[-1] > 0.9 * per_step
+    assert tracker.lost_share == pytest.approx(3.0 / 8.0)
 
 
 def zoomed(index: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.overlap import Features
+from lalaloc_core.photograph.overlap import Features, Link
 from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn, level_axes
+from lalaloc_core.photograph.turn_order import Step, agreeing_links, headings_in_order, usual_steps
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from tests.core.taken import jpeg, sphere, take
 
@@ -75,6 +77,53 @@ def test_photographs_without_overlap_form_groups() -> None:
     (warning,) = linked.warnings(math.radians(53.0))
     assert "3 groups (photo[0], photo[1]; photo[2], photo[3]; photo[4])" in warning
     assert "half the field of view, 26°" in warning
+
+
+def test_photographs_of_plain_walls_get_their_angles_by_order() -> None:
+    views = turn_views(photographs(ONCE_AROUND, hfov_deg=53.0))
+    blank = Overview(Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8)), np.zeros((0, 4)))
+    plain = [replace(view, overview=blank) if index in (4, 5, 6) else view for index, view in enumerate(views)]
+    angles = angles_of_turn(plain)
+    assert [index for index, angle in enumerate(angles) if angle.is_assumed] == [4, 5, 6]
+    assert misses_deg(angles, np.radians(ONCE_AROUND)).max() < 2.0
+    # The turn closes, so the middle of the gap is the least certain.
+    sd_deg = np.degrees([angle.heading_sd for angle in angles])
+    assert 3.0 < sd_deg[4] < sd_deg[5] < 8.0
+    linked = LinkedTurn.of(angles)
+    assert linked.turns is not None
+    (warning,) = linked.warnings(math.radians(53.0))
+    assert "nothing links photo[4], photo[5], photo[6] to most others" in warning
+    assert f"within ± {2.0 * sd_deg.max():.0f}°" in warning
+
+
+def test_links_against_the_order_are_dropped() -> None:
+    rays = np.zeros((2, 12, 3))
+    right = [Link(index, index + 1, rays, math.radians(30.0)) for index in range(6)]
+    closing = Link(0, 11, rays, math.radians(-30.0))
+    repeated = Link(3, 8, rays, math.radians(20.0))
+    steps = usual_steps(12, [*right, closing, repeated])
+    assert steps is not None
+    assert [math.degrees(step.turn) for step in steps] == pytest.approx([30.0] * 12)
+    assert agreeing_links([*right, closing, repeated], 12, steps) == [*right, closing]
+    # Steps that do not lead once around, or are not alike, tell nothing.
+    assert usual_steps(5, right[:3]) is None
+    assert usual_steps(12, [right[0], Link(1, 2, rays, math.radians(80.0))]) is None
+
+
+@pytest.mark.parametrize("first", [0, 2])
+def test_groups_are_placed_by_steps_that_close(first: int) -> None:
+    true = np.radians(30.0 * np.arange(12))
+    group = np.array([0, 0, 1, 2, 2, 3, 3, 4, 0, 0, 0, 0])
+    group = np.unique(np.roll(group, first), return_inverse=True)[1]
+    within = true - true[[int(np.flatnonzero(group == number)[0]) for number in group]]
+    # Optical flow tells a tenth too much.
+    steps = [Step(1.1 * math.radians(30.0), math.radians(5.0))] * 11
+    heading, sd = headings_in_order(group, wrap_angle(within), steps)
+    missed = np.degrees(np.abs(wrap_angle(heading - true)))
+    assert missed.max() < 3.0
+    main = int(np.bincount(group).argmax())
+    assert (sd[group == main] == 0.0).all()
+    assert (sd[group != main] > 0.0).all()
 
 
 def test_stated_tilt_and_field_are_kept() -> None:

@@ -10,9 +10,6 @@ import type { Answer, ChosenVenue, Plan, SequenceAnswer } from "./types";
 /** Plan or venue to search. */
 export type Place = Plan | ChosenVenue;
 
-// Warning about angles that the photographs do not tell.
-const NOT_LINKED = "the photographs overlap only within";
-
 const isVenue = (place: Place): place is ChosenVenue => "listed" in place;
 const placeFields = (place: Place): Record<string, string> =>
   isVenue(place) ? { venue_id: place.id } : { floorplan_id: place.id };
@@ -58,8 +55,9 @@ export async function askTogether(place: Place, { motion, photos }: Group, signa
       motion === "turn" && !directions.includes(null) ? { relative_heading_deg: JSON.stringify(directions) } : null;
   // Features do not overlap. Photographs tell angles and field of view better than a gyroscope, where they overlap.
   let found = await ask(told !== null && onDevice ? told : {});
-  const [first] = found.poses;
-  if (told !== null && !onDevice && first?.view != null && found.warnings.some((text) => text.startsWith(NOT_LINKED)))
+  const [first] = found.poses,
+    areSeen = found.poses.every(({ view }) => view?.relative_heading?.source === "estimated");
+  if (told !== null && !onDevice && first?.view != null && !areSeen)
     found = await ask({ ...told, hfov_deg: String(first.view.hfov.value_deg) });
   if (signal.aborted) return;
   photos.forEach((photo, index) => {

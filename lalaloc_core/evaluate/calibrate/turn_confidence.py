@@ -78,7 +78,7 @@ class TurnSettings:
 
 
 class _Taken(NamedTuple):
-    """Pictures of a turn with their headings (radians) minus that of the shot, and the field of view in use (degrees)."""
+    """Pictures of a turn with their headings (radians) minus that of the shot, and the field of view in use."""
 
     shot: Shot
     pictures: list[UInt8[np.ndarray, "h w 3"]]

@@ -65,17 +65,28 @@ class LinkedTurn:
         return replace(found, pictures=[pictures[index] for index in range(len(pictures))])
 
     def warnings(self, hfov: float) -> list[str]:
-        """Return a warning about angles that had to be searched, for a horizontal field of view (radians)."""
+        """Return a warning about angles that are assumed or had to be searched, for a field of view (radians)."""
         groups: dict[int, list[int]] = {}
         for index in self.order:
             groups.setdefault(self.angles[index].group, []).append(index)
-        if len(groups) == 1:
+        remedy = (
+            f"turn by at most half the field of view, {math.degrees(0.5 * hfov):.0f}°, from one photograph to the "
+            "next, or state the relative headings"
+        )
+        if len(groups) > 1:
+            names = "; ".join(", ".join(f"photo[{index}]" for index in group) for group in groups.values())
+            return [
+                f"the photographs overlap only within {len(groups)} groups ({names}), so the angles between these were "
+                f"searched: {remedy}"
+            ]
+        assumed = [index for index, angle in enumerate(self.angles) if angle.is_assumed]
+        if not assumed:
             return []
-        names = "; ".join(", ".join(f"photo[{index}]" for index in group) for group in groups.values())
+        names = ", ".join(f"photo[{index}]" for index in assumed)
+        sd_deg = math.degrees(max(self.angles[index].heading_sd for index in assumed))
         return [
-            f"the photographs overlap only within {len(groups)} groups ({names}), so the angles between these were "
-            f"searched: turn by at most half the field of view, {math.degrees(0.5 * hfov):.0f}°, from one photograph "
-            "to the next, or state the relative headings"
+            f"nothing links {names} to most others, as on plain walls, so their angles were assumed by their order, "
+            f"within ± {2.0 * sd_deg:.0f}°, as of one turn in equal steps: {remedy}"
         ]
 
 
