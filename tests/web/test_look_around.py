@@ -125,6 +125,37 @@ def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
     expect(page.locator("#photo-strip li")).to_have_count(3)
 
 
+def test_refused_sensors_are_asked_for_again_and_used(phone: Visit) -> None:
+    # As on iOS: the sensors are silent until they are allowed, and the first event has no angles.
+    phone.page.add_init_script(
+        """const answers = ['denied', 'granted'];
+        const silence = (event) => { if (answers.length > 0) event.stopImmediatePropagation(); };
+        addEventListener('deviceorientation', silence);
+        DeviceMotionEvent.requestPermission = async () => 'granted';
+        DeviceOrientationEvent.requestPermission = async () => {
+          const answer = answers.shift();
+          if (answer === 'granted') setTimeout(() => dispatchEvent(new DeviceOrientationEvent('deviceorientation')), 0);
+          return answer;
+        };"""
+    )
+    page = _open(phone)
+    protocol, find = page.context.new_cdp_session(page), page.locator("#look-dialog .primary")
+    _hold(protocol, 0.0)
+    expect(find).to_have_text(re.compile("\\(1 photo"))
+    page.get_by_role("button", name="Allow motion sensors").click()
+    _hold(protocol, 1.0)
+    expect(page.get_by_role("button", name="Allow motion sensors")).to_be_hidden()
+    # The turn begins anew.
+    expect(find).to_have_text(re.compile("\\(1 photo"))
+    _hold(protocol, 335.0)
+    expect(find).to_have_text(re.compile("\\(2 photo"))
+    page.get_by_label(BOX).evaluate("box => box.click()")
+    with page.expect_response("**/localise/sequence", timeout=SLOW_MS) as answered:
+        find.click()
+    angles = [pose["view"]["relative_heading"] for pose in answered.value.json()["poses"]]
+    assert [angle["source"] for angle in angles] == ["given", "given"]
+
+
 def test_only_features_leave_a_phone_with_the_box_ticked(camera: Browser, service: httpx.Client) -> None:
     with recorded(service) as (wire, through):
         for phone in visit(camera, through, viewport=PHONE, has_touch=True, is_mobile=True, permissions=PERMISSIONS):

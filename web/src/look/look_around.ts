@@ -11,6 +11,9 @@ import { type Hint, HINTS, Turn } from "./turn";
 const TICK_MS = 120,
   LEAST_FRAMES = 2;
 
+const REFUSED =
+  "The motion sensors are not allowed, so the photographs tell the angles by overlap. Safari asks once only: load the page again to be asked.";
+
 export interface LookActions {
   /** Find the place of frames, with their directions (degrees) if a gyroscope told them; null if it was stopped. */
   find: (frames: File[], directions: number[] | null, signal: AbortSignal) => Promise<FoundPlace | null>;
@@ -44,6 +47,7 @@ export class LookAround {
   );
   private readonly find = button("Find the place", () => void this.localise(), { class: "primary", disabled: true });
   private readonly take = button("Take a photograph", () => void this.takeNow());
+  private readonly sensors = button("Allow motion sensors", () => void this.askAgain(), { hidden: true });
   private readonly close = button("Cancel", () => this.dialog.close());
   private readonly stage = h("div", { class: "look-stage" }, this.video, this.lines, this.ring.element);
   private readonly dialog = h(
@@ -54,7 +58,7 @@ export class LookAround {
     this.hint,
     this.error,
     this.instead,
-    h("div", { class: "ask" }, this.find, this.take, this.close),
+    h("div", { class: "ask" }, this.find, this.take, this.sensors, this.close),
   );
   private readonly orientation = new Orientation();
   private stream: MediaStream | null = null;
@@ -83,18 +87,13 @@ export class LookAround {
 
   /** Open the dialog and begin. */
   async open(): Promise<void> {
-    this.frames = [];
-    this.turn = new Turn();
-    this.judge = new FrameJudge();
-    this.found = this.live = this.said = null;
-    this.before = 0;
+    this.begin();
+    this.found = this.live = null;
     clearError(this.error);
     this.lines.getContext("2d")?.clearRect(0, 0, this.lines.width, this.lines.height);
     this.close.textContent = "Cancel";
     this.find.hidden = this.take.hidden = false;
-    this.find.textContent = "Find the place";
-    this.find.disabled = true;
-    this.ring.show([], 0, 0);
+    this.sensors.hidden = true;
     this.dialog.showModal();
     // iOS asks for both permissions within the click.
     const sensors = this.orientation.start();
@@ -108,17 +107,39 @@ export class LookAround {
       return;
     }
     await sensors;
+    this.sensors.hidden = !this.orientation.isDenied;
     this.instead.hidden = true;
     this.stage.hidden = false;
     this.state = "looking";
     this.timer = window.setInterval(() => void this.tick(), TICK_MS);
   }
 
+  /** Begin a turn without photographs. */
+  private begin(): void {
+    this.frames = [];
+    this.turn = new Turn();
+    this.judge = new FrameJudge();
+    this.said = null;
+    this.before = 0;
+    this.find.textContent = "Find the place";
+    this.find.disabled = true;
+    this.ring.show([], 0, 0);
+  }
+
+  /** Ask for the sensors once more; with them, the turn begins anew, so that they tell all of its directions. */
+  private async askAgain(): Promise<void> {
+    await this.orientation.start();
+    this.sensors.hidden = !this.orientation.isDenied;
+    if (this.orientation.attitude === null && this.orientation.isDenied) showError(this.error, new Error(REFUSED));
+    else clearError(this.error);
+    if (this.state === "looking" && this.orientation.attitude !== null) this.begin();
+  }
+
   /** Say why there is no camera, and offer to choose a film. */
   private offerFilm(reason: string): void {
     this.stop();
     if (!this.dialog.open) return;
-    this.stage.hidden = this.find.hidden = this.take.hidden = true;
+    this.stage.hidden = this.find.hidden = this.take.hidden = this.sensors.hidden = true;
     this.instead.hidden = false;
     this.hint.textContent = reason;
     this.film.focus();
@@ -186,7 +207,7 @@ export class LookAround {
       this.state = "found";
       this.found = found;
       this.hint.textContent = found.words;
-      this.find.hidden = this.take.hidden = true;
+      this.find.hidden = this.take.hidden = this.sensors.hidden = true;
       this.close.textContent = "Show on the plan";
       this.close.focus();
     } catch (error) {

@@ -21,6 +21,18 @@ interface WithPermission {
   requestPermission?: () => Promise<"granted" | "denied">;
 }
 
+const SENSORS = (): WithPermission[] =>
+  [globalThis.DeviceOrientationEvent, globalThis.DeviceMotionEvent].filter(Boolean) as WithPermission[];
+
+/** Return whether a sensor may be followed; without it there are no events, and overlap tells the angles. */
+async function permitted(sensor: WithPermission): Promise<boolean> {
+  try {
+    return ((await sensor.requestPermission?.()) ?? "granted") === "granted";
+  } catch {
+    return false;
+  }
+}
+
 /** Return the attitude of the rear camera for the angles of an event; `screen` is the angle of the screen. */
 export function cameraAttitude(alpha: number, beta: number, gamma: number, screen: number): Attitude {
   const [a, b, c, s] = [alpha, beta, gamma, screen].map(radians) as [number, number, number, number];
@@ -42,23 +54,22 @@ export function cameraAttitude(alpha: number, beta: number, gamma: number, scree
 export class Orientation {
   /** Latest attitude; null on devices without a gyroscope, and without the permission. */
   attitude: Attitude | null = null;
+  /** The permission that iOS wants was not given. */
+  isDenied = false;
   private acceleration = 0;
+  private onFirst: () => void = () => undefined;
 
   /** Ask for the permission that iOS wants, which needs the user's click, and follow the sensors; wait for the first direction. */
   async start(): Promise<void> {
+    this.stop();
     this.attitude = null;
     this.acceleration = 0;
-    try {
-      await (globalThis.DeviceOrientationEvent as unknown as WithPermission | undefined)?.requestPermission?.();
-      await (globalThis.DeviceMotionEvent as unknown as WithPermission | undefined)?.requestPermission?.();
-    } catch {
-      // Without the permission there are no events, and overlap tells the angles.
-    }
+    this.isDenied = (await Promise.all(SENSORS().map(permitted))).includes(false);
     addEventListener("devicemotion", this.onMove);
     // A photograph before the first direction would leave the directions of all others unused.
     await new Promise<void>((done) => {
       addEventListener("deviceorientation", this.onTurn);
-      addEventListener("deviceorientation", () => done(), { once: true });
+      this.onFirst = done;
       setTimeout(done, FIRST_MS);
     });
   }
@@ -75,6 +86,8 @@ export class Orientation {
   private readonly onTurn = ({ alpha, beta, gamma }: DeviceOrientationEvent): void => {
     if (alpha === null || beta === null || gamma === null) return;
     this.attitude = cameraAttitude(alpha, beta, gamma, globalThis.screen.orientation?.angle ?? 0);
+    // Events without angles come first in some browsers.
+    this.onFirst();
   };
 
   private readonly onMove = ({ acceleration }: DeviceMotionEvent): void => {
