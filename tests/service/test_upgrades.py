@@ -127,6 +127,9 @@ def _assert_works(client: httpx.Client, version: str, script: str, panorama: byt
         [venue] = client.get("/venues").json()["venues"]
         answer = client.post("/localise", data={"venue_id": venue["id"], "heading_deg": 0}, files={"photo": panorama})
         assert answer.json()["floorplan_id"] == plan["id"]
+    if version >= "0.8.0":
+        [album] = client.get("/albums").json()["albums"]
+        assert len(client.get(f"/albums/{album['id']}/photographs").json()["photographs"]) == 1
     # Tables that were moved take new rows, and rows are deleted with their plan.
     upload(client)
     assert client.delete(address).status_code == 204
