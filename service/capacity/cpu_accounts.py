@@ -34,6 +34,7 @@ class _Account:
     charged_at: float = 0.0
     owed_s: float = 0.0
     rest_until: float = 0.0
+    refused_until: float = 0.0
 
     def recent_at(self, now: float) -> float:
         return self.recent_s * 0.5 ** ((now - self.charged_at) / _HALF_LIFE_S)
@@ -69,6 +70,20 @@ class CpuAccounts:
             account.total_s += cpu_s
             account.owed_s += cpu_s if rests else 0.0
 
+    def refuse(self, client: str, cpu_s: float) -> None:
+        """Let the queries of a client rest for the CPU time (s) of one that was refused, which was charged already."""
+        with self._lock:
+            now = self._clock()
+            account = self._accounts.get(client)
+            if account is not None and self._active(now) - {client}:
+                until = max(account.refused_until, now) + _REST_RATIO * cpu_s
+                account.refused_until = min(until, now + _LONGEST_REST_S)
+
+    def refused_rest_s(self, client: str) -> float:
+        """Return how long (s) queries of a client must rest now because others of it were refused."""
+        account = self._accounts.get(client)
+        return 0.0 if account is None else max(account.refused_until - self._clock(), 0.0)
+
     @contextmanager
     def charged(self, client: str, *, rests: bool = False) -> Iterator[None]:
         """Charge the CPU time that this thread uses in the block."""
@@ -80,9 +95,17 @@ class CpuAccounts:
 
     @coroutine
     def charged_steps(
-        self, client: str, work: Coroutine[Any, Any, T], *, rests: bool = False
+        self,
+        client: str,
+        work: Coroutine[Any, Any, T],
+        *,
+        rests: bool = False,
+        spend: Callable[[float], None] = lambda _cpu_s: None,
     ) -> Generator[Any, Any, T]:
-        """Run a coroutine and charge the CPU time of its steps, without those of other tasks in between."""
+        """Run a coroutine and charge the CPU time of its steps, without those of other tasks in between.
+
+        `spend` receives the CPU time (s) of each step, too.
+        """
         value, error = None, None
         while True:
             begin = thread_time()
@@ -91,7 +114,9 @@ class CpuAccounts:
             except StopIteration as done:
                 return done.value
             finally:
-                self.charge(client, thread_time() - begin, rests=rests)
+                cpu_s = thread_time() - begin
+                self.charge(client, cpu_s, rests=rests)
+                spend(cpu_s)
             value, error = None, None
             try:
                 value = yield awaited

@@ -201,6 +201,27 @@ def test_client_rests_from_its_requests_beside_others() -> None:
     assert accounts.rest_s(PROBES) == pytest.approx(0.3)
 
 
+def test_queries_rest_after_refused_ones_beside_others() -> None:
+    now = [0.0]
+    accounts = CpuAccounts(lambda: now[0])
+    accounts.charge("flood", 0.01)
+    accounts.refuse("flood", 0.01)
+    # Nobody else is active.
+    assert accounts.refused_rest_s("flood") == 0.0
+    accounts.charge("light", 0.01)
+    for _ in range(2):
+        accounts.refuse("flood", 0.01)
+    assert accounts.refused_rest_s("flood") == pytest.approx(0.06)
+    assert accounts.refused_rest_s("light") == 0.0
+    # Accepted work leaves no such rest, and refusals leave none to other requests.
+    assert accounts.rest_s("flood") == 0.0
+    for _ in range(100):
+        accounts.refuse("flood", 0.1)
+    assert accounts.refused_rest_s("flood") == pytest.approx(0.5)
+    now[0] = 0.6
+    assert accounts.refused_rest_s("flood") == 0.0
+
+
 def test_many_clients_do_not_fill_memory() -> None:
     accounts = CpuAccounts()
     for number in range(5000):

@@ -23,6 +23,8 @@ from service.security.permissions import caller_of
 
 # Bytes of a query's body that arrive without a rest, and the time (s) that the server takes to receive a byte.
 _FREE_BYTES, _RECEIVING_S = 8 * 2**20, 5e-9
+# CPU time (s) of a refused query that is not measured: of its connection, head and key.
+_REFUSED_S = 1e-3
 
 
 class AdmissionMiddleware:
@@ -65,7 +67,10 @@ class AdmissionMiddleware:
                 connection.on_answer = permit.end
                 with ending_request(scope):
                     handled = cast(Coroutine[Any, Any, None], self._app(scope, connection.receive, connection.send))
-                    await admission.cpu_accounts.charged_steps(client, handled, rests=not is_query(path))
+                    steps = admission.cpu_accounts.charged_steps(
+                        client, handled, rests=not is_query(path), spend=rests.spend
+                    )
+                    await steps
         except asyncio.CancelledError:
             # The stopping server cancels requests that did not finish in time.
             if not admission.stopping or connection.answered:
@@ -75,20 +80,36 @@ class AdmissionMiddleware:
             if not connection.answered:
                 error = DeadlineExceededError(admission.limits.deadline_s)
                 await problem_answer(Request(scope), error)(scope, receive, send)
+        finally:
+            if is_query(path) and 400 <= connection.status < 500:
+                admission.cpu_accounts.refuse(client, _REFUSED_S + rests.spent_s)
 
 
 class _Rests:
-    """Rests of one request. A query only rests while a large body arrives, as queries share threads of their own."""
+    """Rests of one request.
+
+    A query only rests while a large body arrives, as queries share threads of their own, and after others of its client
+    were refused, which only the event loop works for.
+
+    Attributes:
+        spent_s: CPU time (s) of the request so far.
+    """
 
     def __init__(self, accounts: CpuAccounts, client: str, *, query: bool) -> None:
         self._accounts = accounts
         self._client = client
         self._free_bytes = _FREE_BYTES if query else 0
+        self.spent_s = 0.0
+
+    def spend(self, cpu_s: float) -> None:
+        """Add CPU time (s)."""
+        self.spent_s += cpu_s
 
     @property
     def left_s(self) -> float:
         """Time (s) that the client must rest now."""
-        return 0.0 if self._free_bytes > 0 else self._accounts.rest_s(self._client)
+        accounts = self._accounts
+        return accounts.refused_rest_s(self._client) if self._free_bytes > 0 else accounts.rest_s(self._client)
 
     async def take(self) -> None:
         """Wait until no rest is left."""
@@ -143,6 +164,8 @@ class _Connection:
         self._rests = rests
         self._begun = False
         self.answered = False
+        # Of the answer; 0 before it begins.
+        self.status = 0
         self.on_answer: Callable[[], None] = lambda: None
         self._receive = receive
         self._send = send
@@ -185,6 +208,7 @@ class _Connection:
     async def send(self, message: Message) -> None:
         """Send a part of the answer."""
         self.answered = True
+        self.status = message.get("status", self.status)
         self.on_answer()
         await self._send(message)
 
