@@ -42,7 +42,8 @@ def test_photographs_one_after_the_other_are_followed(phone: Visit) -> None:
     x_m, y_m = answer["pose"]["position"]["x_m"], answer["pose"]["position"]["y_m"]
     placed = page.locator("#session-camera").get_attribute("transform") or ""
     assert [float(value) for value in re.findall(r"-?[\d.]+", placed)[:2]] == pytest.approx([x_m, -y_m])
-    page.get_by_role("button", name="Stop").click()
+    with page.expect_response(lambda response: response.request.method == "DELETE"):
+        page.get_by_role("button", name="Stop").click()
     expect(page.get_by_role("button", name="Follow a camera here")).to_be_visible()
     expect(page.locator("#plan .session > *")).to_have_count(0)
     assert phone.client.get(f"/sessions/{session_id}").status_code == 404
