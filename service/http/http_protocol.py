@@ -22,6 +22,8 @@ _MANY_CHUNKS, _MIN_CHUNK_BYTES = 1024, 64
 # A chunk smaller than that counts as this many events, and the rest of a body of more of them is not read after the
 # answer: a client that opens connections for a few chunks each would keep the event loop busy, too.
 _SMALL_CHUNK_EVENTS, _FEW_CHUNKS = 8, 4
+# Time (s) for which the next connections of a client's address are not read after such a body, and the longest.
+_PENALTY_S, _MAX_PENALTY_S = 0.01, 0.5
 # Time (s) per byte at which bodies of refused requests arrive, of all connections together. They are dropped, so that
 # clients read the refusal; at the speed of a local network they would occupy the event loop.
 _DROPPING_S = 5e-9
@@ -115,6 +117,7 @@ class _Flow(FlowControl):
 def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[asyncio.Protocol]:
     """Return an HTTP/1.1 protocol that bounds connections, heads, events and bodies of refused requests."""
     dropping = Pace(_DROPPING_S)
+    penalties: dict[str, Pace] = {}
 
     class BoundedProtocol(H11Protocol):
         """Protocol that ends connections without a request in progress after a while, and reads refused bodies slowly.
@@ -132,7 +135,7 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
         def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
             super().connection_made(transport)
             self.conn = _CountedConnection(lambda: self._parser)
-            account = ParsingAccount(self.config.app, lambda: self.scope, self.client[0] if self.client else "")
+            account = ParsingAccount(self.config.app, lambda: self.scope, self._address)
             self._parser = PacedParser(
                 transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused, account.add
             )
@@ -141,6 +144,10 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
             self._idle_since = monotonic()
             self._make_room()
             self._watch()
+            penalty = penalties.get(self._address)
+            if penalty is not None and (wait_s := penalty.wait_s(0)) > 0.0:
+                self._parser.block("penalty")
+                self.loop.call_later(min(wait_s, _MAX_PENALTY_S), self._end_penalty)
 
         def data_received(self, data: bytes) -> None:
             self._unset_keepalive_if_required()
@@ -176,6 +183,7 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
             super().on_response_complete()
             self._idle_since = monotonic()
             if self.conn.is_answered_in_small_chunks:
+                self._penalise()
                 self.transport.close()
             # Requests that were sent with the last one are handled outside the feeder.
             self._parser.settle()
@@ -187,6 +195,19 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
             self._parser.close()
             if self._pause is not None:
                 self._pause.cancel()
+
+        @property
+        def _address(self) -> str:
+            return self.client[0] if self.client else ""
+
+        def _penalise(self) -> None:
+            if len(penalties) >= max_connections:
+                penalties.clear()
+            penalties.setdefault(self._address, Pace(_PENALTY_S)).wait_s(1)
+
+        def _end_penalty(self) -> None:
+            if not self.transport.is_closing():
+                self._parser.unblock("penalty")
 
         def _parse(self, piece: bytes) -> None:
             if piece:

@@ -119,7 +119,7 @@ class AlbumPhotographQuery:
 
 @dataclass(frozen=True)
 class AlbumEntry:
-    """What an album keeps of a photograph: its features, and size, time and camera as JSON."""
+    """Parts of a photograph that an album keeps: its features, and size, time and camera as JSON."""
 
     entry: bytes
     facts: str

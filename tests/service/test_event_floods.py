@@ -19,7 +19,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.sync.client import connect
 
 from service.capacity.cpu_accounts import CpuAccounts
-from service.http import paced_parsing
+from service.http import http_protocol, paced_parsing
 from service.http.http_protocol import MAX_HEAD_BYTES
 from service.http.paced_parsing import EVENTS_PER_TURN, PacedParser
 from service.http.socket_protocol import BoundedSocket
@@ -151,6 +151,18 @@ def test_answer_ends_the_connection_of_a_body_in_small_chunks(port: int) -> None
         connection.sendall(_chunked("/refused", b"x", 6))
         connection.settimeout(3.0)
         assert _read_all(connection).startswith(b"HTTP/1.1 401 ")
+
+
+def test_connections_after_a_body_in_small_chunks_are_read_later(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_protocol, "_PENALTY_S", 60.0)
+    with _connected(port) as flood:
+        flood.sendall(_chunked("/refused", b"x", 6))
+        _read_all(flood)
+    begin = time.monotonic()
+    with _connected(port) as connection:
+        connection.sendall(b"GET /who HTTP/1.1\r\nConnection: close\r\n" + HOST + b"\r\n")
+        assert _read_all(connection).endswith(b'"me"')
+    assert time.monotonic() - begin > 0.4
 
 
 def _send_quietly(connection: socket.socket, content: bytes) -> None:

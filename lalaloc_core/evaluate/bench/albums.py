@@ -38,7 +38,7 @@ _NEAR_M, _TURNED = 1.0, math.radians(30.0)
 
 
 class _Score(NamedTuple):
-    """Of one photograph: right room, pose within 1 m and 30°, within 1 m, and the confidence of the room."""
+    """Result of one photograph: right room, pose within 1 m and 30°, within 1 m, and the confidence of the room."""
 
     room: bool
     pose: bool

@@ -80,12 +80,12 @@ class Shape:
 
     @property
     def is_box(self) -> bool:
-        """Whether the shape fills its box."""
+        """True if the shape fills its box."""
         return self.filled >= _FILLED
 
     @cached_property
     def is_oval(self) -> bool:
-        """Whether the shape is an ellipse."""
+        """True if the shape is an ellipse."""
         points = shapely.get_coordinates(self.outline) - self.centre
         x, y = points @ self.axis, points @ np.array([-self.axis[1], self.axis[0]])
         radius = np.hypot(x / (0.5 * self.long_m), y / (0.5 * self.short_m))
@@ -95,7 +95,7 @@ class Shape:
 
     @property
     def is_circle(self) -> bool:
-        """Whether the shape is a circle."""
+        """True if the shape is a circle."""
         return self.is_oval and self.long_m <= _CIRCLE * self.short_m
 
     @cached_property
