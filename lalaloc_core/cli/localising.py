@@ -186,8 +186,10 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         source = "searched" if found.heading_contradicted else known.source
         warnings = ["the photograph contradicts the heading, which was estimated instead"]
         warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
-        if confidence is not None and not warnings:
-            warnings = [text for text in [reason_for(confidence.position, confidence.elsewhere)] if text]
+        if confidence is not None:
+            objects, is_warned = query.objects, bool(warnings)
+            reason = reason_for(confidence.position, confidence.elsewhere, objects, is_warned=is_warned)
+            warnings += [] if reason is None else [reason]
         details = {
             "stage": found.stage,
             "heading_source": source,
