@@ -25,6 +25,7 @@ from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
+from lalaloc_core.photograph.overlap import ALBUM_SIDE
 from lalaloc_core.photograph.taken import Taken
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -55,7 +56,7 @@ def photographs(encoder: PhotographEncoder) -> list[AlbumPhotograph]:
     for number, name in enumerate(NAMES):
         content = (EXAMPLES / name).read_bytes()
         view = open_photograph(
-            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), overview=True
+            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), overview=ALBUM_SIDE
         )
         taken = Taken(at=datetime(2026, 5, 1, 12, number), make="M", model="P", width=1280, height=960)
         found.append(photograph_entry(name, encoder.with_features(view), taken))
