@@ -198,7 +198,7 @@ def test_photographs_of_a_facade_are_set_aside(
     outside = [
         photograph_entry(
             f"outside {number}",
-            encoder.with_features(open_photograph(_facade(number), overview=True, **size)),
+            encoder.with_features(open_photograph(_facade(number), overview=ALBUM_SIDE, **size)),
             replace(photographs[-1].taken, at=datetime(2026, 5, 1, 12, 10 + number)),
         )
         for number in range(2)
