@@ -210,6 +210,19 @@ def test_photographs_of_a_facade_are_set_aside(
         assert "nothing that rooms hold" in pin.reason
 
 
+def test_photograph_that_shows_no_wall_is_not_sure(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    phone = photographs[-1]
+    assert phone.view.features is not None
+    outputs = dict(phone.view.features.outputs)
+    outputs["seen"] = np.full_like(outputs["seen"], 0.0)
+    blind = replace(phone, id="blind", view=replace(phone.view, features=replace(phone.view.features, outputs=outputs)))
+    pin = solve_album(ground, encoder, [blind]).pins[0]
+    assert pin.state in ("set_aside", "uncertain")
+    assert pin.within_1m < 0.2
+
+
 def test_correction_of_an_unknown_room_is_refused(
     ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
 ) -> None:

@@ -85,7 +85,7 @@ class Comparison:
         for begin, end in pairwise([0, *ends]):
             openings = self.openings[trust_number[begin]]
             cost = self.walls[:, :, None, :] + openings[:, None, :, None]
-            cost = cost.reshape(len(cost), BINS * KINDS, -1)
+            cost = cost.reshape(len(cost), BINS * KINDS, self.walls.shape[2])
             for first in range(begin, end, _CHUNK):
                 part = slice(first, min(first + _CHUNK, end))
                 yield part, self._part(ground.part(part), cost, openings)
