@@ -28,10 +28,15 @@ from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
+# Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
+_LIKE_WALL = (0.5, 1.6)
 _MIN_ROOM_M2 = 0.8
 _MAX_ISLAND_M2 = 2.0
-# Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area.
+# Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area, or all rooms of
+# the dark walls and more.
 _OUTLINE_ADVANTAGE = 1.6
+# Smallest intersection over union of the same room in two readings.
+_SAME_ROOM = 0.9
 _SURE = 0.85
 # Share of drawn openings that are found and classified (benchmarks.plan_pictures).
 _RECALL = 0.95
@@ -62,6 +67,18 @@ class _Reading:
     @property
     def area_m2(self) -> float:
         return float(sum(room.area for room in self.enclosed.rooms))
+
+    def extends(self, smaller: _Reading) -> bool:
+        """Return whether this reading has all rooms of another one and more."""
+        if self.area_m2 < smaller.area_m2 + _MIN_ROOM_M2 or not smaller.enclosed.rooms:
+            return False
+        tree = shapely.STRtree(self.enclosed.rooms)
+        for room in smaller.enclosed.rooms:
+            near = tree.geometries[tree.query(room, predicate="intersects")]
+            shared = shapely.area(shapely.intersection(near, room))
+            if not (shared >= _SAME_ROOM * (shapely.area(near) + room.area - shared)).any():
+                return False
+        return True
 
 
 def sketch_picture(
@@ -103,7 +120,7 @@ def sketch_picture(
         return Sketch()
     best = readings[0]
     for reading in readings[1:]:
-        if reading.area_m2 > _OUTLINE_ADVANTAGE * best.area_m2:
+        if reading.area_m2 > _OUTLINE_ADVANTAGE * best.area_m2 or reading.extends(best):
             best = reading
     builder.use("ink", "walls", len(shapely.get_parts(best.enclosed.walls)))
     if best.walls.thickness_m > _MAX_WALL_THICKNESS_M:
@@ -146,7 +163,8 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         contents[id(gap)] = found = reader.classify(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
-        if is_bare and not (gap.is_sure and gap.width <= widest):
+        relative = gap.shape.area / gap.width / walls.thickness_m
+        if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
             return None
         if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None
