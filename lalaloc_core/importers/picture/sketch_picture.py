@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -17,6 +17,8 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
+from lalaloc_core.importers.drawing.named_rooms import split_named_rooms
+from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
@@ -80,6 +82,13 @@ class _Reading:
                 return False
         return True
 
+    def divided(self, letterings: Sequence[Lettering], budget: Budget) -> _Reading:
+        """Return the reading with rooms that have several names divided at passages wider than a door."""
+        found = self.enclosed
+        rooms, wide = split_named_rooms(found.rooms, found.walls, found.gaps, letterings, budget.check_time)
+        contents = self.contents | {id(gap): GapContent("nothing", 1.0) for gap in wide}
+        return replace(self, enclosed=Enclosed(rooms, [*found.gaps, *wide], found.walls), contents=contents)
+
 
 def sketch_picture(
     gray: UInt8[np.ndarray, "h w"],
@@ -90,13 +99,15 @@ def sketch_picture(
     *,
     straighten: bool = True,
     has_symbols: bool = True,
+    letterings: Sequence[Lettering] = (),
 ) -> Sketch:
     """Find the rooms that walls enclose, and classify gaps in walls by their content.
 
     Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used.
     Rows of `gray` are from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards
     blue. Without `straighten`, the coordinates are those of the picture even if its lines are skew; without
-    `has_symbols`, fixtures are not looked for.
+    `has_symbols`, fixtures are not looked for. `letterings` are texts in plan metres: rooms with several names are
+    divided at wide passages.
 
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
@@ -128,6 +139,7 @@ def sketch_picture(
             f"the walls are {best.walls.thickness_m:.2f} m thick at {metres_per_pixel:g} m per pixel; the limit is "
             f"{_MAX_WALL_THICKNESS_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
+    best = best.divided(letterings, budget)
     _report(best, ink, metres_per_pixel, builder)
     _report_coverage(best, builder)
     if budget.trace is not None:

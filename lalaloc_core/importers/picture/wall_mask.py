@@ -27,8 +27,8 @@ _OUTLINED_RANGE, _FILLED_RANGE = (0.6, 2.5), (0.6, 3.0)
 # Largest share of a cavity that can be wider than a wall, at the junctions of walls.
 _WIDE_PART = 0.15
 # White areas in walls: least length of sure ones (m), share of the walls that sets the thickest, tolerance of widths,
-# least length of strips and thickness of piers relative to the usual, widths of panes around 0.4 of it, and wide part of
-# a strip.
+# least length of strips and thickness of piers relative to the usual, widths of panes around 0.4 of it, and wide part
+# of a strip.
 _LONG_M, _WIDEST_WALLS, _LIKE_USUAL, _OBLONG, _PIER = 1.5, 0.9, 0.25, 2.5, 1.5
 _PANE, _THINNEST_PANE, _WIDE_IN_STRIP = 0.15, 0.28, 0.03
 # Width of lines, and reach across them (pixels).
