@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,57 @@ def test_layers_named_by_use_are_rooms_in_other_languages(layers: tuple[str, ...
     plan = import_plan(dxf_file(document))
     assert _areas(plan) == [12.0] * 4
     assert {"kitchen", "bathroom", "office"} <= {room.get("type") for room in plan.document["rooms"]}
+
+
+@pytest.mark.parametrize(
+    ("layer", "kind"),
+    [
+        ("Küchen", "kitchen"),
+        ("Toiletter", "bathroom"),
+        ("Sypialnie", "bedroom"),
+        ("Łazienki", "bathroom"),
+        ("03_SCHLAFEN", "bedroom"),
+    ],
+)
+def test_plurals_name_the_use_of_rooms(layer: str, kind: str):
+    document: Any = new_dxf("R2010", units=6)
+    for x, name in ((0.0, "ROOM"), (4.2, layer)):
+        ring = [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0)]
+        document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": name})
+    plan = import_plan(dxf_file(document))
+    assert _areas(plan) == [12.0, 12.0]
+    assert kind in {room.get("type") for room in plan.document["rooms"]}
+
+
+def test_outlines_of_separate_lines_on_a_layer_of_rooms_are_rooms():
+    document: Any = new_dxf("R2010", units=6)
+    for x in (0.0, 4.2):
+        ring = [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0), (x, 0.0)]
+        for start, end in pairwise(ring):
+            document.modelspace().add_line(start, end, dxfattribs={"layer": "Rooms"})
+    assert _areas(import_plan(dxf_file(document))) == [12.0, 12.0]
+
+
+@pytest.mark.parametrize("turn_deg", [0, 2, 25])
+def test_turned_shapes_of_an_svg_are_walls(turn_deg: int):
+    turned = f'<g transform="rotate({turn_deg})" fill="none" stroke="#000" stroke-width="12">{{}}</g>'
+    outer, inner = '<rect width="1000" height="700"/>', '<path d="M450,0 V300 M450,390 V700"/>'
+    plan = _svg(turned.format(outer + inner))
+    assert _areas(plan) == [37.0, 30.1]
+
+
+def test_outlines_with_holes_are_faces_of_walls():
+    faces = "M0,0 H900 V600 H0 Z M20,20 V580 H440 V20 Z M460,20 V580 H880 V120 H780 V20 Z"
+    plan = _svg(f'<path fill="none" stroke="#333" stroke-width="2" d="{faces}"/>')
+    assert _areas(plan) == [23.5, 22.5]
+
+
+def test_titles_name_the_shapes_of_an_svg():
+    shapes_of = "".join(
+        f'<rect id="room-{x}" x="{x}" width="500" height="400"><title>Bedroom</title></rect>' for x in (0, 515)
+    )
+    plan = _svg("<title>House</title>", shapes_of)
+    assert [room["name"] for room in plan.document["rooms"]] == ["Bedroom", "Bedroom"]
 
 
 def test_unused_outlines_are_reported_with_layer_and_share():

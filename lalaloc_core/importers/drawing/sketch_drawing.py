@@ -218,7 +218,8 @@ def name_rooms(
         if others := [text for text in dict.fromkeys(known) if text != name]:
             names = " and ".join(f"'{text}'" for text in (name, *others[:_MAX_OTHERS]))
             builder.warnings.append(
-                f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall between them"
+                f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
+                "between them"
             )
     check_areas(rooms, [texts.get(index, []) for index in range(len(rooms))], builder)
     unnamed = sum(room.name is None for room in rooms)
