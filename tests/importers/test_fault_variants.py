@@ -14,6 +14,7 @@ from scipy import ndimage
 from lalaloc_core.importers import ImportedPlan, import_plan
 from lalaloc_core.importers.common.floors import find_floor
 from tests.importers.conftest import dxf_file, lines, shapes, zip_file
+from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import SETTINGS, _picture
 
 _SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1200 900" data-metres-per-unit="0.01">{}</svg>'
@@ -97,6 +98,14 @@ def test_titles_name_the_shapes_of_an_svg():
     )
     plan = _svg("<title>House</title>", shapes_of)
     assert [room["name"] for room in plan.document["rooms"]] == ["Bedroom", "Bedroom"]
+
+
+@pytest.mark.parametrize("schema", ["IFC4X3", "IFC4X3_ADD1", "IFC4_ADD2", "ifc4"])
+def test_versions_of_ifc_schemas_are_read(schema: str):
+    model = (FOLDER / "door_curtain.ifc").read_text().replace("'IFC4'", f"'{schema}'")
+    plan = import_plan(model.encode())
+    assert _areas(plan) == [19.2, 16.0]
+    assert [len(lines(plan.document, kind)) for kind in ("door", "window")] == [1, 1]
 
 
 def test_unused_outlines_are_reported_with_layer_and_share():
