@@ -118,13 +118,14 @@ def draw_plan(
     symbols = sheet.furnish_with_symbols(rng) if has_symbols else []
     if not has_symbols and (is_furnished or style in ("coloured", "scanned")):
         sheet.furnish(rng)
-    if has_texts and style in ("coloured", "scanned"):
+    has_names = has_texts and style in ("coloured", "scanned")
+    if has_names:
         sheet.letter()
         sheet.dimension()
     sheet.draw_walls(style, rng)
     sheet.draw_openings()
     picture = sheet.picture
-    rooms, openings = _as_seen(model)
+    rooms, openings = (model.rooms, model.openings) if has_names else _as_seen(model)
     if style == "scanned":
         degrees = float(rng.uniform(1.0, 4.0) * rng.choice([-1.0, 1.0]))
         picture = scan(picture, degrees, rng)
@@ -195,7 +196,7 @@ def _cut_through(
 
 
 def _as_seen(model: Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]:
-    """Return rooms and openings as a drawing shows them: wide openings without a symbol join rooms."""
+    """Return rooms and openings as a drawing without names shows them: wide openings without a symbol join rooms."""
     wide = [o for o in model.openings if o.kind == "passage" and math.dist(o.start, o.end) > WIDEST_BARE_OPENING_M]
     joined = shapely.unary_union([*model.rooms, *(o.shape.buffer(1e-3, join_style="mitre") for o in wide)])
     parts = [part for part in shapely.get_parts(joined) if isinstance(part, shapely.Polygon)]

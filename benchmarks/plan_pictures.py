@@ -2,7 +2,7 @@
 
 `python -m benchmarks.plan_pictures` prints the figures of docs/results.md by style; `--conditions` those with noise,
 shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that are estimated without any text;
-`--symbols` the precision and recall of fixtures, drawn as symbols among furniture.
+`--symbols` the rooms and the precision and recall of fixtures, drawn as symbols among furniture.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import shapely
@@ -53,8 +53,8 @@ def f1(counts: tuple[int, int, int]) -> float:
     return 2.0 * found / max(true + imported, 1)
 
 
-def score_plan(drawn: DrawnPlan, content: bytes, score: Score) -> None:
-    """Import one picture and count the rooms and openings found; none where the import is refused."""
+def score_plan(drawn: DrawnPlan, content: bytes, score: Score) -> dict[str, Any]:
+    """Import one picture, count the rooms and openings found, and return the plan; none where the import is refused."""
     began = time.process_time()
     try:
         document = import_plan(content, ImportOptions(metres_per_pixel=drawn.metres_per_pixel)).document
@@ -72,6 +72,7 @@ def score_plan(drawn: DrawnPlan, content: bytes, score: Score) -> None:
         truth = [opening for opening in drawn.openings if opening.kind == kind]
         counts = (len(truth), len(lines), _matches(truth, lines))
         setattr(score, kind, tuple(a + b for a, b in zip(getattr(score, kind), counts, strict=True)))
+    return document
 
 
 def _iou(a: shapely.Polygon, b: shapely.Polygon) -> float:
@@ -123,16 +124,13 @@ def measure_condition(condition: Condition, plans: int, first_seed: int = 0) -> 
     return score
 
 
-def measure_symbols(style: Style, plans: int, first_seed: int = 0) -> dict[str, tuple[int, int, int]]:
-    """Return by kind of fixture how many are drawn, imported, and imported with their kind at their place."""
+def measure_symbols(style: Style, plans: int, first_seed: int = 0) -> tuple[Score, dict[str, tuple[int, int, int]]]:
+    """Return the score of plans with symbols, and by kind of fixture how many are drawn, imported, and both."""
+    score = Score()
     counts: dict[str, tuple[int, int, int]] = dict.fromkeys(FIXTURES, (0, 0, 0))
     for seed in range(first_seed, first_seed + plans):
         drawn = draw_plan(style, seed, has_symbols=True)
-        try:
-            content = drawn.jpeg() if style == "scanned" else drawn.png()
-            document = import_plan(content, ImportOptions(metres_per_pixel=drawn.metres_per_pixel)).document
-        except InvalidFloorPlanError:
-            document = {}
+        document = score_plan(drawn, drawn.jpeg() if style == "scanned" else drawn.png(), score)
         fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in document.get("fixtures", [])]
         for kind in FIXTURES:
             truth = [symbol.outline for symbol in drawn.symbols if symbol.kind == kind]
@@ -140,7 +138,7 @@ def measure_symbols(style: Style, plans: int, first_seed: int = 0) -> dict[str, 
             matched = sum(any(_iou(outline, other) >= _SYMBOL_IOU for other in truth) for outline in found)
             drawn_before, found_before, matched_before = counts[kind]
             counts[kind] = drawn_before + len(truth), found_before + len(found), matched_before + matched
-    return counts
+    return score, counts
 
 
 def symbol_table(counts: Sequence[dict[str, tuple[int, int, int]]]) -> str:
@@ -228,7 +226,9 @@ def main() -> None:
     if arguments.plans < 1:
         parser.error(f"--plans is {arguments.plans}, the minimum is 1")
     if arguments.symbols:
-        print(symbol_table([measure_symbols(style, arguments.plans, arguments.seed) for style in STYLES]))
+        measured = {style: measure_symbols(style, arguments.plans, arguments.seed) for style in STYLES}
+        print(table({style: score for style, (score, _) in measured.items()}))
+        print(symbol_table([counts for _, counts in measured.values()]))
         return
     if arguments.scale:
         print(scale_table({style: measure_scale(style, arguments.plans, arguments.seed) for style in STYLES}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy import ndimage
 from lalaloc_core.importers import ImportedPlan, import_plan
 from lalaloc_core.importers.common.floors import find_floor
 from tests.importers.conftest import dxf_file, lines, shapes, zip_file
+from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import SETTINGS, _picture
 
 _SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1200 900" data-metres-per-unit="0.01">{}</svg>'
@@ -45,6 +47,65 @@ def test_layers_named_by_use_are_rooms_in_other_languages(layers: tuple[str, ...
     plan = import_plan(dxf_file(document))
     assert _areas(plan) == [12.0] * 4
     assert {"kitchen", "bathroom", "office"} <= {room.get("type") for room in plan.document["rooms"]}
+
+
+@pytest.mark.parametrize(
+    ("layer", "kind"),
+    [
+        ("Küchen", "kitchen"),
+        ("Toiletter", "bathroom"),
+        ("Sypialnie", "bedroom"),
+        ("Łazienki", "bathroom"),
+        ("03_SCHLAFEN", "bedroom"),
+    ],
+)
+def test_plurals_name_the_use_of_rooms(layer: str, kind: str):
+    document: Any = new_dxf("R2010", units=6)
+    for x, name in ((0.0, "ROOM"), (4.2, layer)):
+        ring = [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0)]
+        document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": name})
+    plan = import_plan(dxf_file(document))
+    assert _areas(plan) == [12.0, 12.0]
+    assert kind in {room.get("type") for room in plan.document["rooms"]}
+
+
+def test_outlines_of_separate_lines_on_a_layer_of_rooms_are_rooms():
+    document: Any = new_dxf("R2010", units=6)
+    for x in (0.0, 4.2):
+        ring = [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0), (x, 0.0)]
+        for start, end in pairwise(ring):
+            document.modelspace().add_line(start, end, dxfattribs={"layer": "Rooms"})
+    assert _areas(import_plan(dxf_file(document))) == [12.0, 12.0]
+
+
+@pytest.mark.parametrize("turn_deg", [0, 2, 25])
+def test_turned_shapes_of_an_svg_are_walls(turn_deg: int):
+    turned = f'<g transform="rotate({turn_deg})" fill="none" stroke="#000" stroke-width="12">{{}}</g>'
+    outer, inner = '<rect width="1000" height="700"/>', '<path d="M450,0 V300 M450,390 V700"/>'
+    plan = _svg(turned.format(outer + inner))
+    assert _areas(plan) == [37.0, 30.1]
+
+
+def test_outlines_with_holes_are_faces_of_walls():
+    faces = "M0,0 H900 V600 H0 Z M20,20 V580 H440 V20 Z M460,20 V580 H880 V120 H780 V20 Z"
+    plan = _svg(f'<path fill="none" stroke="#333" stroke-width="2" d="{faces}"/>')
+    assert _areas(plan) == [23.5, 22.5]
+
+
+def test_titles_name_the_shapes_of_an_svg():
+    shapes_of = "".join(
+        f'<rect id="room-{x}" x="{x}" width="500" height="400"><title>Bedroom</title></rect>' for x in (0, 515)
+    )
+    plan = _svg("<title>House</title>", shapes_of)
+    assert [room["name"] for room in plan.document["rooms"]] == ["Bedroom", "Bedroom"]
+
+
+@pytest.mark.parametrize("schema", ["IFC4X3", "IFC4X3_ADD1", "IFC4_ADD2", "ifc4"])
+def test_versions_of_ifc_schemas_are_read(schema: str):
+    model = (FOLDER / "door_curtain.ifc").read_text().replace("'IFC4'", f"'{schema}'")
+    plan = import_plan(model.encode())
+    assert _areas(plan) == [19.2, 16.0]
+    assert [len(lines(plan.document, kind)) for kind in ("door", "window")] == [1, 1]
 
 
 def test_unused_outlines_are_reported_with_layer_and_share():

@@ -18,7 +18,11 @@ from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
+from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import find_skew
+from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from tests.importers.conftest import lines, shapes
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
@@ -101,6 +105,50 @@ def test_area_without_rooms_is_reported(gap_m: float):
         assert shapely.Polygon(outline).bounds == pytest.approx((5.6, 1.1, 9.9, 3.9), abs=0.2)
     else:
         assert plan.report.no_room == ()
+
+
+@pytest.mark.parametrize("names", [("Kitchen", "Living room"), ("Kitchen", "north")])
+def test_rooms_joined_by_a_wide_passage_are_divided_by_their_names(names: tuple[str, str]):
+    page = np.full((500, 1100), 255, np.uint8)
+    page[90:410, 90:1010] = 0
+    page[110:390, 110:990] = 255
+    page[110:150, 542:558] = page[350:390, 542:558] = 0
+    places = ((3.0, 2.5), (8.0, 2.5))
+    letterings = [Lettering(name, place) for name, place in zip(names, places, strict=True)]
+    sketch = sketch_picture(page, 0.01, ReportBuilder(), Budget(ImportLimits()), letterings=letterings)
+    is_divided = names[1] == "Living room"
+    assert len(sketch.rooms) == (2 if is_divided else 1)
+    assert [opening.kind for opening in sketch.openings] == ["passage"] * is_divided
+
+
+@pytest.mark.parametrize("is_hatched", [False, True])
+def test_furniture_at_outlined_walls_is_no_wall(is_hatched: bool):
+    page = Image.new("L", (1200, 900), 255)
+    pen = ImageDraw.Draw(page)
+    if is_hatched:
+        for x in range(-900, 1200, 14):
+            pen.line((x, 900, x + 900, 0), fill=0)
+        pen.rectangle((0, 0, 1199, 99), fill=255)
+        pen.rectangle((0, 801, 1199, 899), fill=255)
+        pen.rectangle((0, 0, 99, 899), fill=255)
+        pen.rectangle((1101, 0, 1199, 899), fill=255)
+        pen.rectangle((120, 120, 1080, 780), fill=255)
+    for box in ((100, 100, 1100, 800), (120, 120, 1080, 780)):
+        pen.rectangle(box, outline=0, width=2)
+    # A hob, a basin, a shelf and a wardrobe.
+    pen.rectangle((120, 300, 175, 360), outline=0)
+    for x, y in ((135, 316), (160, 316), (135, 344), (160, 344)):
+        pen.ellipse((x - 9, y - 9, x + 9, y + 9), outline=0)
+    pen.rectangle((400, 120, 460, 165), outline=0)
+    pen.ellipse((410, 128, 450, 156), outline=0)
+    for x in (600, 640, 680, 720):
+        pen.rectangle((x, 745, x + 40, 780), outline=0)
+    pen.rectangle((1020, 500, 1080, 700), outline=0)
+    pen.line((1050, 500, 1050, 700), fill=0)
+    stream = io.BytesIO()
+    page.save(stream, "PNG")
+    (room,) = shapes(import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=0.01)).document)
+    assert shapely.hausdorff_distance(room, shapely.box(1.2, 1.2, 10.8, 7.8)) < 0.06
 
 
 def test_single_line_is_a_window_outside_and_a_passage_inside():

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 from lalaloc_core.floorplan.rooms import room_type_from_label
 
 Role = Literal["door", "window", "passage", "obstacle", "wall", "room", "text", "ignored"]
 
+# Shorter words have no plurals but those with s.
+_SHORTEST_PLURAL = 5
 # The first match wins: "A-WALL-DOOR" is a door layer, "window dimensions" is ignored.
 _ROLES: tuple[tuple[Role, str], ...] = (
     (
@@ -59,7 +61,8 @@ _ROLES: tuple[tuple[Role, str], ...] = (
         "room",
         "room rooms space spaces area areas zone zones zimmer raum raume raeume raumflachen flache flachen "
         "piece pieces local locaux habitacion habitaciones estancia estancias stanza stanze locale locali "
-        "ruimte ruimten kamer kamers rum rom pomieszczenie pomieszczenia pokoje comodo comodos vaerelse unit units",
+        "ruimte ruimten ruimtes kamer kamers rum rom pomieszczenie pomieszczenia pokoje comodo comodos compartimento "
+        "compartimentos vaerelse unit units",
     ),
     ("text", "text texts texte label labels name names iden note notes annotation anno beschriftung"),
 )
@@ -79,7 +82,7 @@ _ENGLISH: Mapping[str, str] = {
             "badevaerelse brusebad baderom toalet lazienka ubikacja kph powder ensuite pwdr"
         ),
         "bedroom": (
-            "schlafzimmer kinderzimmer gastezimmer gaestezimmer elternzimmer sz chambre chambres chbre chb "
+            "schlafzimmer schlafen kinderzimmer gastezimmer gaestezimmer elternzimmer sz chambre chambres chbre chb "
             "dormitorio dormitorios dorm alcoba camera camere cameretta quarto quartos slaapkamer slpk sovrum "
             "sov sovevaerelse vaerelse kammer soverom sov1 sypialnia mh br bed bdrm mbr"
         ),
@@ -218,14 +221,22 @@ def room_type_from_name(label: str | None) -> str | None:
     # Compare whole words only: the Finnish "et" must not match "sheet".
     words = split_words(label)
     for word in ("".join(words), "".join(word.removesuffix("s") for word in words), *words):
-        # Plurals: "Offices", "Toilets", "Lobbies".
-        singular = f"{word[:-3]}y" if word.endswith("ies") else word.removesuffix("s")
-        for form in (word, singular, word.removesuffix("es")):
+        for form in (word, *_singulars(word)):
             found = room_type_from_label(_ENGLISH.get(form, form))
             if found != "unknown":
                 return found
     text = unicodedata.normalize("NFKC", label)
     return next((kind for word, kind in _JAPANESE if word in text), None)
+
+
+def _singulars(word: str) -> Iterator[str]:
+    """Yield what a plural can come from: "Offices", "Lobbies", "Küchen", "Toiletter", "Camere", "Sypialnie"."""
+    yield f"{word[:-3]}y" if word.endswith("ies") else word.removesuffix("s")
+    yield word.removesuffix("es")
+    if len(word) > _SHORTEST_PLURAL:
+        yield from (word.removesuffix(ending) for ending in ("en", "er", "n", "r") if word.endswith(ending))
+        if word[-1] in "eiy":
+            yield f"{word[:-1]}a"
 
 
 def _role_of_word(word: str) -> Role | None:

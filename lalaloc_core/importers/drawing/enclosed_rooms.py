@@ -28,7 +28,7 @@ _OUT_OF_LINE_M, _SLIT_M = 0.35, 0.001
 # in a comparison of readings (m²).
 _MOSTLY_SINGLE, _SMALLEST_COUNTED_M2 = 0.5, 1.0
 # Long outlines (m) bound a wall if they are this slim nearly everywhere, and nowhere wider, relative to the thickest.
-_LONG_M, _USUAL, _WIDEST = 10.0, 0.75, 2.0
+_LONG_M, _USUAL, _WIDEST = 10.0, 0.75, 2.5
 # Piers are so much thicker than the usual ends of walls, and shorter than so many times their own thickness.
 _PIER, _PIER_NIB = 1.6, 2.0
 

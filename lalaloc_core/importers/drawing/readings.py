@@ -244,7 +244,7 @@ def _by_named_walls(drawing: Drawing, budget: Budget) -> Enclosed | None:
     lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall"]
     if not areas and not lines:
         return None
-    outlines = [area.shape.exterior for area in areas if _is_outline(area)]
+    outlines = [ring for area in areas if _is_outline(area) for ring in _rings(area.shape)]
     bodies = [area.shape for area in areas if not _is_outline(area)]
     return enclose(bodies, split_lines([*lines, *outlines]), _closers(drawing), check_time=budget.check_time)
 
@@ -271,8 +271,8 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
 
 def _by_all_lines(drawing: Drawing, budget: Budget) -> Enclosed | None:
     """Return the areas between all lines on layers without a role, None if there are none."""
-    lines = [stroke.line for stroke in drawing.strokes if stroke.role is None]
-    lines += [area.shape.exterior for area in drawing.areas if area.role is None]
+    lines = [stroke.line for stroke in drawing.strokes if stroke.role in (None, "room")]
+    lines += [ring for area in drawing.areas if area.role is None for ring in _rings(area.shape)]
     if not lines:
         return None
     found = enclose([], split_lines(lines), _closers(drawing), check_time=budget.check_time)
@@ -287,6 +287,10 @@ def _panes(drawing: Drawing, walls: BaseGeometry, least: int, budget: Budget) ->
     found = drawn_panes(split_lines(lines), walls, least, budget.check_time)
     ends = [(area, shapely.get_coordinates(line)) for area, line in found]
     return [Gap(area, point_xy(a), point_xy(b), is_between_ends=True, is_pane=True) for area, (a, b) in ends]
+
+
+def _rings(shape: shapely.Polygon) -> list[shapely.LinearRing]:
+    return [shape.exterior, *shape.interiors]
 
 
 def _is_outline(area: Area) -> bool:

@@ -216,8 +216,10 @@ def name_rooms(
         name = area.name or next(iter(known or words), None)
         rooms.append(SketchedRoom(area.shape, name, room_type_from_name(area.kind) or room_type_from_name(name)))
         if others := [text for text in dict.fromkeys(known) if text != name]:
-            builder.unsure.append(
-                f"'{', '.join(others[:_MAX_OTHERS])}' is written in room '{name}' too; check that it is one room"
+            names = " and ".join(f"'{text}'" for text in (name, *others[:_MAX_OTHERS]))
+            builder.warnings.append(
+                f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
+                "between them"
             )
     check_areas(rooms, [texts.get(index, []) for index in range(len(rooms))], builder)
     unnamed = sum(room.name is None for room in rooms)

@@ -12,6 +12,9 @@ _END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
 # Placements in a chain; a model has about ten. Numbers of a hundred digits are beyond all that is measured, and larger
 # ones end the reading of their instance.
 _MAX_PLACEMENTS = 64
+# Schema in the head of a file, and by its beginning the version that is read in its place.
+_SCHEMA, _HEAD = re.compile(r"(FILE_SCHEMA\s*\(\s*\(\s*')([^']{0,50})"), 65_536
+_SCHEMAS = {"IFC2X3": "IFC2X3", "IFC4X": "IFC4X3_ADD2", "IFC4": "IFC4"}
 _LARGE_NUMBER = re.compile(rb"[(,]\s*([-+]?\d+\.?\d*[Ee]\+?\d{3,}|[-+]?\d{101,}\.\d*)\s*[,)]")
 
 
@@ -34,9 +37,14 @@ def open_model(content: bytes) -> Any:
         raise InvalidFloorPlanError(
             f"the IFC file is truncated: it does not end with {_END.decode()}; export or upload it again"
         )
+    # The format is ASCII and escapes other characters, so nothing is lost by "replace".
+    text = content.decode("utf-8", "replace")
+    stated = _SCHEMA.search(text, 0, _HEAD)
+    schema = stated[2] if stated is not None else ""
+    # The library knows one version of each schema.
+    known = next((known for start, known in _SCHEMAS.items() if schema.upper().startswith(start)), schema)
     try:
-        # The format is ASCII and escapes other characters, so nothing is lost by "replace".
-        model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))
+        model = ifcopenshell.file.from_string(_SCHEMA.sub(rf"\g<1>{known}", text, 1) if known != schema else text)
         schema = str(model.schema)
     except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
         raise InvalidFloorPlanError(

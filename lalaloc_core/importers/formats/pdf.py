@@ -6,6 +6,7 @@ A PDF has neither rooms nor meaningful layers, so the result is always a draft.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +32,7 @@ from lalaloc_core.importers.drawing.scale_guess import (
 )
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
 from lalaloc_core.importers.drawing.storeys import Box, choose_storey
-from lalaloc_core.importers.drawing.vector_drawing import Area
+from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.ink import blank_outside
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
@@ -95,11 +96,11 @@ def _read_plan(
     if sketch is None or not sketch.rooms:
         notes.append(f"page {options.page} was read as a picture")
         builder = ReportBuilder("pdf", is_draft=True, notes=notes)
-        sketch = _as_picture(page, found, factor, options.crop, builder, budget)
         # Searchable scans contain text over the picture.
-        own = found.drawing.scaled(factor, flip_y=False).letterings
+        letterings = found.drawing.scaled(factor, flip_y=False).letterings or scan.placed(factor)
+        sketch = _as_picture(page, found, factor, options.crop, builder, budget, letterings=letterings)
         rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-        sketch.rooms = name_rooms(rooms, own or scan.placed(factor), builder, sketch.drawn)
+        sketch.rooms = name_rooms(rooms, letterings, builder, sketch.drawn)
 
     def in_points(box: Box) -> Box:
         x0, y0, x1, y1 = box
@@ -154,8 +155,9 @@ def _as_picture(
     budget: Budget,
     *,
     has_symbols: bool = True,
+    letterings: Sequence[Lettering] = (),
 ) -> Sketch:
-    """Render the page and read it as a picture; `has_symbols` looks for fixtures."""
+    """Render the page and read it as a picture; `has_symbols` looks for fixtures, `letterings` divide rooms."""
     width, height = found.size_pt
     metres_per_pixel = max(_FINEST_M, factor * 0.25)
     scale = min(factor / metres_per_pixel, _COARSEST_PT)
@@ -165,7 +167,7 @@ def _as_picture(
             f"the limit is {budget.limits.max_plan_pixels} (max_plan_pixels); check the scale"
         )
     gray = _cropped(_gray(page.render(scale=scale, grayscale=True)), crop, scale)  # type: ignore[arg-type]
-    return sketch_picture(gray, factor / scale, builder, budget, has_symbols=has_symbols)
+    return sketch_picture(gray, factor / scale, builder, budget, has_symbols=has_symbols, letterings=letterings)
 
 
 def _cropped(gray: UInt8[np.ndarray, "h w"], crop: Box | None, scale: float) -> UInt8[np.ndarray, "h w"]:

@@ -94,7 +94,8 @@ def _read_plan(
             f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel; the limit is "
             f"{_MAX_EXTENT_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
-    sketch = sketch_picture(gray, factor, builder, budget, warmth)
+    letterings = texts.placed(factor)
+    sketch = sketch_picture(gray, factor, builder, budget, warmth, letterings=letterings)
     if not sketch.rooms:
         raise InvalidFloorPlanError(
             f"no walls that enclose a room were found in the picture, which is {columns * factor:.1f} m by "
@@ -102,7 +103,7 @@ def _read_plan(
             "scale), and that walls are dark or drawn with two lines"
         )
     rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
-    sketch.rooms = name_rooms(rooms, texts.placed(factor), builder, sketch.drawn)
+    sketch.rooms = name_rooms(rooms, letterings, builder, sketch.drawn)
 
     def in_file(box: Box) -> Box:
         x0, y0, x1, y1 = (number / factor for number in box)

@@ -104,6 +104,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
     _drop_ignored(root)
     check_work(root, budget)
+    _name_by_titles(root)
     paper_m, own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder("svg")
     drawing = _read_drawing(root, options, builder, budget)
@@ -168,6 +169,14 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 def _drop_ignored(root: Element) -> None:
     for parent in root.iter():
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
+
+
+def _name_by_titles(root: Element) -> None:
+    """Set the title of a shape as its name, unless it has one; the title of the drawing names nothing."""
+    for element in root.iter():
+        title = next((child.text for child in element if local_name(child) == "title"), None)
+        if element is not root and title and title.strip():
+            element.attrib.setdefault("data-name", title.strip())
 
 
 def _size_on_paper(root: Element) -> float | None:
@@ -236,7 +245,7 @@ def _add_fixture(fixture: Any, context: _Context, drawing: Drawing, builder: Rep
     for part in parts:
         budget.spend()
         if isinstance(part, svgelements.Shape) and not _is_hidden(part):
-            points += [outline for outline, _, _ in _outlines(svgelements.Path(part), budget) if len(outline)]
+            points += [outline for outline, _, _ in _outlines(_path(part), budget) if len(outline)]
     box = shapely.minimum_rotated_rectangle(shapely.MultiPoint(np.concatenate(points))) if points else None
     if context.kind is not None and isinstance(box, shapely.Polygon):
         builder.use(context.layer, f"fixtures: {context.kind}")
@@ -264,7 +273,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
     is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
-    for points, closed, curves in _outlines(svgelements.Path(element), budget):
+    for points, closed, curves in _outlines(_path(element), budget):
         swings = [fit_swing(curve, context.layer) for curve in curves] if context.role in (None, "door") else []
         leaves = [swing for swing in swings if swing is not None] if len(swings) <= 2 else []
         if leaves:
@@ -285,6 +294,11 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         pen = float(width or 0.0)
         drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, pen, order))
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
+
+
+def _path(shape: svgelements.Shape) -> svgelements.Path:
+    """Return a shape as a path; rectangles and ellipses still have the transform that turns them."""
+    return abs(svgelements.Path(shape))
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:

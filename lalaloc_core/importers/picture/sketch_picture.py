@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -17,6 +17,8 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
+from lalaloc_core.importers.drawing.named_rooms import split_named_rooms
+from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
@@ -28,10 +30,15 @@ from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
+# Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
+_LIKE_WALL = (0.5, 1.6)
 _MIN_ROOM_M2 = 0.8
 _MAX_ISLAND_M2 = 2.0
-# Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area.
+# Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area, or all rooms of
+# the dark walls and more.
 _OUTLINE_ADVANTAGE = 1.6
+# Smallest intersection over union of the same room in two readings.
+_SAME_ROOM = 0.9
 _SURE = 0.85
 # Share of drawn openings that are found and classified (benchmarks.plan_pictures).
 _RECALL = 0.95
@@ -63,6 +70,25 @@ class _Reading:
     def area_m2(self) -> float:
         return float(sum(room.area for room in self.enclosed.rooms))
 
+    def extends(self, smaller: _Reading) -> bool:
+        """Return whether this reading has all rooms of another one and more."""
+        if self.area_m2 < smaller.area_m2 + _MIN_ROOM_M2 or not smaller.enclosed.rooms:
+            return False
+        tree = shapely.STRtree(self.enclosed.rooms)
+        for room in smaller.enclosed.rooms:
+            near = tree.geometries[tree.query(room, predicate="intersects")]
+            shared = shapely.area(shapely.intersection(near, room))
+            if not (shared >= _SAME_ROOM * (shapely.area(near) + room.area - shared)).any():
+                return False
+        return True
+
+    def divided(self, letterings: Sequence[Lettering], budget: Budget) -> _Reading:
+        """Return the reading with rooms that have several names divided at passages wider than a door."""
+        found = self.enclosed
+        rooms, wide = split_named_rooms(found.rooms, found.walls, found.gaps, letterings, budget.check_time)
+        contents = self.contents | {id(gap): GapContent("nothing", 1.0) for gap in wide}
+        return replace(self, enclosed=Enclosed(rooms, [*found.gaps, *wide], found.walls), contents=contents)
+
 
 def sketch_picture(
     gray: UInt8[np.ndarray, "h w"],
@@ -73,13 +99,15 @@ def sketch_picture(
     *,
     straighten: bool = True,
     has_symbols: bool = True,
+    letterings: Sequence[Lettering] = (),
 ) -> Sketch:
     """Find the rooms that walls enclose, and classify gaps in walls by their content.
 
     Walls are read twice, as dark thick areas and as pairs of lines; the reading that encloses more area is used.
     Rows of `gray` are from the top, and 255 is white; `warmth` is 128 without colour, higher towards red, lower towards
     blue. Without `straighten`, the coordinates are those of the picture even if its lines are skew; without
-    `has_symbols`, fixtures are not looked for.
+    `has_symbols`, fixtures are not looked for. `letterings` are texts in plan metres: rooms with several names are
+    divided at wide passages.
 
     Raises:
         InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
@@ -103,7 +131,7 @@ def sketch_picture(
         return Sketch()
     best = readings[0]
     for reading in readings[1:]:
-        if reading.area_m2 > _OUTLINE_ADVANTAGE * best.area_m2:
+        if reading.area_m2 > _OUTLINE_ADVANTAGE * best.area_m2 or reading.extends(best):
             best = reading
     builder.use("ink", "walls", len(shapely.get_parts(best.enclosed.walls)))
     if best.walls.thickness_m > _MAX_WALL_THICKNESS_M:
@@ -111,6 +139,7 @@ def sketch_picture(
             f"the walls are {best.walls.thickness_m:.2f} m thick at {metres_per_pixel:g} m per pixel; the limit is "
             f"{_MAX_WALL_THICKNESS_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
+    best = best.divided(letterings, budget)
     _report(best, ink, metres_per_pixel, builder)
     _report_coverage(best, builder)
     if budget.trace is not None:
@@ -146,7 +175,8 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         contents[id(gap)] = found = reader.classify(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
-        if is_bare and not (gap.is_sure and gap.width <= widest):
+        relative = gap.shape.area / gap.width / walls.thickness_m
+        if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
             return None
         if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None

@@ -29,8 +29,8 @@ _BATH_M, _TUB, _DRAIN_M2 = ((1.35, 1.95), (0.6, 0.95)), (0.5, 0.93), 0.03
 _BED_M, _PILLOW_M, _DOUBLE_M = ((1.85, 2.3), (0.75, 2.1)), ((0.33, 0.95), (0.2, 0.6)), 1.2
 _ROUNDED_M2, _FURNITURE_M2, _TOUCHING_M = 0.03, 1.3, 0.06
 _TREAD_M, _TREADS, _FLIGHT_M = ((0.34, 2.2), (0.18, 0.36)), 5, 0.7
-# Reach (pixels) of lines around symbols, and distance (m) beyond their corners at which a line is one of a wall.
-_LINE_PX, _BEYOND_M = 2, (0.08, 0.2)
+# Reach (pixels) of the outline of a symbol.
+_LINE_PX = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,27 +87,13 @@ def is_taken(outline: shapely.Polygon, found: Sequence[Symbol | SketchedFixture]
 
 
 def without_symbols(ink: Ink, symbols: Sequence[Symbol]) -> Ink:
-    """Return the ink without symbols; lines that continue beyond them are of walls and stay."""
-    erased = np.zeros(ink.mask.shape, np.uint8)
-    kept = np.zeros(ink.mask.shape, np.uint8)
-    near = cv2.dilate(ink.mask.astype(np.uint8), np.ones((2 * _LINE_PX + 1,) * 2, np.uint8))
+    """Return the ink without the inner lines of symbols; outlines stay, because they can be lines of walls."""
+    inside = np.zeros(ink.mask.shape, np.uint8)
     for symbol in symbols:
         corners = np.asarray(symbol.outline.exterior.coords)
-        pixels = np.round(ink.to_pixels(corners) - 0.5).astype(np.int32)
-        cv2.fillPoly(erased, [pixels], 1)
-        cv2.polylines(erased, [pixels], True, 1, 2 * _LINE_PX + 1)
-        for number in range(4):
-            start, end = corners[number : number + 2]
-            along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
-            beyond = [point + side * far * along for point, side in ((start, -1.0), (end, 1.0)) for far in _BEYOND_M]
-            rows = np.round(ink.to_pixels(np.array(beyond)) - 0.5).astype(int)[:, ::-1]
-            rows = np.clip(rows, 0, np.array(near.shape) - 1)
-            is_inked = near[rows[:, 0], rows[:, 1]] > 0
-            if is_inked[:2].all() or is_inked[2:].all():
-                cv2.line(kept, pixels[number].tolist(), pixels[number + 1].tolist(), 1, 2 * _LINE_PX + 1)
-    paper = (erased > 0) & (kept == 0)
-    gray = np.where(paper, np.uint8(255), ink.gray)
-    return replace(ink, gray=gray, mask=ink.mask & ~paper, lines=ink.lines & ~paper)
+        cv2.fillPoly(inside, [np.round(ink.to_pixels(corners) - 0.5).astype(np.int32)], 1)
+    paper = cv2.erode(inside, np.ones((2 * _LINE_PX + 1,) * 2, np.uint8)) > 0
+    return replace(ink, gray=np.where(paper, np.uint8(255), ink.gray), mask=ink.mask & ~paper, lines=ink.lines & ~paper)
 
 
 def _symbol(shape: Shape, parts: Sequence[Shape]) -> Symbol | None:

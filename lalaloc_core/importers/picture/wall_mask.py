@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
 from lalaloc_core.importers.picture.ink import Ink
 
 _MIN_THICKNESS_M = 0.055
+# Broadest strokes relative to walls, and thinnest inner wall (m).
+_STROKE, _THINNEST_INNER_M = 0.4, 0.075
 # Largest white gap between the two lines of a wall; the sector of a door swing is wider.
 _MAX_CAVITY_M = 0.42
 _SMALL_M = 1.2
@@ -23,6 +26,18 @@ _STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
 _OUTLINED_RANGE, _FILLED_RANGE = (0.6, 2.5), (0.6, 3.0)
 # Largest share of a cavity that can be wider than a wall, at the junctions of walls.
 _WIDE_PART = 0.15
+# White areas in walls: least length of sure ones (m), share of the walls that sets the thickest, tolerance of widths,
+# least length of strips and thickness of piers relative to the usual, widths of panes around 0.4 of it, and wide part
+# of a strip.
+_LONG_M, _WIDEST_WALLS, _LIKE_USUAL, _OBLONG, _PIER = 1.5, 0.9, 0.25, 2.5, 1.5
+_PANE, _THINNEST_PANE, _WIDE_IN_STRIP = 0.15, 0.28, 0.03
+# Width of lines, and reach across them (pixels).
+_PEN_PX, _LINES_PX = 2.0, 11
+# Largest side (m) and smallest area (m²) of a ring of furniture, and the least area inside its outline relative to it.
+_RING_M, _SMALLEST_RING_M2, _HOLLOW = 2.4, 0.03, 1.25
+# Thickest strip of a wall with its lines (m), and share of a white area in such strips. Shortest stroke of a hatch (m),
+# and share of such strokes around a white area of the hatch.
+_THICKEST_M, _IN_WALL, _STROKE_OF_HATCH_M, _HATCHED = 0.46, 0.5, 0.12, 0.62
 # Largest cut of a rounded corner (m), and smallest sine of the whole turn.
 _CUT_CORNER_M, _SQUARE = 0.07, 0.8
 # Strokes of panes are paler than walls (of 255), thinner than walls (share), and long (m).
@@ -70,12 +85,14 @@ def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
 def outlined_walls(ink: Ink) -> WallMask | None:
     """Return walls drawn with two lines: the ink and the narrow white areas between its lines."""
     white = (~ink.mask).astype(np.uint8)
-    count, found = cv2.connectedComponents(white, connectivity=4)
-    labels = np.asarray(found, dtype=np.int32)
+    count, found, sizes, _ = cv2.connectedComponentsWithStats(white, connectivity=4)
+    labels, stats = np.asarray(found, dtype=np.int32), np.asarray(sizes)
     depth = cv2.distanceTransform(white, cv2.DIST_L2, 5)
     half_cavity = 0.5 * _MAX_CAVITY_M / ink.metres_per_pixel
     is_cavity = ~_reaches(labels, depth > half_cavity, count) | _is_narrow(labels, depth, half_cavity, count)
     is_cavity[0] = False
+    is_cavity[_furniture_rings(labels, stats, is_cavity, ink.metres_per_pixel)] = False
+    is_cavity &= _is_in_wall(labels, depth, is_cavity, ink)
     return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
 
 
@@ -92,6 +109,77 @@ def _is_narrow(
     return (wide <= _WIDE_PART * area) & ~_reaches(labels, depth > 1.5 * reach, count)
 
 
+def _furniture_rings(
+    labels: Int[np.ndarray, "h w"], stats: Int[np.ndarray, "n 5"], is_cavity: Bool[np.ndarray, "n"], pixel_m: float
+) -> list[int]:
+    """Return the white areas around another one that is too small for a room with a door: rims of baths, rugs."""
+    found = []
+    long_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * pixel_m
+    for label in np.flatnonzero(is_cavity & (long_m <= _RING_M)):
+        x, y, width, height, area = stats[label].tolist()
+        if area * pixel_m**2 < _SMALLEST_RING_M2:
+            continue
+        part = (labels[y : y + height, x : x + width] == label).astype(np.uint8)
+        contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        if sum(map(cv2.contourArea, contours)) > _HOLLOW * area:
+            found.append(int(label))
+    return found
+
+
+def _is_in_wall(
+    labels: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], is_cavity: Bool[np.ndarray, "n"], ink: Ink
+) -> Bool[np.ndarray, "n"]:
+    """Return the white areas that lie in walls or between the strokes of a hatch, among those that are narrow enough.
+
+    Furniture at a wall forms areas with the wall that are thick in both directions. Short areas at a wall must not be
+    much thicker than the wall, and areas behind furniture must be strips of the usual width.
+    """
+    count, pixel = len(is_cavity), ink.metres_per_pixel
+    area = np.maximum(np.bincount(labels.ravel(), minlength=count), 1)
+    # The mean distance from the edges of a strip is a quarter of its width.
+    width = np.maximum(4.0 * (np.bincount(labels.ravel(), depth.ravel(), minlength=count) / area - 0.5), 1.0)
+    length = area / width
+    filled = (ink.mask | is_cavity[labels]).astype(np.uint8)
+
+    def is_thin(thickest: float) -> Bool[np.ndarray, "n"]:
+        size = max(3, round(thickest))
+        kernels = (np.ones((1, size), np.uint8), np.ones((size, 1), np.uint8))
+        across, down = (cv2.morphologyEx(filled, cv2.MORPH_OPEN, kernel) > 0 for kernel in kernels)
+        return np.bincount(labels[~(across & down)], minlength=count) >= _IN_WALL * area
+
+    is_hatched = is_cavity & _is_hatched(labels, ink, count)
+    thin = is_thin(_THICKEST_M / pixel)
+    is_sure = is_hatched | (is_cavity & thin & (length * pixel >= _LONG_M))
+    if not is_sure.any():
+        return thin
+    sure = is_sure[labels].astype(np.uint8)
+    walls = cv2.morphologyEx(sure | ink.mask, cv2.MORPH_OPEN, np.ones((_min_thickness_px(ink),) * 2, np.uint8))
+    usual, widest = (_usual_thickness(walls, share) for share in (0.5, _WIDEST_WALLS))
+    near = cv2.dilate(sure, np.ones((_LINES_PX,) * 2, np.uint8))
+    is_beside = np.bincount(labels[near > 0], minlength=count) > 0
+    inner = max(usual - 2.0 * _PEN_PX, 1.0)
+    is_strip = (np.abs(width / inner - 1.0) <= _LIKE_USUAL) | (np.abs(width / inner - 0.4) <= _PANE)
+    wide = np.bincount(labels[depth > 0.5 * (1.0 + _LIKE_USUAL) * inner + 1.0], minlength=count)
+    is_strip &= (length >= _OBLONG * inner) & (wide <= _WIDE_IN_STRIP * area)
+    is_like_wall = is_thin(min(_PIER * widest, _THICKEST_M / pixel)) & (width >= _THINNEST_PANE * inner)
+    # Corners of a hatch are cut into small parts.
+    is_corner = is_beside & (area <= np.median(area[is_hatched])) if is_hatched.any() else is_hatched
+    return is_sure | (thin & (is_like_wall | ~is_beside)) | is_strip | is_corner
+
+
+def _is_hatched(labels: Int[np.ndarray, "h w"], ink: Ink, count: int) -> Bool[np.ndarray, "n"]:
+    """Return the white areas that the parallel strokes of a hatch bound."""
+    around = np.ones((3, 3), np.uint8)
+    inked = ink.mask.astype(np.uint8)
+    rims = np.bincount(labels[(cv2.dilate(inked, around) > 0) & ~ink.mask], minlength=count)
+    found = np.zeros(count, bool)
+    diagonal = np.eye(max(3, round(_STROKE_OF_HATCH_M / ink.metres_per_pixel / math.sqrt(2.0))), dtype=np.uint8)
+    for kernel in (diagonal, diagonal[::-1].copy()):
+        strokes = cv2.dilate(cv2.morphologyEx(inked, cv2.MORPH_OPEN, kernel), around)
+        found |= np.bincount(labels[(strokes > 0) & ~ink.mask], minlength=count) > _HATCHED * rims
+    return found
+
+
 def _reaches(labels: Int[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
     """Return whether each labelled area has one of some pixels; a maximum per label takes ten times as long."""
     found = np.zeros(count, bool)
@@ -100,8 +188,12 @@ def _reaches(labels: Int[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], cou
 
 
 def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
-    size = max(3, round(_MIN_THICKNESS_M / ink.metres_per_pixel))
+    size = _min_thickness_px(ink)
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    # Strokes of furniture can be broad in scans, but not as broad as walls.
+    widest = min(_STROKE * _usual_thickness(thick), _THINNEST_INNER_M / ink.metres_per_pixel)
+    if cavities is None and round(widest) > size:
+        thick = cv2.morphologyEx(thick, cv2.MORPH_OPEN, np.ones((round(widest),) * 2, np.uint8))
     thickness = _usual_thickness(thick) * ink.metres_per_pixel
     if thickness < _MIN_THICKNESS_M:
         return None  # Merged strokes of a hatch are not walls.
@@ -110,12 +202,20 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
     return WallMask(kept, thickness, cavities) if kept.any() else None
 
 
-def _usual_thickness(mask: np.ndarray) -> float:
-    """Return the thickness of walls in pixels, the median along their centre lines; 0 without walls."""
+def _min_thickness_px(ink: Ink) -> int:
+    return max(3, round(_MIN_THICKNESS_M / ink.metres_per_pixel))
+
+
+def _usual_thickness(mask: np.ndarray, share: float = 0.5) -> float:
+    """Return the thickness of walls in pixels, a quantile by area; 0 without walls."""
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
     ridge = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
-    values = depth[ridge].astype(np.float64)
-    return 2.0 * float(np.median(values)) - 1.0 if len(values) and not mask.all() else 0.0
+    values = np.sort(depth[ridge].astype(np.float64))
+    if not len(values) or mask.all():
+        return 0.0
+    # By area: strokes of furniture can be longer than all walls.
+    parts = np.cumsum(values)
+    return 2.0 * float(values[np.searchsorted(parts, share * parts[-1])]) - 1.0
 
 
 def _without_furniture(
