@@ -25,6 +25,13 @@ _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
+    _add_train(commands)
+    _add_export(commands)
+    _add_export_again(commands)
+    _add_add_objects(commands)
+
+
+def _add_train(commands: Any) -> None:
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
     train.add_argument(
         "stage",
@@ -102,6 +109,8 @@ def add_commands(commands: Any) -> None:
     )
     train.set_defaults(run=_train)
 
+
+def _add_export(commands: Any) -> None:
     export = commands.add_parser("export", help="export a trained run to a model bundle")
     export.add_argument("--run", type=Path, required=True, dest="folder", metavar="DIR", help="folder of the run")
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the bundle")
@@ -118,10 +127,14 @@ def add_commands(commands: Any) -> None:
     export.add_argument("--last", action="store_true", help="export the last weights instead of the best by validation")
     export.set_defaults(run=_export)
 
+
+def _add_export_again(commands: Any) -> None:
     again = commands.add_parser("export-again", help="export the networks of a model bundle again from its own weights")
     again.add_argument("bundle", type=Path, help="folder of the bundle")
     again.set_defaults(run=_export_again)
 
+
+def _add_add_objects(commands: Any) -> None:
     objects = commands.add_parser(
         "add-objects", help="add the pretrained classifier of objects, which tells types of rooms, to a model bundle"
     )
