@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import socket
@@ -22,11 +23,13 @@ import uvicorn
 from fastapi import FastAPI
 from PIL import Image
 
+from lalaloc_core.bundle import default_bundle
 from service.app import create_app
 from service.pools.supervisor import Watchdog
 from service.settings import Settings
 from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
+from tests.core.taken import EXAMPLES
 from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
 from tests.service.ray_cluster import ray_cluster, serving
 
@@ -39,6 +42,9 @@ FLAT: dict[str, Any] = {
         {"name": "living room", "polygon": [[4, 0], [9, 0], [9, 6], [6, 6], [6, 3], [4, 3]]},
     ],
 }
+
+# The flat of the example photographs.
+HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
 
 _DATABASE = os.environ.get("TEST_DATABASE", "sqlite")
 _REPLICAS = 2 if _DATABASE == "replicas" else 1
@@ -153,10 +159,33 @@ class InTurn(httpx.BaseTransport):
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def app_settings() -> dict[str, Any]:
+    """Settings of a module's app; a module that needs others has a fixture of this name."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def client(
+    start_app: StartApp, app_settings: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
     """Yield one app for the tests of a module, which do not disturb each other."""
-    with start_app(tmp_path_factory.mktemp("data")) as started:
+    with start_app(tmp_path_factory.mktemp("data"), **app_settings) as started:
         yield started
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """Yield an app with the shipped model and a ready worker."""
+    deadlines = {"lpo_deadline_s": 60.0, "lpo_stall_s": 60.0, "request_deadline_s": 90.0}
+    with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), workers=1, **deadlines) as started:
+        wait_for(lambda: started.get("/readyz").status_code == 200, 120.0)
+        yield started
+
+
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    """Return the id of the example flat in the app with the shipped model."""
+    return upload(shipped, HOME)
 
 
 @contextmanager
