@@ -9,7 +9,7 @@ import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from itertools import cycle
 from pathlib import Path
@@ -51,6 +51,7 @@ _REPLICAS = 2 if _DATABASE == "replicas" else 1
 
 # From an app's data folder to the address of its database.
 DatabaseOf = Callable[[Path], str]
+OpenStore = Callable[[], Store]
 StartApp = Callable[..., AbstractContextManager[httpx.Client]]
 
 
@@ -186,6 +187,36 @@ def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
 def home(shipped: httpx.Client) -> str:
     """Return the id of the example flat in the app with the shipped model."""
     return upload(shipped, HOME)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Return the URL of an empty database of either kind."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}"
+    return request.getfixturevalue("postgres").new_database()
+
+
+@pytest.fixture
+def configured_url(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the URL of an empty database of either kind, which the settings in the environment name."""
+    monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("LALALOC_DATABASE_URL", url)
+    return url
+
+
+@pytest.fixture
+def open_store(url: str) -> Iterator[OpenStore]:
+    """Return a function that opens a database of either kind again, as another process does."""
+    with ExitStack() as stack:
+        yield lambda: stack.enter_context(closing(Store(url, wait_s=60.0)))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """Yield an empty store on SQLite."""
+    with closing(Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")) as opened:
+        yield opened
 
 
 @contextmanager

@@ -47,7 +47,7 @@ from service.storage.plan_lookup import PlanLookup
 from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, DatabaseOf, OpenStore, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -89,30 +89,6 @@ def encoders(bundle: Bundle) -> CountingEncoders:
     return CountingEncoders(bundle)
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def open_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[[], Store]]:
-    """Return a function that opens one database of either kind again, as a replica does."""
-    url = f"sqlite:///{tmp_path / 'test.sqlite3'}"
-    if request.param == "postgresql":
-        url = request.getfixturevalue("postgres").new_database()
-    opened: list[Store] = []
-
-    def open_another() -> Store:
-        opened.append(Store(url))
-        return opened[-1]
-
-    yield open_another
-    for store in opened:
-        store.close()
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")
-    yield opened
-    opened.close()
-
-
 def _permits() -> FairSemaphore:
     return FairSemaphore(2, CpuAccounts())
 
@@ -135,7 +111,6 @@ def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvide
 
 
 MakeGrids = Callable[..., GridProvider]
-OpenStore = Callable[[], Store]
 
 
 def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: PhotographEncoder) -> None:

@@ -253,13 +253,6 @@ def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypa
         assert answer.json()["grid"]["poses"] == 110
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")
-    yield opened
-    opened.close()
-
-
 def _idempotent(store: Store) -> IdempotentRequest:
     scope = {"type": "http", "method": "POST", "path": "/x", "headers": [(b"idempotency-key", b"a")], "state": {}}
     return IdempotentRequest(store.idempotency_keys, Request(scope), "default")

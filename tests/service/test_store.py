@@ -10,7 +10,7 @@ import sqlite3
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -66,33 +66,10 @@ from service.storage.tables import (
     REVISIONS,
     TENANTS,
 )
-from tests.service.conftest import FLAT, original_of
+from tests.service.conftest import FLAT, OpenStore, original_of
 from tests.service.postgres import PostgresServer
 
-OpenStore = Callable[[], Store]
 PLAN = FloorPlan.from_dict(FLAT)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Return the URL of an empty database of either kind."""
-    if request.param == "sqlite":
-        return _url(tmp_path)
-    return request.getfixturevalue("postgres").new_database()
-
-
-@pytest.fixture
-def open_store(url: str) -> Iterator[OpenStore]:
-    """Return a function that opens the database again, as another process does."""
-    opened: list[Store] = []
-
-    def open_another() -> Store:
-        opened.append(Store(url, wait_s=60.0))
-        return opened[-1]
-
-    yield open_another
-    for store in opened:
-        store.close()
 
 
 @pytest.fixture
