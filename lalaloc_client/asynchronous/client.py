@@ -17,13 +17,7 @@ from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Rea
 from lalaloc_client.asynchronous.albums import AsyncAlbums
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.tracker import AsyncTracker
-from lalaloc_client.errors import (
-    ConnectionFailedError,
-    FloorPlanFailedError,
-    MalformedAnswerError,
-    NotFoundError,
-    NotReadyError,
-)
+from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
 from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
@@ -471,14 +465,9 @@ class AsyncClient(AsyncAlbums):
             request = await run_blocking(
                 query_request, "/localise/batch", panoramas, values, options, accept=NDJSON, streamed=True
             )
-            async with aclosing(await self._send(request)) as response:
-                try:
-                    async for line in response.aiter_lines():
-                        yield parse(BatchAnswer, line, "line")
-                except httpx.TransportError as error:
-                    raise ConnectionFailedError(
-                        f"POST /localise/batch broke off: {type(error).__name__} {error}".rstrip()
-                    ) from error
+            async with aclosing(self._lines(BatchAnswer, request)) as lines:
+                async for line in lines:
+                    yield line
 
     async def localise_sequence(
         self,

@@ -18,13 +18,7 @@ from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Rea
 from lalaloc_client.blocking.albums import Albums
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.tracker import Tracker
-from lalaloc_client.errors import (
-    ConnectionFailedError,
-    FloorPlanFailedError,
-    MalformedAnswerError,
-    NotFoundError,
-    NotReadyError,
-)
+from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
 from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
@@ -465,14 +459,8 @@ class Client(Albums):
             request = run_blocking(
                 query_request, "/localise/batch", panoramas, values, options, accept=NDJSON, streamed=True
             )
-            with closing(self._send(request)) as response:
-                try:
-                    for line in response.iter_lines():
-                        yield parse(BatchAnswer, line, "line")
-                except httpx.TransportError as error:
-                    raise ConnectionFailedError(
-                        f"POST /localise/batch broke off: {type(error).__name__} {error}".rstrip()
-                    ) from error
+            with closing(self._lines(BatchAnswer, request)) as lines:
+                yield from lines
 
     def localise_sequence(
         self,
