@@ -181,6 +181,7 @@ async def read_parts(
     charset = options.get(b"charset", _UTF_8)
     if charset.lower() != _UTF_8:
         raise errors.UnsupportedMediaError(stated, (f"{MULTIPART}; charset=utf-8",))
+    expected = _Expected.of(files, fields, repeated, substitutes)
     # One more than allowed, so that the error states the limit.
     max_files = max(_MAX_PARTS, *(repeats.most + 1 for repeats in repeated.values())) if repeated else _MAX_PARTS
     chunks = _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES)
@@ -197,18 +198,8 @@ async def read_parts(
             async with _in_time(limits):
                 form = await parser.parse()
     except MultiPartException as error:
-        if repeated and error.message.startswith(_TOO_MANY_FILES):
-            faults = [
-                (name, repeats.fault(f"more than {repeats.most}"))
-                for name, repeats in repeated.items()
-                if repeats.most > 1
-            ]
-            raise errors.InvalidRequestError(faults) from error
-        if error.message.startswith(_TOO_LARGE_PART):
-            name = parser.part_name[:50]
-            is_file = aliases.get(name, name) in {*files, *repeated, *substitutes}
-            raise errors.InvalidRequestError([(name, _NO_FILE if is_file else _LARGE_FIELD)]) from error
-        raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
+        name = parser.part_name[:50]
+        raise expected.refusal(error.message, name, is_file=aliases.get(name, name) in expected.files) from error
     except FormParserError as error:
         raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
     uploaded = {id(value): _kept(request, value) for _, value in form.multi_items() if isinstance(value, UploadFile)}
@@ -216,7 +207,7 @@ async def read_parts(
         (aliases.get(name, name), value if isinstance(value, str) else uploaded[id(value)])
         for name, value in form.multi_items()
     ]
-    return _sort(items, limits, files, fields, check, repeated, substitutes)
+    return expected.sort(items, limits, check)
 
 
 class _NamingParser(MultiPartParser):
@@ -270,54 +261,91 @@ def faults_of(
     return []
 
 
-def _sort(
-    items: list[tuple[str, UploadedFile | str]],
-    limits: UploadLimits,
-    files: set[str],
-    fields: set[str],
-    check: Check,
-    repeated: Mapping[str, Repeats],
-    substitutes: Mapping[str, str],
-) -> Parts:
-    faults: list[tuple[str, str]] = []
-    found = Parts({}, {})
-    repeated = {**{other: repeated[name] for other, name in substitutes.items() if name in repeated}, **repeated}
-    needed, given = files | (repeated.keys() - substitutes.keys()), {name for name, _ in items}
-    files, counts = needed | substitutes.keys(), Counter[str]()
-    for part, value in items:
-        label, name = part[:50], part
-        if part not in files | fields:
-            known = ", ".join(sorted(files | fields))
-            faults.append((label, f"unknown part; known: {known}"))
-            continue
-        if part in repeated:
+@dataclass(frozen=True)
+class _Expected:
+    """Parts that a route expects.
+
+    Attributes:
+        needed: names of required files.
+        files: names of all files, those that can be sent instead of others included.
+        fields: names of optional fields.
+        repeated: files that can be repeated.
+        substitutes: other kinds of files, and the names of the files that they can be sent instead of.
+    """
+
+    needed: set[str]
+    files: set[str]
+    fields: set[str]
+    repeated: Mapping[str, Repeats]
+    substitutes: Mapping[str, str]
+
+    @classmethod
+    def of(
+        cls, files: set[str], fields: set[str], repeated: Mapping[str, Repeats], substitutes: Mapping[str, str]
+    ) -> Self:
+        """Return the expected parts for the arguments of `read_parts`; a substitute is repeated like its file."""
+        needed = files | (repeated.keys() - substitutes.keys())
+        also = {other: repeated[name] for other, name in substitutes.items() if name in repeated}
+        return cls(needed, needed | substitutes.keys(), fields, {**also, **repeated}, substitutes)
+
+    def refusal(self, message: str, name: str, *, is_file: bool) -> errors.ServiceError:
+        """Return the error for a message of the parser about the part of this name."""
+        if self.repeated and message.startswith(_TOO_MANY_FILES):
+            several = [(name, repeats) for name, repeats in self.repeated.items() if repeats.most > 1]
+            faults = [(name, repeats.fault(f"more than {repeats.most}")) for name, repeats in several]
+            return errors.InvalidRequestError([fault for fault in faults if fault[0] not in self.substitutes])
+        if message.startswith(_TOO_LARGE_PART):
+            return errors.InvalidRequestError([(name, _NO_FILE if is_file else _LARGE_FIELD)])
+        return errors.MalformedRequestError(f"not valid {MULTIPART}: {message}")
+
+    def sort(self, items: list[tuple[str, UploadedFile | str]], limits: UploadLimits, check: Check) -> Parts:
+        """Return the parts by kind.
+
+        Raises:
+            UploadTooLargeError: a file is too large.
+            InvalidRequestError: a part is missing, unknown, duplicate or of the wrong kind, or `check` found a fault.
+        """
+        found, counts = Parts({}, {}), Counter[str]()
+        added = [(part[:50], self._add(part, value, limits, found, counts)) for part, value in items]
+        faults = [(label, fault) for label, fault in added if fault]
+        given = {name for name, _ in items}
+        substituted = {name for other, name in self.substitutes.items() if other in given}
+        faults.extend((name, "is missing") for name in sorted(self.needed - given - substituted))
+        for name in sorted(set(self.substitutes.values())):
+            kinds = [kind for kind in (name, *self.substitutes) if self.substitutes.get(kind, name) == name]
+            kinds = [kind for kind in kinds if kind in given]
+            faults.extend((kind, f"is given beside {kinds[0]}; send one of the two") for kind in kinds[1:])
+        for name, repeats in self.repeated.items():
+            if name in given and not repeats.least <= counts[name] <= repeats.most:
+                faults.append((name, repeats.fault(str(counts[name]))))
+        faults.extend(check(found.fields))
+        if faults:
+            raise errors.InvalidRequestError(faults)
+        return found
+
+    def _add(
+        self, part: str, value: UploadedFile | str, limits: UploadLimits, found: Parts, counts: Counter[str]
+    ) -> str:
+        """Add a part to those of its kind; return what is wrong with it, if anything."""
+        if part not in self.files | self.fields:
+            return f"unknown part; known: {', '.join(sorted(self.files | self.fields))}"
+        name = part
+        if part in self.repeated:
             name = f"{part}[{counts[part]}]"
             counts[part] += 1
         if name in found.fields or name in found.files:
-            faults.append((label, "given more than once"))
-        elif part in fields:
+            return "given more than once"
+        if part in self.fields:
             if isinstance(value, UploadedFile):
-                faults.append((label, "must be a plain field, not a file"))
-            else:
-                found.fields[name] = value
+                return "must be a plain field, not a file"
+            found.fields[name] = value
         elif isinstance(value, UploadedFile):
             if len(value) > limits.max_bytes:
                 raise errors.UploadTooLargeError(limits.name, limits.max_bytes, len(value))
             found.files[name] = value
         else:
-            faults.append((label, _NO_FILE))
-    substituted = {name for other, name in substitutes.items() if other in given}
-    faults.extend((name, "is missing") for name in sorted(needed - given - substituted))
-    for name in sorted(set(substitutes.values())):
-        kinds = [kind for kind in (name, *substitutes) if kind in given and substitutes.get(kind, name) == name]
-        faults.extend((kind, f"is given beside {kinds[0]}; send one of the two") for kind in kinds[1:])
-    for name, repeats in repeated.items():
-        if name in given and not repeats.least <= counts[name] <= repeats.most:
-            faults.append((name, repeats.fault(str(counts[name]))))
-    faults.extend(check(found.fields))
-    if faults:
-        raise errors.InvalidRequestError(faults)
-    return found
+            return _NO_FILE
+        return ""
 
 
 def _kept(request: Request, upload: UploadFile) -> UploadedFile:
