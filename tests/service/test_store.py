@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import Connection, delete, event, func, select, update
+from sqlalchemy import delete, event, func, select, update
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
@@ -51,12 +51,10 @@ from service.storage.records import (
     NewPlan,
     Original,
     StoredAnswer,
-    VenueMember,
 )
 from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
 from service.storage.tables import (
-    FLOORPLANS,
     GRID_CHUNKS,
     GRID_LEASES,
     IDEMPOTENCY,
@@ -122,17 +120,6 @@ def _rows(store: Store, table: object) -> int:
 def _filled_tables(store: Store) -> list[str]:
     """Return the tables with rows, except the counters of tenants."""
     return [table.name for table in METADATA.sorted_tables if table is not TENANTS and _rows(store, table)]
-
-
-def _fill(store: Store, tenant: str, *, plan_id: str = "a" * 32) -> None:
-    """Store something of every kind."""
-    revision_id = _add(store, plan_id, tenant=tenant)
-    _put(store, _key(revision_id))
-    store.venues.add(tenant, plan_id, "venue", None, [VenueMember(plan_id)], limit=9)
-    store.answers.add(tenant, plan_id, lambda answer_id: answer_id * 20, limit=9)
-    claim = store.idempotency_keys.begin(tenant, "POST /x", "", "body")
-    assert isinstance(claim, Claimed)
-    store.idempotency_keys.finish(tenant, "POST /x", "", claim.token, StoredAnswer(200, {}, b"{}"))
 
 
 # Plans and originals
@@ -767,137 +754,6 @@ CREATE TABLE {grids} (
     FOREIGN KEY(plan_id) REFERENCES floorplans (id) ON DELETE CASCADE
 );
 """
-
-
-# Columns that the migration for venues adds.
-_OF_FILES = (("revisions", "original_media_type"), ("revisions", "report"))
-_OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
-_OF_BYTES = tuple((name, "stored_bytes") for name in ("revisions", "latent_grids", "kept_answers", "idempotency"))
-_OF_KEYS = ("expires_at", "lifetime_s", "replaces")
-_OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude"))
-
-
-def _undo_tenants(connection: Connection) -> None:
-    """Undo the migrations 0007 to 0013."""
-    connection.exec_driver_sql("DROP TABLE audit_log")
-    if connection.dialect.name == "postgresql":
-        connection.exec_driver_sql("DROP FUNCTION audit_log_refuse_update")
-    connection.exec_driver_sql("DROP INDEX api_keys_by_age")
-    for column in _OF_KEYS:
-        connection.exec_driver_sql(f"ALTER TABLE api_keys DROP COLUMN {column}")
-    connection.exec_driver_sql("DROP INDEX floorplans_by_change")
-    connection.exec_driver_sql("ALTER TABLE floorplans DROP COLUMN changed")
-    connection.exec_driver_sql("DROP TABLE album_photographs")
-    connection.exec_driver_sql("DROP TABLE albums")
-    connection.exec_driver_sql("DROP TABLE sessions")
-    connection.exec_driver_sql("DROP INDEX idempotency_by_tenant_and_age")
-    connection.exec_driver_sql("DROP TABLE tenants")
-    for table, column in _OF_BYTES:
-        connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-
-
-def test_migration_counts_stored_bytes(store: Store, url: str) -> None:
-    _fill(store, "one")
-    _fill(store, "two", plan_id="b" * 32)
-    counted = store.quota.accounts()
-    with store._database.writing() as connection:
-        _undo_tenants(connection)
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0006'")
-    store.close()
-    moved = Store(url)
-    assert moved.quota.accounts() == counted
-    # That version had no sessions and no albums.
-    later = {"sessions", "albums"}
-    assert all(used for account in counted.values() for kind, used in vars(account.used).items() if kind not in later)
-    for tenant in ("one", "two"):
-        for plan in moved.plans.list_plans(tenant, limit=10):
-            moved.plans.delete(tenant, plan.id)
-    assert {account.used.plans + account.used.grids for account in moved.quota.accounts().values()} == {0}
-    moved.close()
-
-
-def test_migration_fills_in_places(store: Store, url: str) -> None:
-    anchored = FloorPlan.from_dict({**FLAT, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0})
-    for plan_id, plan in (("p", PLAN), ("q", anchored), ("r", PLAN)):
-        store.plans.add("default", plan_id, NewPlan(plan, Original(b"{}")), limit=100)
-    columns = select(*(getattr(FLOORPLANS.c, name) for _, name in _OF_PLACES)).order_by(FLOORPLANS.c.id)
-    with store._database.writing() as connection:
-        written = connection.execute(columns).all()
-        _undo_tenants(connection)
-        connection.exec_driver_sql("DROP INDEX floorplans_by_place")
-        for table, column in _OF_PLACES:
-            connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        connection.exec_driver_sql("UPDATE revisions SET document = 'damaged' WHERE plan_id = 'r'")
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0005'")
-    store.close()
-    moved = Store(url)
-    with moved._database.reading() as connection:
-        filled = connection.execute(columns).all()
-    assert tuple(filled[0])[:3] == pytest.approx((4.5, 3.0, 0.5 * math.hypot(9.0, 6.0)))
-    assert tuple(filled[0])[3:] == (None, None)
-    assert tuple(filled[1]) == pytest.approx(tuple(written[1]), abs=1e-12)
-    assert tuple(filled[2]) == (None,) * 5
-    moved.close()
-
-
-def test_migration_drops_grids_without_digest(store: Store, url: str) -> None:
-    revision_id = _add(store, "p")
-    _put(store, _key(revision_id))
-    store.idempotency_keys.begin("t", "r", "k", "body")
-    with store._database.writing() as connection:
-        _undo_tenants(connection)
-        connection.exec_driver_sql("DROP INDEX floorplans_by_place")
-        for table, column in (
-            ("latent_grids", "sha256"),
-            ("revisions", "document_sha256"),
-            ("revisions", "warnings"),
-            ("grid_leases", "length_s"),
-            ("grid_leases", "attempts"),
-            ("idempotency", "lease_s"),
-            *_OF_VENUES,
-            *_OF_FILES,
-            *_OF_PLACES,
-        ):
-            connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues", "kept_answers"):
-            connection.exec_driver_sql(f"DROP TABLE {table}")
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
-    store.close()
-    moved = Store(url)
-    assert _rows(moved, LATENT_GRIDS) == _rows(moved, GRID_CHUNKS) == 0
-    assert [summary.id for summary in moved.grids.missing("m1", 0.5, 10)] == ["p"]
-    record = moved.plans.get("default", "p")
-    assert record is not None
-    assert record.plan.to_dict() == PLAN.to_dict()
-    assert isinstance(moved.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
-    with moved._database.reading() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, METADATA) == []
-    moved.close()
-
-
-def test_migration_adds_venues(store: Store, url: str) -> None:
-    revision_id = _add(store, "p")
-    _put(store, _key(revision_id))
-    with store._database.writing() as connection:
-        _undo_tenants(connection)
-        connection.exec_driver_sql("DROP INDEX floorplans_by_place")
-        for table, column in (*_OF_VENUES, *_OF_FILES, *_OF_PLACES):
-            connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues", "kept_answers"):
-            connection.exec_driver_sql(f"DROP TABLE {table}")
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0002'")
-    store.close()
-    moved = Store(url)
-    assert moved.grids.get(_key(revision_id)) is not None
-    moved.venues.add("default", "v", "venue", None, [VenueMember("p", 1.0)], limit=1)
-    [found] = moved.venues.searchable_plans("v", "m1", 0.5)
-    assert (found.plan_id, found.camera_height_std_m) == ("p", None)
-    assert moved.grids.prototypes([found.grid_id]) == {}
-    with moved._database.reading() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, METADATA) == []
-    moved.close()
 
 
 @pytest.mark.parametrize("grids", ["latent_grids", "latent_grids_2"])
