@@ -97,6 +97,14 @@ def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord
     return store.plans.add("default", plan_id, NewPlan(plan, Original(b"{}")), limit=20)
 
 
+def _begun(encoders: CountingEncoders, grids: GridProvider, record: PlanRecord) -> Future[PoseGrid]:
+    """Begin to compute a grid, which waits for `encoders.go_on` within its first chunk."""
+    encoders.go_on.clear()
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    return future
+
+
 @pytest.fixture
 def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvider]]:
     made: list[GridProvider] = []
@@ -336,9 +344,7 @@ def test_overtaken_replica_gives_way(open_store: OpenStore, make_grids: MakeGrid
     store = open_store()
     grids, record = make_grids(store, grid_lease_s=0.2), _add(store, HALL)
     key = grids.key(record.revision_id, 1.5)
-    encoders.go_on.clear()
-    future = grids.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, grids, record)
     time.sleep(0.3)
     assert store.leases.claim(key, "another replica", 60.0)
     encoders.go_on.set()
@@ -355,9 +361,7 @@ def test_remote_deletion_cancels_the_grid(
 ) -> None:
     store = open_store()
     grids, record = make_grids(store, grid_lease_s=0.1), _add(store, HALL)
-    encoders.go_on.clear()
-    future = grids.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, grids, record)
     assert open_store().plans.delete("default", "p")
     encoders.go_on.set()
     wait_for(lambda: _looked(grids) or future.done())
@@ -371,9 +375,7 @@ def test_work_of_stopped_replica_is_taken_over(
 ) -> None:
     first, second = open_store(), open_store()
     stopping, record = make_grids(first), _add(first, HALL)
-    encoders.go_on.clear()
-    future = stopping.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, stopping, record)
     closing = threading.Thread(target=stopping.close)
     closing.start()
     wait_for(stopping._jobs.closing.is_set)
@@ -463,9 +465,7 @@ def test_remote_job_of_replaced_revision_ends(open_store: OpenStore, make_grids:
 def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_step_m=0.4)
     large, small = _add(store, HALL, "large"), _add(store, PLAN, "small")
-    encoders.go_on.clear()
-    slow = grids.compute(large, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    slow = _begun(encoders, grids, large)
     quick = grids.compute(small, 1.5)
     encoders.go_on.set()
     quick.result(30.0)
@@ -477,9 +477,7 @@ def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, e
 def test_overtaken_grid_keeps_its_lease(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_lease_s=2.0)
     large, small = _add(store, LARGE_HALL, "large"), _add(store, HALL, "small")
-    encoders.go_on.clear()
-    slow = grids.compute(large, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    slow = _begun(encoders, grids, large)
     quick = grids.compute(small, 1.5)
     # Six chunks, which take longer than the lease.
     encoders.pause_s = 0.5
@@ -507,9 +505,7 @@ def test_grid_of_replaced_revision_is_cancelled(
     store: Store, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     grids, record = make_grids(store), _add(store, HALL)
-    encoders.go_on.clear()
-    future = grids.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, grids, record)
     new = store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
     grids.forget({record.revision_id})
     encoders.go_on.set()

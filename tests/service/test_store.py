@@ -484,6 +484,17 @@ def test_grid_of_deleted_plan_is_not_stored(store: Store) -> None:
     ids=["cut off", "too long", "another format", "more poses", "empty", "no number", "infinite"],
 )
 def test_damaged_grid_counts_as_missing(store: Store, damage: Callable[[bytes], bytes]) -> None:
+    # Size and digest agree, so that only the content is wrong.
+    _assert_unread(store, damage, fits=True)
+
+
+def test_grid_with_wrong_digest_is_not_read(store: Store) -> None:
+    # Two poses are swapped: a valid grid, but not the one that was computed.
+    _assert_unread(store, lambda content: content[:16] + content[32:48] + content[16:32] + content[48:], fits=False)
+
+
+def _assert_unread(store: Store, damage: Callable[[bytes], bytes], *, fits: bool) -> None:
+    """Check that a damaged grid counts as missing and can be stored anew; `fits`: with its size and digest."""
     key = _key(_add(store))
     _put(store, key)
     with store._database.writing() as connection:
@@ -491,23 +502,9 @@ def test_damaged_grid_counts_as_missing(store: Store, damage: Callable[[bytes], 
         assert content is not None
         damaged = damage(bytes(content))
         connection.execute(update(GRID_CHUNKS).values(content=damaged))
-        # Size and digest agree, so that only the content is wrong.
-        digest = hashlib.sha256(damaged).hexdigest()
-        connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged), sha256=digest))
-    assert store.grids.get(key) is None
-    assert _put(store, key)
-    assert store.grids.get(key) is not None
-
-
-def test_grid_with_wrong_digest_is_not_read(store: Store) -> None:
-    key = _key(_add(store))
-    _put(store, key)
-    with store._database.writing() as connection:
-        content = connection.scalar(select(GRID_CHUNKS.c.content))
-        assert content is not None
-        # Two poses are swapped: a valid grid, but not the one that was computed.
-        swapped = content[:16] + content[32:48] + content[16:32] + content[48:]
-        connection.execute(update(GRID_CHUNKS).values(content=swapped))
+        if fits:
+            digest = hashlib.sha256(damaged).hexdigest()
+            connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged), sha256=digest))
     assert store.grids.get(key) is None
     assert _put(store, key)
     assert store.grids.get(key) is not None
