@@ -29,7 +29,7 @@ from service.errors import (
     UploadTimeoutError,
 )
 from service.http.idempotent_request import IdempotentRequest, parts_sha256
-from service.http.uploads import Parts
+from service.http.multipart import Parts
 from service.pools.job_queue import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Claimed, NewPlan, Original
