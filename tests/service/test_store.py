@@ -3,12 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-import math
-import sqlite3
-import struct
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,11 +13,8 @@ from unittest.mock import ANY
 
 import numpy as np
 import pytest
-from alembic.autogenerate import compare_metadata
-from alembic.migration import MigrationContext
 from sqlalchemy import delete, event, func, select, update
 
-from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.render.sampling import PoseSet
@@ -31,13 +22,10 @@ from service.errors import (
     DamagedDataError,
     RevisionMismatchError,
     ServiceError,
-    StoreBusyError,
-    StoreUnavailableError,
     TooManyFloorPlansError,
     UnknownFloorPlanError,
 )
 from service.storage import database
-from service.storage.grid_format import pack
 from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
 from service.storage.originals import OriginalFile
 from service.storage.plans import PlanDocument
@@ -54,18 +42,8 @@ from service.storage.records import (
 )
 from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
-from service.storage.tables import (
-    GRID_CHUNKS,
-    GRID_LEASES,
-    IDEMPOTENCY,
-    LATENT_GRIDS,
-    METADATA,
-    ORIGINAL_CHUNKS,
-    REVISIONS,
-    TENANTS,
-)
+from service.storage.tables import IDEMPOTENCY, METADATA, ORIGINAL_CHUNKS, REVISIONS, TENANTS
 from tests.service.conftest import FLAT, OpenStore, original_of
-from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
 
@@ -408,217 +386,6 @@ def test_revisions_and_grids_are_limited(store: Store) -> None:
     assert _rows(store, ORIGINAL_CHUNKS) == 3
 
 
-# Grids
-
-
-def test_grid_round_trip_is_exact_and_copies_nothing(store: Store) -> None:
-    grid = _grid(count=5000)
-    key = _key(_add(store))
-    assert _put(store, key, grid)
-    assert _rows(store, GRID_CHUNKS) > 1
-    found = store.grids.get(key)
-    _assert_same(found, grid)
-    assert found is not None
-    assert found.latents is not None
-    assert not found.latents.flags.owndata
-    assert not found.latents.flags.writeable
-
-
-def test_grid_without_latents_has_half_precision(store: Store) -> None:
-    whole, key = _grid(count=50), _key(_add(store))
-    grid = dataclasses.replace(whole, latents=None, profile_m=whole.profile_m.astype(np.float16))
-    assert _put(store, key, grid)
-    found = store.grids.get(key)
-    assert found is not None
-    assert found.latents is None
-    assert found.profile_m.dtype == np.float16
-    np.testing.assert_array_equal(found.profile_m, grid.profile_m)
-    np.testing.assert_array_equal(found.poses.room_index, grid.poses.room_index)
-    assert len(pack(grid).content) < 0.3 * len(pack(whole).content)
-
-
-@pytest.mark.parametrize("changed", [{"model_sha256": "m2"}, {"step_m": 0.25}, {"camera_height_mm": 1520}])
-def test_grid_is_found_by_its_key_only(store: Store, changed: dict[str, object]) -> None:
-    revision_id = _add(store)
-    _put(store, _key(revision_id))
-    assert store.grids.get(_key(revision_id, **changed)) is None
-
-
-def test_grids_of_the_previous_model_are_kept(store: Store) -> None:
-    revision_id = _add(store)
-    for model in ("m1", "m2", "m3"):
-        _put(store, _key(revision_id, model_sha256=model))
-    kept = [store.grids.get(_key(revision_id, model_sha256=model)) is not None for model in ("m1", "m2", "m3")]
-    assert kept == [False, True, True]
-
-
-def test_own_grid_is_never_dropped(store: Store) -> None:
-    revision_id = _add(store)
-    _put(store, _key(revision_id))
-    for height_mm in (1600, 1620, 1640, 1660):
-        _put(store, _key(revision_id, camera_height_mm=height_mm), keep=3)
-    heights = {height_mm for _, height_mm in store.grids.poses("m1", 0.5)}
-    assert heights == {1500, 1640, 1660}
-
-
-def test_grid_of_deleted_plan_is_not_stored(store: Store) -> None:
-    revision_id = _add(store, "p")
-    store.plans.delete("default", "p")
-    assert not _put(store, _key(revision_id))
-    assert _rows(store, LATENT_GRIDS) == 0
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda content: content[:-1],
-        lambda content: content + b"x",
-        lambda content: b"NOPE" + content[4:],
-        lambda content: content[:4] + b"\x08" + content[5:],
-        lambda content: b"",
-        # First coordinate of the first pose.
-        lambda content: content[:16] + struct.pack("<d", math.nan) + content[24:],
-        # Last value of the last profile, before the room indices.
-        lambda content: content[: -7 * 4 - 4] + struct.pack("<f", math.inf) + content[-7 * 4 :],
-    ],
-    ids=["cut off", "too long", "another format", "more poses", "empty", "no number", "infinite"],
-)
-def test_damaged_grid_counts_as_missing(store: Store, damage: Callable[[bytes], bytes]) -> None:
-    # Size and digest agree, so that only the content is wrong.
-    _assert_unread(store, damage, fits=True)
-
-
-def test_grid_with_wrong_digest_is_not_read(store: Store) -> None:
-    # Two poses are swapped: a valid grid, but not the one that was computed.
-    _assert_unread(store, lambda content: content[:16] + content[32:48] + content[16:32] + content[48:], fits=False)
-
-
-def _assert_unread(store: Store, damage: Callable[[bytes], bytes], *, fits: bool) -> None:
-    """Check that a damaged grid counts as missing and can be stored anew; `fits`: with its size and digest."""
-    key = _key(_add(store))
-    _put(store, key)
-    with store._database.writing() as connection:
-        content = connection.scalar(select(GRID_CHUNKS.c.content))
-        assert content is not None
-        damaged = damage(bytes(content))
-        connection.execute(update(GRID_CHUNKS).values(content=damaged))
-        if fits:
-            digest = hashlib.sha256(damaged).hexdigest()
-            connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged), sha256=digest))
-    assert store.grids.get(key) is None
-    assert _put(store, key)
-    assert store.grids.get(key) is not None
-
-
-def test_grid_without_digest_counts_as_missing(store: Store) -> None:
-    key = _key(_add(store))
-    _put(store, key)
-    with store._database.writing() as connection:
-        connection.execute(update(LATENT_GRIDS).values(sha256=None))
-    assert store.grids.get(key) is None
-    assert store.grids.poses("m1", 0.5) == {}
-    assert [summary.revision_id for summary in store.grids.missing("m1", 0.5, 10)] == [key.revision_id]
-    assert store.grids.count_unprepared("m1", 0.5) == 1
-    assert _put(store, key)
-    assert store.grids.get(key) is not None
-
-
-# Leases
-
-
-def test_lease_of_a_fast_clock_is_expired(store: Store) -> None:
-    key = _key(_add(store))
-    store.leases.claim(key, "ahead", 60.0)
-    two_days_s = 2 * 24 * 3600.0
-    with store._database.writing() as connection:
-        connection.execute(update(GRID_LEASES).values(lease_until_s=GRID_LEASES.c.lease_until_s + two_days_s))
-    assert store.leases.progress("m1", 0.5, [key.revision_id]) == {}
-    assert [summary.revision_id for summary in store.grids.missing("m1", 0.5, 10)] == [key.revision_id]
-    assert store.leases.claim(key, "me", 60.0) == 2
-    assert store.leases.claim(key, "other", 60.0) is None
-
-
-def test_lease_without_length_holds_until_its_end(store: Store) -> None:
-    key = _key(_add(store))
-    store.leases.claim(key, "earlier", 60.0)
-    with store._database.writing() as connection:
-        connection.execute(update(GRID_LEASES).values(length_s=None))
-    assert store.leases.claim(key, "me", 60.0) is None
-
-
-def test_lease_counts_attempts_until_released(store: Store) -> None:
-    key, counts = _key(_add(store)), []
-    for owner in ("one", "two", "one"):
-        counts.append(store.leases.claim(key, owner, 0.001))
-        time.sleep(0.01)
-    assert counts == [1, 2, 3]
-    store.leases.release(key, "one")
-    assert store.leases.claim(key, "two", 60.0) == 1
-
-
-def test_lease_is_exclusive_until_it_expires(open_store: OpenStore) -> None:
-    first, second = open_store(), open_store()
-    key = _key(_add(first))
-    assert first.leases.claim(key, "one", 0.5)
-    assert not second.leases.claim(key, "two", 0.5)
-    assert first.leases.renew(key, "one", 0.5, 0.25)
-    assert second.leases.progress("m1", 0.5, [key.revision_id]) == {(key.revision_id, 1500): 0.25}
-    time.sleep(0.6)
-    assert second.leases.progress("m1", 0.5, [key.revision_id]) == {}
-    assert second.leases.claim(key, "two", 60.0)
-    assert not first.leases.renew(key, "one", 0.5, 0.5)
-    first.leases.release(key, "one")
-    assert not first.leases.claim(key, "one", 60.0)
-
-
-def test_concurrent_claims_give_one_lease(open_store: OpenStore) -> None:
-    stores = [open_store(), open_store()]
-    key = _key(_add(stores[0]))
-    start = threading.Barrier(8)
-
-    def claim(number: int) -> bool:
-        start.wait(10.0)
-        return stores[number % 2].leases.claim(key, f"owner {number}", 60.0) is not None
-
-    with ThreadPoolExecutor(8) as threads:
-        assert sum(threads.map(claim, range(8))) == 1
-
-
-def test_deleted_plan_has_no_lease(store: Store) -> None:
-    key = _key(_add(store, "p"))
-    assert store.leases.claim(key, "me", 60.0)
-    store.plans.delete("default", "p")
-    assert not store.leases.renew(key, "me", 60.0, 0.5)
-    assert not store.leases.claim(key, "me", 60.0)
-
-
-def test_storing_a_grid_ends_its_lease(store: Store) -> None:
-    key = _key(_add(store))
-    store.leases.claim(key, "me", 60.0)
-    _put(store, key)
-    assert _rows(store, GRID_LEASES) == 0
-
-
-def test_missing_grids_exclude_leased_and_failed(store: Store) -> None:
-    revisions = {name: _add(store, name) for name in ("stored", "leased", "failed", "other height", "missing")}
-    _put(store, _key(revisions["stored"]))
-    store.leases.claim(_key(revisions["leased"]), "someone", 1.0)
-    store.plans.set_failure(revisions["failed"], "too large")
-    _put(store, _key(revisions["other height"], camera_height_mm=1600))
-
-    def missing() -> list[str]:
-        return [summary.id for summary in store.grids.missing("m1", 0.5, 10)]
-
-    assert missing() == ["other height", "missing"]
-    time.sleep(1.1)
-    assert missing() == ["leased", "other height", "missing"]
-    store.plans.clear_failures()
-    assert [summary.id for summary in store.grids.missing("m1", 0.5, 2)] == ["leased", "failed"]
-    assert len(store.grids.missing("m2", 0.5, 10)) == store.grids.count_unprepared("m2", 0.5) == 5
-    store.leases.claim(_key(revisions["missing"]), "someone", 60.0)
-    assert store.grids.count_unprepared("m1", 0.5) == 4
-
-
 # Idempotency and keys
 
 ANSWER = StoredAnswer(201, {"location": "/floorplans/x"}, b'{"id": "x"}')
@@ -707,164 +474,3 @@ def test_claim_of_a_fast_clock_is_expired(store: Store) -> None:
         connection.execute(update(IDEMPOTENCY).values(lease_until_s=IDEMPOTENCY.c.lease_until_s + 48 * 3600.0))
     assert store.idempotency_keys.begin("t", "r", "k", "body") == claim
     assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
-
-
-# The database itself
-
-
-def test_migrations_match_the_tables(store: Store) -> None:
-    with store._database.reading() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, METADATA) == []
-
-
-def test_concurrent_starts_migrate_once(url: str) -> None:
-    with ThreadPoolExecutor(4) as threads:
-        stores = list(threads.map(lambda _: Store(url), range(4)))
-    _add(stores[0])
-    assert all(len(store.plans.list_plans("default", limit=10)) == 1 for store in stores)
-    for store in stores:
-        store.close()
-
-
-def test_newer_database_is_rejected(store: Store, url: str) -> None:
-    with store._database.writing() as connection:
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-    with pytest.raises(ConfigError, match="9999"):
-        Store(url)
-
-
-_FIRST_SCHEMA = """
-CREATE TABLE floorplans (
-    id VARCHAR(32) NOT NULL, created_at DATETIME NOT NULL, name TEXT NOT NULL, document TEXT NOT NULL,
-    room_count INTEGER NOT NULL, area_m2 FLOAT NOT NULL, camera_height_m FLOAT NOT NULL, failure TEXT, PRIMARY KEY (id)
-);
-CREATE INDEX floorplans_by_age ON floorplans (created_at, id);
-CREATE TABLE originals (
-    plan_id VARCHAR(32) NOT NULL, content BLOB NOT NULL, PRIMARY KEY (plan_id),
-    FOREIGN KEY(plan_id) REFERENCES floorplans (id) ON DELETE CASCADE
-);
-CREATE TABLE {grids} (
-    id INTEGER NOT NULL, plan_id VARCHAR(32) NOT NULL, model_sha256 VARCHAR(64) NOT NULL, step_m FLOAT NOT NULL,
-    camera_height_mm INTEGER NOT NULL, poses INTEGER NOT NULL, arrays BLOB NOT NULL, PRIMARY KEY (id),
-    UNIQUE (plan_id, model_sha256, step_m, camera_height_mm),
-    FOREIGN KEY(plan_id) REFERENCES floorplans (id) ON DELETE CASCADE
-);
-"""
-
-
-@pytest.mark.parametrize("grids", ["latent_grids", "latent_grids_2"])
-def test_migration_from_the_first_version(tmp_path: Path, grids: str) -> None:
-    original = b"\x00 as sent \xff" * 200_000
-    with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
-        raw.executescript(_FIRST_SCHEMA.format(grids=grids))
-        for number in (1, 2):
-            plan_id, created_at = f"{number}" * 32, f"2026-01-0{number} 10:00:00.123456"
-            document = FloorPlan.from_dict({**FLAT, "name": f"Flat {number}"}).to_dict()
-            values = (plan_id, created_at, f"Flat {number}", json.dumps(document), 2, 36.0, 1.5, None)
-            raw.execute("INSERT INTO floorplans VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
-            raw.execute("INSERT INTO originals VALUES (?, ?)", (plan_id, original))
-            raw.execute(f"INSERT INTO {grids} VALUES (?, ?, 'm1', 0.5, 1500, 7, x'00')", (number, plan_id))
-    raw.close()
-    store = Store(_url(tmp_path))
-    assert [summary.name for summary in store.plans.list_plans("default", limit=10)] == ["Flat 2", "Flat 1"]
-    record = store.plans.get("default", "1" * 32)
-    assert record is not None
-    assert record.created_at == datetime(2026, 1, 1, 10, 0, 0, 123456, tzinfo=UTC)
-    assert record.plan.to_dict() == FloorPlan.from_dict({**FLAT, "name": "Flat 1"}).to_dict()
-    assert original_of(store, "1" * 32) == original
-    # Grids are computed again.
-    assert [summary.name for summary in store.grids.missing("m1", 0.5, 10)] == ["Flat 1", "Flat 2"]
-    with store._database.reading() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, METADATA) == []
-    store.close()
-    again = Store(_url(tmp_path))
-    assert len(again.plans.list_plans("default", limit=10)) == 2
-    again.close()
-
-
-def test_sqlite_uses_foreign_keys_and_wal(tmp_path: Path) -> None:
-    store = Store(_url(tmp_path))
-    with store._database.reading() as connection:
-        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
-        assert connection.exec_driver_sql("PRAGMA foreign_keys").scalar() == 1
-        # Commits reach the disk before they are acknowledged.
-        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
-    store.close()
-
-
-@pytest.mark.parametrize(
-    "url",
-    [
-        "nonsense",
-        "sqlite:////no/such/folder/x.sqlite3",
-        "nosuchdialect://x",
-        "sqlite://",
-        "mysql://x/y",
-        "postgresql://127.0.0.1:9/x",
-    ],
-)
-def test_unusable_database_is_a_config_error(url: str) -> None:
-    with pytest.raises(ConfigError, match="database"):
-        Store(url)
-
-
-def test_connections_and_waiting_are_limited(url: str) -> None:
-    store = Store(url, connections=2, wait_s=0.2)
-    with store._database.reading(), store._database.reading(), pytest.raises(StoreUnavailableError):
-        store.plans.list_plans("default", limit=1)
-    assert store.plans.list_plans("default", limit=1) == []
-    store.close()
-
-
-def test_database_that_answers_others_is_busy(url: str) -> None:
-    store = Store(url, connections=1, wait_s=0.25)
-
-    def use(_number: int) -> StoreUnavailableError | None:
-        try:
-            with store._database.reading():
-                time.sleep(0.1)
-        except StoreUnavailableError as error:
-            return error
-        return None
-
-    with ThreadPoolExecutor(10) as threads:
-        refused = [error for error in threads.map(use, range(10)) if error is not None]
-    assert refused
-    assert all(isinstance(error, StoreBusyError) for error in refused)
-    with store._database.reading(), pytest.raises(StoreUnavailableError) as caught:
-        store.plans.list_plans("default", limit=1)
-    assert not isinstance(caught.value, StoreBusyError)
-    store.close()
-
-
-def test_postgresql_urls_are_accepted(postgres: PostgresServer) -> None:
-    plain = postgres.new_database()
-    for url in (plain, plain.replace("postgresql:", "postgresql+psycopg:"), plain.replace("postgresql:", "postgres:")):
-        store = Store(url)
-        assert store.plans.list_plans("default", limit=1) == []
-        store.close()
-
-
-def test_store_reconnects_after_an_outage(postgres: PostgresServer) -> None:
-    store = Store(postgres.new_database())
-    _add(store, "p")
-    postgres.stop()
-    try:
-        for _ in range(3):
-            with pytest.raises(StoreUnavailableError):
-                store.plans.get("default", "p")
-    finally:
-        postgres.start()
-    assert store.plans.get("default", "p") is not None
-    store.close()
-
-
-def test_cached_plan_needs_one_query(store: Store) -> None:
-    _add(store, "p")
-    statements: list[str] = []
-    event.listen(store._database._engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))
-    assert store.plans.get("default", "p") is not None
-    assert len([statement for statement in statements if statement.startswith("SELECT floorplans")]) == 1
-    assert not any("document" in statement for statement in statements)
