@@ -22,16 +22,8 @@ from lalaloc_client.albums import (
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.transport import AsyncTransport
 from lalaloc_client.errors import AlbumFailedError, NotReadyError
-from lalaloc_client.requests import (
-    NDJSON,
-    Photograph,
-    Request,
-    ViewOptions,
-    json_request,
-    query_request,
-    resource_path,
-    text_values,
-)
+from lalaloc_client.options import ViewOptions
+from lalaloc_client.requests import NDJSON, Photograph, Request, json_request, query_request, resource_path, text_values
 
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 

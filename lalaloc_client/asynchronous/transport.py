@@ -21,18 +21,9 @@ from lalaloc_client.asynchronous.device import AsyncDevice
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, ImportStep, Venue, VenuePage, VenuePlanPage
 from lalaloc_client.on_device import Film, TurnFeatures, split_options
+from lalaloc_client.options import Options
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import (
-    JSON,
-    NDJSON,
-    Photograph,
-    QueryOptions,
-    Request,
-    ViewOptions,
-    http_options,
-    query_request,
-    text_values,
-)
+from lalaloc_client.requests import JSON, NDJSON, Photograph, Request, http_options, query_request, text_values
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
@@ -109,7 +100,7 @@ class AsyncTransport:
         path: str,
         photographs: Sequence[Photograph],
         values: Mapping[str, object],
-        options: QueryOptions | ViewOptions,
+        options: Options,
         *,
         on_device: bool = False,
     ) -> bytes:
@@ -125,17 +116,19 @@ class AsyncTransport:
         return await self._with_current_model(send)
 
     async def localise_turn(
-        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: ViewOptions
+        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: Options
     ) -> tuple[bytes, TurnFeatures]:
         """Send the features of a turn with its angles; return the answer, and what was sent."""
         camera, others = split_options(options)
+        fields = {**values, **others, "motion": "turn"}
 
         async def send() -> tuple[bytes, TurnFeatures]:
             sent = await self._device.turn(turn, camera)
-            fields = {**values, "motion": "turn", "relative_heading_deg": sent.relative_heading_deg}
+            angles: dict[str, object] = {"relative_heading_deg": sent.relative_heading_deg}
             if sent.relative_heading_deg is not None:
-                fields["relative_heading_std_deg"] = sent.relative_heading_std_deg
-            return await self.query(query_request, "/localise/sequence", sent.features, fields, others), sent
+                angles["relative_heading_std_deg"] = sent.relative_heading_std_deg
+            path = "/localise/sequence"
+            return await self.query(query_request, path, sent.features, {**fields, **angles}), sent
 
         return await self._with_current_model(send)
 

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from typing import Literal, Unpack
+from typing import Unpack
 
 from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
 from lalaloc_client.blocking.backend import run_blocking
 from lalaloc_client.blocking.plans import Plans
 from lalaloc_client.blocking.tracker import Tracker
 from lalaloc_client.on_device import TurnFeatures, filmed
+from lalaloc_client.options import FilmOptions, QueryOptions, SequenceOptions, ViewOptions
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
     NDJSON,
@@ -20,10 +21,7 @@ from lalaloc_client.requests import (
     Photograph,
     Picture,
     PictureFormat,
-    QueryOptions,
     Request,
-    SequenceRefine,
-    ViewOptions,
     film_request,
     geopose_request,
     query_request,
@@ -129,19 +127,8 @@ class Client(Plans):
         panoramas: Sequence[Photograph],
         *,
         venue_id: str | None = None,
-        motion: Literal["walk", "turn"] | None = None,
-        relative_heading_deg: Sequence[float | None] | None = None,
-        relative_heading_std_deg: float | None = None,
-        motions: Sequence[Mapping[str, float] | None] | None = None,
-        headings_deg: Sequence[float | None] | None = None,
-        heading_tolerance_deg: float | None = None,
-        camera_height_m: float | None = None,
-        camera_height_std_m: float | None = None,
-        camera_heights_m: Sequence[float | None] | None = None,
-        refine: SequenceRefine | None = None,
-        top_k: int | None = None,
         on_device: bool = False,
-        **options: Unpack[ViewOptions],
+        **options: Unpack[SequenceOptions],
     ) -> SequenceLocalisation:
         """Localise several photographs of one visit jointly.
 
@@ -149,40 +136,11 @@ class Client(Plans):
             floorplan_id: id of the plan; None with `venue_id`.
             panoramas: photographs in the order in which they were taken, each as for `localise`.
             venue_id: id of a venue, to search all its plans; poses have `floorplan_id` and `level`.
-            motion: `turn` for photographs from one spot, else `walk`, the default.
-            relative_heading_deg: for `turn`, headings relative to each other, clockwise, None where unknown. Default:
-                from what the photographs show twice; turn by at most half the field of view between them.
-            relative_heading_std_deg: their standard deviation. Default: 2.
-            motions: for `walk`, measurements between consecutive photographs, any of {"distance_m": 2.4,
-                "distance_std_m": 0.1, "turn_deg": 35, "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2},
-                or None: the turn of the heading, clockwise, and the direction of the motion relative to the first
-                heading.
-            headings_deg: heading of each photograph, None where unknown.
-            heading_tolerance_deg: maximum error of the headings. Default: 0.
-            camera_height_m: camera height, common to all photographs, as in `QueryOptions`.
-            camera_height_std_m: its standard deviation, as in `QueryOptions`.
-            camera_heights_m: height of each photograph, None for the common one; all share one relative error.
-            refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
-            top_k: number of candidates per photograph. Default: set by the service.
             on_device: as for `localise`; the angles of a turn are computed on this device, too.
-            **options: camera of all photographs, see `ViewOptions`.
+            **options: see `SequenceOptions`.
         """
-        values = {
-            "floorplan_id": floorplan_id,
-            "venue_id": venue_id,
-            "motion": motion,
-            "relative_heading_deg": relative_heading_deg,
-            "relative_heading_std_deg": relative_heading_std_deg,
-            "motions": motions,
-            "headings_deg": headings_deg,
-            "heading_tolerance_deg": heading_tolerance_deg,
-            "camera_height_m": camera_height_m,
-            "camera_height_std_m": camera_height_std_m,
-            "camera_heights_m": camera_heights_m,
-            "refine": refine,
-            "top_k": top_k,
-        }
-        if on_device and motion == "turn" and relative_heading_deg is None:
+        values = {"floorplan_id": floorplan_id, "venue_id": venue_id}
+        if on_device and options.get("motion") == "turn" and options.get("relative_heading_deg") is None:
             content, _ = self.localise_turn(panoramas, values, options)
         else:
             content = self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
@@ -194,12 +152,8 @@ class Client(Plans):
         film: bytes | str | os.PathLike[str],
         *,
         venue_id: str | None = None,
-        camera_height_m: float | None = None,
-        camera_height_std_m: float | None = None,
-        refine: SequenceRefine | None = None,
-        top_k: int | None = None,
         on_device: bool = False,
-        **options: Unpack[ViewOptions],
+        **options: Unpack[FilmOptions],
     ) -> SequenceLocalisation:
         """Localise a film of one slow turn, once around on the spot.
 
@@ -208,23 +162,11 @@ class Client(Plans):
             film: content or path of an MP4, MOV or WebM file. The frames that the service keeps become poses, with
                 `time_s`; `film` of the answer tells how it was read.
             venue_id: id of a venue, to search all its plans.
-            camera_height_m: camera height, as in `QueryOptions`.
-            camera_height_std_m: its standard deviation, as in `QueryOptions`.
-            refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
-            top_k: number of candidates per frame. Default: set by the service.
             on_device: read the film on this device, and send the features of its frames and their angles alone; as for
                 `localise`.
-            **options: the camera, see `ViewOptions`.
+            **options: see `FilmOptions`.
         """
-        values = {
-            "floorplan_id": floorplan_id,
-            "venue_id": venue_id,
-            "motion": "turn",
-            "camera_height_m": camera_height_m,
-            "camera_height_std_m": camera_height_std_m,
-            "refine": refine,
-            "top_k": top_k,
-        }
+        values = {"floorplan_id": floorplan_id, "venue_id": venue_id, "motion": "turn"}
         if on_device:
             content, sent = self.localise_turn(film, values, options)
             return filmed(parse(SequenceLocalisation, content), sent)

@@ -22,18 +22,9 @@ from lalaloc_client.blocking.device import Device
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, ImportStep, Venue, VenuePage, VenuePlanPage
 from lalaloc_client.on_device import Film, TurnFeatures, split_options
+from lalaloc_client.options import Options
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import (
-    JSON,
-    NDJSON,
-    Photograph,
-    QueryOptions,
-    Request,
-    ViewOptions,
-    http_options,
-    query_request,
-    text_values,
-)
+from lalaloc_client.requests import JSON, NDJSON, Photograph, Request, http_options, query_request, text_values
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
@@ -110,7 +101,7 @@ class Transport:
         path: str,
         photographs: Sequence[Photograph],
         values: Mapping[str, object],
-        options: QueryOptions | ViewOptions,
+        options: Options,
         *,
         on_device: bool = False,
     ) -> bytes:
@@ -126,17 +117,19 @@ class Transport:
         return self._with_current_model(send)
 
     def localise_turn(
-        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: ViewOptions
+        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: Options
     ) -> tuple[bytes, TurnFeatures]:
         """Send the features of a turn with its angles; return the answer, and what was sent."""
         camera, others = split_options(options)
+        fields = {**values, **others, "motion": "turn"}
 
         def send() -> tuple[bytes, TurnFeatures]:
             sent = self._device.turn(turn, camera)
-            fields = {**values, "motion": "turn", "relative_heading_deg": sent.relative_heading_deg}
+            angles: dict[str, object] = {"relative_heading_deg": sent.relative_heading_deg}
             if sent.relative_heading_deg is not None:
-                fields["relative_heading_std_deg"] = sent.relative_heading_std_deg
-            return self.query(query_request, "/localise/sequence", sent.features, fields, others), sent
+                angles["relative_heading_std_deg"] = sent.relative_heading_std_deg
+            path = "/localise/sequence"
+            return self.query(query_request, path, sent.features, {**fields, **angles}), sent
 
         return self._with_current_model(send)
 
