@@ -206,8 +206,10 @@ def _details(plan: FloorPlan, grid: PoseGrid, bundle: Bundle, view: Photograph, 
     )
     warnings = ["the photograph contradicts the heading, which was estimated instead"]
     warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
-    if confidence is not None and not warnings:
-        warnings = [text for text in [reason_for(confidence.position, confidence.elsewhere)] if text]
+    if confidence is not None:
+        objects, is_warned = found.query.objects, bool(warnings)
+        reason = reason_for(confidence.position, confidence.elsewhere, objects, is_warned=is_warned)
+        warnings += [] if reason is None else [reason]
     return {
         "heading_confidence": None if confidence is None else confidence.heading,
         "probability_elsewhere": None if confidence is None else confidence.elsewhere,

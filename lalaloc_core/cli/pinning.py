@@ -165,6 +165,7 @@ def _read(model: Any, paths: Any, stated: StatedCamera) -> Iterator[tuple[Pinned
     from lalaloc_core.localise.album.entry import photograph_entry
     from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
     from lalaloc_core.photograph import open_photograph
+    from lalaloc_core.photograph.overlap import ALBUM_SIDE
     from lalaloc_core.photograph.taken import read_taken
 
     known: dict[str, str] = {}
@@ -176,7 +177,7 @@ def _read(model: Any, paths: Any, stated: StatedCamera) -> Iterator[tuple[Pinned
             if id in known:
                 yield PinnedFile(number, path, id, taken=known[id]), None
                 continue
-            view = model.encoder.with_features(open_photograph(content, stated=stated, overview=True, **sizes))
+            view = model.encoder.with_features(open_photograph(content, stated=stated, overview=ALBUM_SIDE, **sizes))
             taken = read_taken(content)
         except InvalidPhotographError as error:
             yield PinnedFile(number, path, None, str(error)), None

@@ -26,6 +26,7 @@ from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.photograph.exif import ExifLens
 from lalaloc_core.photograph.film_limits import FilmLimits
 from lalaloc_core.photograph.film_motion import FlowTracker
+from lalaloc_core.photograph.overlap import TURN_SIDE
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
@@ -175,15 +176,10 @@ def _turned(
 
     Frames that do not overlap are joined by the turns that the tracker tells.
     """
-
-    def photograph(picture: np.ndarray, statement: StatedCamera, *, overview: bool) -> Photograph:
-        nothing = ExifLens(), PhotoSphere()
-        lens = find_lens(
-            *full_size, stated=statement, sphere=nothing[1], exif=nothing[0], looks_spherical=lambda: False
-        )
-        return photograph_of_picture(picture, full_size, lens, statement, size, overview=overview)
-
-    photographs = [photograph(sample.picture, stated, overview=True) for sample in kept]
+    lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
+    photographs = [
+        photograph_of_picture(sample.picture, full_size, lens, stated, size, overview=TURN_SIDE) for sample in kept
+    ]
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
     numbers = [sample.number for sample in kept]
@@ -193,10 +189,7 @@ def _turned(
         for turn, sd in zip(np.diff(heading), np.diff(error), strict=True)
     ]
     angles = angles_of_turn(views, steps)
-    for index, found in enumerate(turned_photographs(photographs, views, stated, angles)):
-        if found.stated is not None:
-            again = photograph(kept[index].picture, found.stated, overview=False)
-            photographs[index] = found.applied(again)
+    photographs = turned_photographs(photographs, views, angles, size)
     tracker.calibrate(photographs[0].hfov.value, full_size)
     return photographs, angles
 

@@ -18,6 +18,8 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.photograph.cameras import Camera, Perspective, camera_axes
 
+# Longer side (pixels) at which segments are found, in pictures that are larger by more than the slack.
+_LONG_SIDE, _SLACK = 480, 1.1
 # Shorter segments, as a share of the picture's longer side, are mostly texture.
 _MIN_LENGTH = 0.025
 _MAX_SEGMENTS = 150
@@ -112,13 +114,17 @@ class Calibration:
 def find_segments(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
     """Return the longest segments (x, y, x, y; pixels from the top left corner) found by OpenCV's LSD."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    share = 1.0
+    if max(grey.shape) > _SLACK * _LONG_SIDE:
+        share = _LONG_SIDE / max(grey.shape)
+        grey = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
     found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     if found is None:
         return np.zeros((0, 4))
     segments = found.reshape(-1, 4).astype(float) + _HALF_PIXEL
     length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
     order = np.argsort(-length, kind="stable")[:_MAX_SEGMENTS]
-    return segments[order[length[order] > _MIN_LENGTH * max(grey.shape)]]
+    return segments[order[length[order] > _MIN_LENGTH * max(grey.shape)]] / share
 
 
 def lines_of(segments: Float[np.ndarray, "n 4"], camera: Camera) -> Lines:

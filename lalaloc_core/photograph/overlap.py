@@ -15,19 +15,20 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.photograph.cameras import Camera, camera_axes
 from lalaloc_core.photograph.levelling import Attitude
 
 # Features that are kept of a photograph, the strongest of each cell of a grid, and the side of the grid.
 _MAX_FEATURES, _CELLS = 400, 8
-# Longer side (pixels) at which features are found.
-_LONG_SIDE = 640
+# Longer side (pixels) at which features are found: those of photographs from one spot differ little in scale.
+TURN_SIDE, ALBUM_SIDE = 420, 640
 # Contrast of the weakest features: rooms have plain walls.
 _CONTRAST = 0.015
 # Largest ratio of the distances of descriptors to the best and to the second best match.
 _MAX_RATIO = 0.85
 # Rotations that are tried for a pair, each by two matches.
-_TRIES = 300
+_TRIES = 150
 # Largest error (radians) of a match along and across the horizon. Parallax is along it: 0.2 m at 3 m are 4 degrees.
 _ALONG, _ACROSS = math.radians(7.0), math.radians(1.5)
 # Least number of matches that a rotation explains, and their least share; for photographs that are more steps apart in
@@ -74,10 +75,10 @@ class Link:
     turn: float
 
 
-def find_features(picture: UInt8[np.ndarray, "h w 3"]) -> Features:
-    """Return the features of a picture, spread over it."""
+def find_features(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> Features:
+    """Return the features of a picture, spread over it, that are found at a longer side (pixels)."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    share = _LONG_SIDE / max(grey.shape)
+    share = long_side / max(grey.shape)
     if share < 1.0:
         grey = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
     found, descriptor = cv2.SIFT.create(nfeatures=4 * _MAX_FEATURES, contrastThreshold=_CONTRAST).detectAndCompute(
@@ -102,19 +103,20 @@ def _spread(place: Float[np.ndarray, "n 2"], response: Float[np.ndarray, "n"]) -
     return np.lexsort((-response, rank))[:_MAX_FEATURES]
 
 
-def _alike(first: Features, second: Features) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """Return pairs of features that are each other's best match, and clearly better than the second best."""
-    if min(len(first.place), len(second.place)) < 2:
+def _alike(
+    one: Float[np.ndarray, "n 128"], other: Float[np.ndarray, "k 128"]
+) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+    """Return pairs of descriptors that are each other's best match, and clearly better than the second best."""
+    if min(len(one), len(other)) < 2:
         return np.zeros(0, int), np.zeros(0, int)
-    one, other = (_rooted(features.descriptor) for features in (first, second))
-    alike = one @ other.T
+    alike, every = one @ other.T, np.arange(len(one))
     best = alike.argmax(axis=1)
-    top = alike[np.arange(len(one)), best]
-    rest = alike.copy()
-    rest[np.arange(len(one)), best] = -1.0
-    distance, next_distance = (np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)) for cosine in (top, rest.max(axis=1)))
-    mutual = alike.argmax(axis=0)[best] == np.arange(len(one))
-    kept = np.flatnonzero(mutual & (distance < _MAX_RATIO * next_distance))
+    top = alike[every, best]
+    alike[every, best] = -1.0
+    distance, next_distance = (np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)) for cosine in (top, alike.max(axis=1)))
+    alike[every, best] = top
+    kept = np.flatnonzero(distance < _MAX_RATIO * next_distance)
+    kept = kept[alike[:, best[kept]].argmax(axis=0) == kept]
     return kept, best[kept]
 
 
@@ -133,28 +135,56 @@ def find_links(
     """
     count = len(features)
     apart = max(min(_MAX_PAIRS // count, count // 2), 1)
-    pairs = {tuple(sorted((first, (first + step) % count))) for first in range(count) for step in range(1, apart + 1)}
+    pairs = {
+        (min(first, (first + step) % count), max(first, (first + step) % count))
+        for first in range(count)
+        for step in range(1, apart + 1)
+    }
     rays = [_rays_of(*view) for view in zip(features, cameras, strict=True)]
+    rooted = [_rooted(view.descriptor) for view in features]
     axes = [camera_axes(pitch=attitude.pitch, roll=attitude.roll) for attitude in attitudes]
-    links = []
-    for first, second in sorted(pairs):
-        if first == second:
-            continue
-        one, other = _alike(features[first], features[second])
+
+    def link(pair: tuple[int, int], min_matches: int, min_share: float) -> Link | None:
+        first, second = pair
+        one, other = _alike(rooted[first], rooted[second])
         matched = np.stack([rays[first][one], rays[second][other]])
         # In frames that are about level, with the headings of the cameras.
         level = matched[0] @ axes[first], matched[1] @ axes[second]
-        steps = min(second - first, count - second + first)
-        limits = (_MIN_MATCHES, _MIN_SHARE) if steps <= _NEAR_STEPS else (_FAR_MIN_MATCHES, _FAR_MIN_SHARE)
         tilt_sd = math.hypot(attitudes[first].pitch_sd, attitudes[second].pitch_sd)
-        turned = turn_between(*level, *limits, _MAX_TILT + 2.0 * tilt_sd, rng)
-        if turned is None:
-            continue
-        turn, agreed = turned
-        if abs(turn) < 0.5 * (cameras[first].hfov + cameras[second].hfov):
-            kept = np.flatnonzero(agreed)[:_MAX_MATCHES]
-            links.append(Link(first, second, matched[:, kept], turn))
+        turned = turn_between(*level, min_matches, min_share, _MAX_TILT + 2.0 * tilt_sd, rng)
+        if turned is None or not overlap(first, second, turned[0]):
+            return None
+        return Link(first, second, matched[:, np.flatnonzero(turned[1])[:_MAX_MATCHES]], turned[0])
+
+    def overlap(first: int, second: int, turn: float) -> bool:
+        return abs(turn) < 0.5 * (cameras[first].hfov + cameras[second].hfov)
+
+    steps = {pair: min(pair[1] - pair[0], count - pair[1] + pair[0]) for pair in sorted(pairs) if pair[0] != pair[1]}
+    near = [link(pair, _MIN_MATCHES, _MIN_SHARE) for pair, step in steps.items() if step <= _NEAR_STEPS]
+    links = [found for found in near if found is not None]
+    placed = {member: headings for headings in grouped(count, links) for member in headings}
+    for (first, second), step in steps.items():
+        headings = placed[first]
+        # Most pairs do not overlap, and comparing one takes milliseconds.
+        if step > _NEAR_STEPS and (
+            second not in headings or overlap(first, second, wrap_angle(headings[second] - headings[first]))
+        ):
+            found = link((first, second), _FAR_MIN_MATCHES, _FAR_MIN_SHARE)
+            links += [] if found is None else [found]
     return links
+
+
+def grouped(count: int, links: Sequence[Link]) -> list[dict[int, float]]:
+    """Return groups of photographs that links connect, each with headings along the links with most matches."""
+    group = {index: {index: 0.0} for index in range(count)}
+    for link in sorted(links, key=lambda link: -link.rays.shape[1]):
+        one, other = group[link.first], group[link.second]
+        if one is not other:
+            # The second group's headings in the frame of the first one.
+            offset = one[link.first] + link.turn - other[link.second]
+            one |= {index: heading + offset for index, heading in other.items()}
+            group |= dict.fromkeys(other, one)
+    return list({min(members): members for members in group.values()}.values())
 
 
 def _rays_of(features: Features, camera: Camera) -> Float[np.ndarray, "n 3"]:
@@ -202,9 +232,9 @@ def _errors(
     rotations: Float[np.ndarray, "k 3 3"], one: Float[np.ndarray, "m 3"], other: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "k m"]:
     """Return squared errors of matches, in units of what is tolerated along and across the horizon."""
-    missed = np.einsum("kij,mj->kmi", rotations, one) - other
+    missed = rotations @ one.T - other.T
     along = np.cross(other, _UP)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), _TINY)
-    beside = np.einsum("kmi,mi->km", missed, along)
-    rest = np.maximum(np.square(missed).sum(axis=2) - np.square(beside), 0.0)
+    beside = (missed * along.T).sum(axis=1)
+    rest = np.maximum(np.square(missed).sum(axis=1) - np.square(beside), 0.0)
     return np.square(beside / _ALONG) + rest / _ACROSS**2

@@ -1,4 +1,4 @@
-"""Gravity-aligned patches of photographs, as the network for photographs expects them."""
+"""Gravity-aligned patches of photographs, and thumbnails, as the networks for photographs expect them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,10 @@ FINER = 1.4
 _SLACK = 1.03
 # Least overlap of neighbouring patches, as a share of their width.
 _OVERLAP = 0.2
+# Seen azimuths: samples of the left and right border, and the largest elevation that counts.
+_SAMPLES, _MAX_ELEVATION = 33, math.radians(45.0)
+# Thumbnails have about so many pixels, and sides that are multiples of the step.
+_THUMBNAIL_PIXELS, _THUMBNAIL_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
 # cv2.remap counts from the centre of the first pixel.
 _HALF_PIXEL = 0.5
 
@@ -90,7 +94,7 @@ def cut_patches(
         roll: clockwise rotation of the camera about it, radians.
         size: size of the patches.
     """
-    picture, camera = _reduced(picture, camera, FINER * size.resolution)
+    picture, camera = reduced(picture, camera, size)
     axes = camera_axes(pitch=pitch, roll=roll).astype(np.float32)
     return tuple(_patch(picture, camera, axes, azimuth, size) for azimuth in patch_azimuths(camera.hfov, size))
 
@@ -129,10 +133,34 @@ def _level_rays(size: PatchSize) -> Float[np.ndarray, "h w 3"]:
     return unit_rays(azimuth, elevation).astype(np.float32)
 
 
-def _reduced(picture: np.ndarray, camera: Camera, resolution: float) -> tuple[np.ndarray, Camera]:
-    """Scale a photograph down to a resolution (pixels per radian) at its axis, so that sampling does not alias."""
-    share = resolution / camera.resolution
+def reduced(
+    picture: UInt8[np.ndarray, "h w 3"], camera: Camera, size: PatchSize
+) -> tuple[UInt8[np.ndarray, "k l 3"], Camera]:
+    """Scale a photograph down to the resolution that patches are sampled from, so that sampling does not alias."""
+    share = FINER * size.resolution / camera.resolution
     if share > 0.85:
         return picture, camera
     width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), camera.scaled(width, height)
+
+
+def seen_azimuths(camera: Camera, pitch: float, roll: float) -> tuple[float, float]:
+    """Return the azimuths of the picture's leftmost and rightmost ray that a patch can show."""
+    half = 0.5 * camera.hfov
+    if half > 0.5 * math.pi:
+        return -half, half
+    y = np.linspace(0.0, camera.height, _SAMPLES)
+    border = np.concatenate([np.stack([np.full_like(y, x), y], axis=-1) for x in (0.0, float(camera.width))])
+    rays = camera.rays(border) @ camera_axes(pitch=pitch, roll=roll)
+    usable = np.abs(rays[:, 2]) < math.sin(_MAX_ELEVATION)
+    azimuth = np.arctan2(rays[:, 0], rays[:, 1])[usable]
+    return (float(azimuth.min()), float(azimuth.max())) if len(azimuth) else (-half, half)
+
+
+def thumbnail_of(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Return the whole picture at the size that objects are recognised in; its aspect changes by rounding only."""
+    height, width = picture.shape[:2]
+    aspect = min(max(width / height, 1.0 / _MAX_ASPECT), _MAX_ASPECT)
+    rows = max(1, round(math.sqrt(_THUMBNAIL_PIXELS / aspect) / _THUMBNAIL_STEP))
+    size = max(1, round(aspect * rows)) * _THUMBNAIL_STEP, rows * _THUMBNAIL_STEP
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
@@ -25,8 +24,8 @@ from lalaloc_core.photograph.levelling import (
     find_segments,
     lines_of,
 )
-from lalaloc_core.photograph.overlap import find_features
-from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
+from lalaloc_core.photograph.overlap import TURN_SIDE, find_features
+from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
     FORMATS,
@@ -45,14 +44,10 @@ from lalaloc_core.picture_kinds import is_drawing
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
-# Thumbnails have about so many pixels, and sides that are multiples of the step.
-_THUMBNAIL_PIXELS, _THUMBNAIL_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
 # Ratios of sides of photographs, and their relative deviation.
 _USUAL_RATIOS, _USUAL_TOLERANCE = (4.0 / 3.0, 1.5, 16.0 / 9.0), 0.02
 # Standard deviation of a stated pitch or roll.
 _GIVEN_SD = math.radians(0.5)
-# Seen azimuths: samples of the left and right border, and the largest elevation that counts.
-_SAMPLES, _MAX_ELEVATION = 33, math.radians(45.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +169,7 @@ def open_photograph(
     stated: StatedCamera | None = None,
     patch_size: PatchSize | None = None,
     limits: PhotographLimits | None = None,
-    overview: bool = False,
+    overview: int = 0,
     refuse_drawings: bool = True,
 ) -> Photograph:
     """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
@@ -185,7 +180,8 @@ def open_photograph(
         stated: the caller's statements; None for none.
         patch_size: size of the patches of other photographs.
         limits: limits of the file.
-        overview: find what tells the angle to other photographs from its spot, too (`turned.py`).
+        overview: longer side (pixels) at which to find what other photographs show too (`overlap.py`); 0 for nothing.
+            With `TURN_SIDE`, patches are left to `turned.py`, which finds the tilt.
         refuse_drawings: refuse a plan or a page of text; an overexposed white wall can be taken for one.
 
     Raises:
@@ -329,11 +325,11 @@ def photograph_of_picture(
     stated: StatedCamera,
     size: PatchSize,
     *,
-    overview: bool = False,
+    overview: int = 0,
 ) -> Photograph:
     """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
-    needs_lines = overview or lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
+    needs_lines = overview > 0 or lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
     segments = find_segments(picture) if needs_lines else np.zeros((0, 4))
     warnings = lens.warnings
     if lens.camera is None:
@@ -341,13 +337,9 @@ def photograph_of_picture(
         attitude, focal_sd = found.attitude, found.focal_sd
         camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
         small = camera.scaled(columns, rows)
-        origin = "was estimated from straight lines" if len(segments) else "is only usual"
-        warnings = (
-            *warnings,
-            f"the field of view of {math.degrees(found.hfov):.0f}° ± "
-            f"{math.degrees(2.0 * _hfov_sd(camera, focal_sd)):.0f}° {origin}; "
-            "send hfov_deg or the camera's original file",
-        )
+        if overview != TURN_SIDE:
+            origin = "was estimated from straight lines" if len(segments) else "is only usual"
+            warnings = (*warnings, field_warning(camera.hfov, _hfov_sd(camera, focal_sd), origin))
     else:
         camera, focal_sd = lens.camera, lens.focal_sd
         small = camera.scaled(columns, rows)
@@ -363,29 +355,39 @@ def photograph_of_picture(
         # A strip's pitch is the same all around, so its camera is not rotated.
         camera, tilt = replace(camera, elevation=pitch.value), 0.0
         small = camera.scaled(columns, rows)
+    hfov = Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source)
+    # Strips are not turned by the tilt that others tell.
+    is_of_turn = overview == TURN_SIDE and not isinstance(camera, Around)
+    overlapping = None
+    if overview:
+        overlapping = Overview(
+            find_features(picture, overview),
+            segments / (columns, rows, columns, rows),
+            attitude,
+            reduced(picture, small, size)[0] if is_of_turn else None,
+        )
     return Photograph(
         projection=lens.projection,
         projection_source=lens.projection_source,
-        hfov=Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source),
+        hfov=hfov,
         pitch=pitch,
         roll=roll,
-        azimuths=_seen_azimuths(small, tilt, roll.value),
-        patches=cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
-        thumbnail=_thumbnail(picture),
+        azimuths=seen_azimuths(small, tilt, roll.value),
+        patches=() if is_of_turn else cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
+        thumbnail=thumbnail_of(picture),
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),
-        overview=Overview(find_features(picture), segments / (columns, rows, columns, rows)) if overview else None,
+        overview=overlapping,
         warnings=warnings,
     )
 
 
-def _thumbnail(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Return the whole picture at the size that objects are recognised in; its aspect changes by rounding only."""
-    height, width = picture.shape[:2]
-    aspect = min(max(width / height, 1.0 / _MAX_ASPECT), _MAX_ASPECT)
-    rows = max(1, round(math.sqrt(_THUMBNAIL_PIXELS / aspect) / _THUMBNAIL_STEP))
-    size = max(1, round(aspect * rows)) * _THUMBNAIL_STEP, rows * _THUMBNAIL_STEP
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+def field_warning(hfov: float, sd: float, origin: str) -> str:
+    """Return the warning that a field of view (radians) is not known."""
+    return (
+        f"the field of view of {math.degrees(hfov):.0f}° ± {math.degrees(2.0 * sd):.0f}° {origin}; "
+        "send hfov_deg or the camera's original file"
+    )
 
 
 def _stated_or(stated_deg: float | None, otherwise: Assumed) -> Assumed:
@@ -405,16 +407,3 @@ def _decoded_size(width: int, height: int, lens: Lens, size: PatchSize) -> tuple
 def _hfov_sd(camera: Camera, focal_sd: float) -> float:
     """Return the standard deviation of the field of view; only that of perspective cameras is not linear."""
     return focal_sd * (math.sin(camera.hfov) if isinstance(camera, Perspective) else camera.hfov)
-
-
-def _seen_azimuths(camera: Camera, pitch: float, roll: float) -> tuple[float, float]:
-    """Return the azimuths of the picture's leftmost and rightmost ray that a patch can show."""
-    half = 0.5 * camera.hfov
-    if half > 0.5 * math.pi:
-        return -half, half
-    y = np.linspace(0.0, camera.height, _SAMPLES)
-    border = np.concatenate([np.stack([np.full_like(y, x), y], axis=-1) for x in (0.0, float(camera.width))])
-    rays = camera.rays(border) @ camera_axes(pitch=pitch, roll=roll)
-    usable = np.abs(rays[:, 2]) < math.sin(_MAX_ELEVATION)
-    azimuth = np.arctan2(rays[:, 0], rays[:, 1])[usable]
-    return (float(azimuth.min()), float(azimuth.max())) if len(azimuth) else (-half, half)

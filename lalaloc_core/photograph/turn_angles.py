@@ -19,12 +19,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.levelling import Attitude, estimate_attitude, lines_of
-from lalaloc_core.photograph.overlap import Features, Link, find_links
+from lalaloc_core.photograph.overlap import Features, Link, find_links, grouped
 from lalaloc_core.photograph.turn_order import Step, agreeing_links, headings_in_order, usual_steps
 
 if TYPE_CHECKING:
@@ -56,10 +56,14 @@ class Overview:
     Attributes:
         features: its features.
         segments: (n, 4) ends of its straight lines, as shares of width and height.
+        attitude: tilt by these lines, with the photograph's own camera; None to estimate it with another.
+        picture: (h, w, 3) the upright picture, small, that patches are still to be cut from; None if they were cut.
     """
 
     features: Features
     segments: Float[np.ndarray, "n 4"]
+    attitude: Attitude | None = None
+    picture: UInt8[np.ndarray, "h w 3"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,7 +149,7 @@ def _turn(found: Sequence[TurnAngles], link: Link) -> float:
 def _fitted(views: Sequence[TurnView], attitudes: Sequence[Attitude], links: Sequence[Link]) -> list[TurnAngles]:
     """Return the angles by some links."""
     found: dict[int, TurnAngles] = {}
-    for group, headings in enumerate(_groups(len(views), links)):
+    for group, headings in enumerate(grouped(len(views), links)):
         members = sorted(headings)
         if len(members) == 1:
             found[members[0]] = TurnAngles(group=group, heading=0.0, heading_sd=0.0, attitude=attitudes[members[0]])
@@ -163,24 +167,12 @@ def _fitted(views: Sequence[TurnView], attitudes: Sequence[Attitude], links: Seq
 
 
 def _attitude_of(view: TurnView) -> Attitude:
-    size = view.camera.width, view.camera.height
-    attitude = estimate_attitude(lines_of(view.overview.segments * (*size, *size), view.camera))
+    attitude, size = view.overview.attitude, (view.camera.width, view.camera.height)
+    if attitude is None:
+        attitude = estimate_attitude(lines_of(view.overview.segments * (*size, *size), view.camera))
     if view.pitch is not None:
         attitude = replace(attitude, pitch=view.pitch, pitch_sd=_LINES_SD)
     return attitude if view.roll is None else replace(attitude, roll=view.roll, roll_sd=_LINES_SD)
-
-
-def _groups(count: int, links: Sequence[Link]) -> list[dict[int, float]]:
-    """Return groups of photographs that links connect, each with headings along the links with most matches."""
-    group = {index: {index: 0.0} for index in range(count)}
-    for link in sorted(links, key=lambda link: -link.rays.shape[1]):
-        one, other = group[link.first], group[link.second]
-        if one is not other:
-            # The second group's headings in the frame of the first one.
-            offset = one[link.first] + link.turn - other[link.second]
-            one |= {index: heading + offset for index, heading in other.items()}
-            group |= dict.fromkeys(other, one)
-    return list({min(members): members for members in group.values()}.values())
 
 
 class _Fit:

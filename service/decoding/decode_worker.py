@@ -18,10 +18,12 @@ from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.film import Film, read_film
 from lalaloc_core.photograph.film_limits import FilmLimits
+from lalaloc_core.photograph.overlap import ALBUM_SIDE
 from lalaloc_core.photograph.photograph import open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.taken import Taken, read_taken
-from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView, angles_of_turn
+from lalaloc_core.photograph.turn_angles import TurnAngles
+from lalaloc_core.photograph.turned import level_turn
 from service.uploaded_file import UploadedFile
 from service.workers.process import limit_memory, serve_jobs
 
@@ -41,7 +43,7 @@ class DecodeJob:
 
     content: bytes | UploadedFile
     stated: StatedCamera
-    overview: bool = False
+    overview: int = 0
 
 
 @dataclass(frozen=True)
@@ -62,9 +64,17 @@ class FilmJob:
 
 @dataclass(frozen=True)
 class TurnJob:
-    """Photographs of one spot whose angles to each other are to be found."""
+    """Photographs of one spot, decoded for a turn, whose angles to each other are to be found."""
 
-    views: Sequence[TurnView]
+    photographs: Sequence[Photograph]
+
+
+@dataclass(frozen=True)
+class LevelledTurn:
+    """Photographs of one spot with their patches, and their angles."""
+
+    photographs: list[Photograph]
+    angles: list[TurnAngles]
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,7 @@ class DecodeRefusal:
 
 
 Job = DecodeJob | AlbumJob | FilmJob | TurnJob | ShowJob | RasteriseJob
-Result = Photograph | tuple[Photograph, Taken] | Film | list[TurnAngles] | np.ndarray | DecodeRefusal | bytes
+Result = Photograph | tuple[Photograph, Taken] | Film | LevelledTurn | np.ndarray | DecodeRefusal | bytes
 
 
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
@@ -118,7 +128,7 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
         if isinstance(job, RasteriseJob):
             return rasterise(job.svg)
         if isinstance(job, TurnJob):
-            return angles_of_turn(job.views)
+            return LevelledTurn(*level_turn(job.photographs, sizes.patch))
         assert isinstance(job.content, bytes)
         try:
             if isinstance(job, FilmJob):
@@ -131,7 +141,7 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
                     stated=job.stated,
                     patch_size=sizes.patch,
                     limits=limits,
-                    overview=is_of_album or job.overview,
+                    overview=ALBUM_SIDE if is_of_album else job.overview,
                 )
                 return (photograph, read_taken(job.content, limits)) if is_of_album else photograph
             return _shown(job, job.content, limits)

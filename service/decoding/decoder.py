@@ -19,7 +19,7 @@ from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_s
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
 from lalaloc_core.photograph.taken import Taken
-from lalaloc_core.photograph.turn_angles import TurnAngles, TurnView
+from lalaloc_core.photograph.turn_angles import TurnAngles
 from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import (
@@ -29,6 +29,7 @@ from service.decoding.decode_worker import (
     DecodeSizes,
     FilmJob,
     Job,
+    LevelledTurn,
     RasteriseJob,
     Result,
     ShowJob,
@@ -102,7 +103,7 @@ class Decoder:
         deadline: float,
         client: str = "",
         *,
-        overview: bool = False,
+        overview: int = 0,
     ) -> Photograph:
         """Decode an uploaded photograph for the encoders; one that is encoded already is returned as it is.
 
@@ -154,16 +155,18 @@ class Decoder:
         assert isinstance(result, Film)
         return result
 
-    async def angles(self, views: Sequence[TurnView], deadline: float, client: str = "") -> list[TurnAngles]:
-        """Return the angles of photographs of one spot, by what they show twice.
+    async def level_turn(
+        self, photographs: Sequence[Photograph], deadline: float, client: str = ""
+    ) -> tuple[list[Photograph], list[TurnAngles]]:
+        """Return photographs of one spot, decoded for a turn, with the angles that their overlap tells.
 
         Raises:
             InvalidPhotographError: the photographs stalled a worker, or crashed two.
             OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
         """
-        result = await self._run_job(TurnJob(views), deadline, client)
-        assert isinstance(result, list)
-        return result
+        result = await self._run_job(TurnJob(photographs), deadline, client)
+        assert isinstance(result, LevelledTurn)
+        return result.photographs, result.angles
 
     async def picture(
         self,

@@ -51,7 +51,7 @@ class PendingJob:
 
     def __init__(
         self,
-        content: Sequence[bytes],
+        content: Sequence[bytes | memoryview],
         digest: bytes,
         deadline: float,
         client: str = "",

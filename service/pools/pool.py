@@ -38,13 +38,15 @@ class _Parts:
     """File of a pickled job. Its uploaded file stays one part, as copying it would hold the interpreter's lock."""
 
     def __init__(self) -> None:
-        self.parts: list[bytes] = []
+        self.parts: list[bytes | memoryview] = []
         self.digest = hashlib.sha256()
 
-    def write(self, part: bytes) -> None:
-        if part:
-            self.parts.append(part)
-            self.digest.update(part)
+    def write(self, part: bytes | pickle.PickleBuffer) -> None:
+        # Large arrays come as buffers of their shape, and pipes count bytes.
+        content = part.raw() if isinstance(part, pickle.PickleBuffer) else part
+        if content:
+            self.parts.append(content)
+            self.digest.update(content)
 
 
 class WorkerPool(Generic[Job, Result]):

@@ -325,7 +325,7 @@ def _status(process: BaseProcess | None, file: str) -> str:
         return ""
 
 
-def _send(connection: Connection, content: Sequence[bytes]) -> bool:
+def _send(connection: Connection, content: Sequence[bytes | memoryview]) -> bool:
     """Send the parts of a job, and an empty one; False if the worker died before it had all of it."""
     try:
         for part in (*content, b""):

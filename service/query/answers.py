@@ -67,9 +67,10 @@ def compose_answer(
     ]
     best, place = candidates[0], ground.place(found.candidates[0])
     warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
-    if confidence is not None and not warnings:
-        reason = reason_for(confidence.position, confidence.elsewhere)
-        warnings = [] if reason is None else [reason]
+    if confidence is not None:
+        objects, is_warned = found.query.objects, bool(warnings)
+        reason = reason_for(confidence.position, confidence.elsewhere, objects, is_warned=is_warned)
+        warnings += [] if reason is None else [reason]
     return LocaliseAnswer(
         floorplan_id=place.plan_id,
         floorplan_revision=place.revision_id,

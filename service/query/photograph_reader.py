@@ -12,8 +12,8 @@ from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.query.stated_pose import known_heading
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
+from lalaloc_core.photograph.overlap import TURN_SIDE
 from lalaloc_core.photograph.turn_angles import TurnAngles
-from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from service.capacity.query_context import QueryContext
 from service.decoding.decoder import Decoder
 from service.query.executor import Executor
@@ -65,16 +65,15 @@ class PhotographReader:
             photographs: list[Photograph] = []
             for index, content in enumerate(contents):
                 with _named(index, contents):
-                    photographs.append(await decode(content, stated, overview=True))
+                    photographs.append(await decode(content, stated, overview=TURN_SIDE))
             if any(photograph.overview is None for photograph in photographs):
-                return photographs, None
-            views = turn_views(photographs)
-            angles = await self._decoder.angles(views, context.deadline, context.client)
-            turned = turned_photographs(photographs, views, stated, angles)
-            for index, found in enumerate(turned):
-                if found.stated is not None:
-                    photographs[index] = found.applied(await decode(contents[index], found.stated))
-        return photographs, angles
+                # Patches of the others are not cut yet.
+                each = zip(photographs, contents, strict=True)
+                return [
+                    photograph if photograph.overview is None else await decode(content, stated)
+                    for photograph, content in each
+                ], None
+            return await self._decoder.level_turn(photographs, context.deadline, context.client)
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, context: QueryContext) -> Film:
         """Read a film of a turn.

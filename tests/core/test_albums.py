@@ -3,10 +3,12 @@
 import math
 from dataclasses import replace
 from datetime import datetime
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image, ImageDraw, ImageFilter
 
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
@@ -23,6 +25,7 @@ from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
+from lalaloc_core.photograph.overlap import ALBUM_SIDE
 from lalaloc_core.photograph.taken import Taken
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -53,7 +56,7 @@ def photographs(encoder: PhotographEncoder) -> list[AlbumPhotograph]:
     for number, name in enumerate(NAMES):
         content = (EXAMPLES / name).read_bytes()
         view = open_photograph(
-            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), overview=True
+            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), overview=ALBUM_SIDE
         )
         taken = Taken(at=datetime(2026, 5, 1, 12, number), make="M", model="P", width=1280, height=960)
         found.append(photograph_entry(name, encoder.with_features(view), taken))
@@ -165,6 +168,46 @@ def test_corrections_are_certain(
     assert (third.state, third.pose) == ("set_aside", None)
     assert third.reason
     assert fourth.state in ("sure", "uncertain")
+
+
+def _facade(seed: int) -> bytes:
+    """Return a picture of a brick house behind a lawn, as JPEG."""
+    width, height = 640, 480
+    pixels = np.linspace([110, 160, 220], [210, 230, 250], height)[:, None, :].repeat(width, axis=1)
+    pixels[370:] = np.array([70, 110, 40]) + np.random.default_rng(seed).normal(0.0, 25.0, (height - 370, width, 1))
+    picture = Image.fromarray(pixels.clip(0, 255).astype(np.uint8))
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((90, 150, 550, 370), fill=(170, 90, 70))
+    for top in range(150, 370, 8):
+        draw.line((90, top, 550, top), fill=(205, 190, 180))
+        for left in range(90 + top % 16, 550, 24):
+            draw.line((left, top, left, top + 8), fill=(205, 190, 180))
+    draw.polygon(((70, 150), (320, 60), (570, 150)), fill=(95, 60, 50))
+    for left in range(120, 520, 85):
+        for top in (180, 270):
+            draw.rectangle((left, top, left + 50, top + 60), fill=(60, 80, 105), outline=(240, 240, 235), width=5)
+    content = BytesIO()
+    picture.filter(ImageFilter.GaussianBlur(0.7)).save(content, "JPEG")
+    return content.getvalue()
+
+
+def test_photographs_of_a_facade_are_set_aside(
+    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
+) -> None:
+    size = {"sphere_size": sphere_size(encoder.manifest), "patch_size": patch_size(encoder.manifest)}
+    outside = [
+        photograph_entry(
+            f"outside {number}",
+            encoder.with_features(open_photograph(_facade(number), overview=ALBUM_SIDE, **size)),
+            replace(photographs[-1].taken, at=datetime(2026, 5, 1, 12, 10 + number)),
+        )
+        for number in range(2)
+    ]
+    pins = solve_album(ground, encoder, [*photographs, *outside]).pins
+    assert [each.pose.room_id for each in pins[:-2] if each.pose] == list(ROOMS)
+    for pin in pins[-2:]:
+        assert (pin.state, pin.pose) == ("set_aside", None)
+        assert "nothing that rooms hold" in pin.reason
 
 
 def test_correction_of_an_unknown_room_is_refused(

@@ -238,6 +238,21 @@ class TestOpenings:
         )
         assert coarse < fine
 
+    @given(seed=seeds())
+    def test_losses_of_a_turned_prediction_are_those_of_each_hypothesis(self, seed: int) -> None:
+        rng, shifts = np.random.default_rng(seed), np.array([0, 2, 5, 11])
+        probability = rng.dirichlet(np.ones(len(OPENING_CLASSES)), 16)
+        turned = np.stack([np.roll(probability, shift, axis=0) for shift in shifts])
+        query = make_query(np.zeros((4, 16)), np.zeros((4, 16)), openings=openings(turned))
+        # The other headings are not those that the prediction was turned by.
+        found, each = (
+            MatchingCost(PLAN, dataclasses.replace(query, roll=roll), 0.2, WEIGHTS, CONFIG).opening_costs(np.arange(16))
+            for roll in (shifts * (math.tau / 16), query.roll)
+        )
+        assert found is not None
+        assert each is not None
+        np.testing.assert_allclose(found, each, atol=1e-6)
+
 
 class TestCeilingAndRoomType:
     def test_ceiling_cost_is_zero_at_the_predicted_height(self) -> None:

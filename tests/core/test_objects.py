@@ -17,8 +17,10 @@ from lalaloc_core.bundle import Bundle, MatchingWeights, default_bundle
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.belief import reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.object_encoder import outside_odds
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost
 from lalaloc_core.localise.match.matching_cost import MatchingCost
@@ -78,6 +80,18 @@ def test_bed_is_seen_where_it_stands() -> None:
     assert beds
     assert math.degrees(beds[0].azimuth) == pytest.approx(15.0, abs=25.0)
     assert next(iter(shown.room_type.shares())) == "bedroom"
+
+
+def test_low_confidence_of_a_photograph_without_household_objects_has_its_reason() -> None:
+    room = query((view("hotel_room", BED_DEG), 0.0)).objects
+    assert room is not None
+    assert room.outside < 0.0
+    assert outside_odds(np.full(63, 0.0005)) > 3.0
+    outside = replace(room, outside=3.0)
+    assert "façade or a garden" in str(reason_for(0.3, 0.2, outside, is_warned=True))
+    assert reason_for(0.8, 0.2, outside, is_warned=False) is None
+    assert reason_for(0.05, 0.2, room, is_warned=True) is None
+    assert "several places look alike" in str(reason_for(0.05, 0.2, room, is_warned=False))
 
 
 def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:

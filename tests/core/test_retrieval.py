@@ -201,6 +201,9 @@ class TestRetrieval:
         costs = grid_costs(PLAN, grid, query, MatchingWeights(), MatchingConfig())
         assert costs.compared == 50
         assert best_candidates(grid, query, top_k=3)[:2] == exhaustive[:2]
+        best = grid_costs(PLAN, grid, query, MatchingWeights(), MatchingConfig(), best_only=True)
+        assert len(best.cost) == best.compared == 50
+        assert best.cost.min() == costs.cost.min()
 
 
 class TestContradictedHeading:

@@ -16,7 +16,8 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.overlap import Features, Link
+from lalaloc_core.photograph.overlap import TURN_SIDE, Features, Link
+from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn, level_axes
 from lalaloc_core.photograph.turn_order import Step, agreeing_links, headings_in_order, usual_steps
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
@@ -35,7 +36,9 @@ def photographs(headings_deg: Sequence[float], room: str = "living_room", **stat
         for heading, pitch in zip(headings_deg, pitches_deg, strict=False)
     ]
     statement = StatedCamera(projection="perspective", **stated)
-    return [open_photograph(picture, sphere_size=(128, 256), stated=statement, overview=True) for picture in pictures]
+    return [
+        open_photograph(picture, sphere_size=(128, 256), stated=statement, overview=TURN_SIDE) for picture in pictures
+    ]
 
 
 def misses_deg(angles: Sequence[TurnAngles], headings: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -56,15 +59,15 @@ def test_overlapping_photographs_give_their_angles() -> None:
 def test_closed_turn_fixes_the_field_of_view() -> None:
     taken = photographs(ONCE_AROUND)
     views = turn_views(taken)
-    turned = turned_photographs(taken, views, StatedCamera(), angles_of_turn(views))
+    turned = turned_photographs(taken, views, angles_of_turn(views), PatchSize())
     alone = np.array([math.degrees(photograph.hfov.value) for photograph in taken])
     assert np.abs(alone - 53.0).max() > 2.0
     for found in turned:
         assert found.hfov.source == "estimated"
         assert math.degrees(found.hfov.value) == pytest.approx(53.0, abs=0.6)
-        assert found.stated is not None
-        assert found.stated.hfov_deg == pytest.approx(math.degrees(found.hfov.value))
-    assert "estimated from all photographs of the turn" in turned[0].applied(taken[0]).warnings[-1]
+        assert found.camera is not None
+        assert found.camera.hfov == found.hfov.value
+    assert "estimated from all photographs of the turn" in turned[0].warnings[-1]
 
 
 def test_photographs_without_overlap_form_groups() -> None:
@@ -129,10 +132,9 @@ def test_groups_are_placed_by_steps_that_close(first: int) -> None:
 def test_stated_tilt_and_field_are_kept() -> None:
     taken = photographs([0.0, 24.0], hfov_deg=53.0, pitch_deg=2.0, roll_deg=0.0)
     views = turn_views(taken)
-    for found in turned_photographs(taken, views, StatedCamera(hfov_deg=53.0), angles_of_turn(views)):
+    for found in turned_photographs(taken, views, angles_of_turn(views), PatchSize()):
         assert (found.hfov.source, found.pitch.source, found.roll.source) == ("given", "given", "given")
-        assert found.stated is not None
-        assert (found.stated.hfov_deg, found.stated.pitch_deg) == pytest.approx((53.0, 2.0))
+        assert (math.degrees(found.hfov.value), math.degrees(found.pitch.value)) == pytest.approx((53.0, 2.0))
 
 
 def room_view(rng: np.random.Generator, arm_m: float, pose: Float[np.ndarray, "3"]) -> Overview:

@@ -7,7 +7,7 @@ import type { Plan, PlanDocument } from "./types";
 
 const DRAFT =
   "This plan is a draft, derived from a picture or from lines: check it, and correct it with “Edit”. When all doors or " +
-  "all windows are right, tick them in the editor: only then the search uses them.";
+  "all windows are right, tick them in the editor: the search then relies on them in full.";
 const MAX_WARNINGS = 4;
 
 /** Describe a stored plan, or the example before it is stored; null: no plan is shown. */

@@ -51,7 +51,7 @@ _SPLIT = SPLIT_NUMBERS["validation"]
 _UPRIGHT, _LYING = Phone(width=360, height=480), Phone(width=480, height=360, hfov_deg=67.0)
 _UPRIGHT_SHARE = 0.7
 # Photographs once around, and the fewest of a part of a turn.
-_PHOTOGRAPHS, _FEWEST = 9, 3
+_PHOTOGRAPHS, _FEWEST = 12, 3
 # Spots of a home, and standard deviations of the relative headings by overlap and of those that are assumed, and of the
 # logarithm of the field of view.
 _SPOTS, _ANGLE_SD, _ASSUMED_SD, _FIELD_SD = 2, math.radians(0.5), math.radians(4.0), 0.03

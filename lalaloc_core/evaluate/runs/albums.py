@@ -22,6 +22,7 @@ from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
 from lalaloc_core.photograph import StatedCamera, open_photograph
+from lalaloc_core.photograph.overlap import ALBUM_SIDE
 from lalaloc_core.photograph.taken import Taken, read_taken
 
 _PLAN = "plan"
@@ -88,7 +89,7 @@ def album_entry(model: LocalModel, id: str, content: bytes, stated: StatedCamera
     """
     manifest = model.bundle.manifest
     view = open_photograph(
-        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), overview=True
+        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), overview=ALBUM_SIDE
     )
     return photograph_entry(id, model.encoder.with_features(view), taken)
 

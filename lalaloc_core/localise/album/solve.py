@@ -28,6 +28,7 @@ from lalaloc_core.localise.album.shared import camera_height, shared_cameras
 from lalaloc_core.localise.album.single import SearchedPlan, single_evidence
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
 from lalaloc_core.localise.album.walks import expected_photographs, walk_of
+from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, outside_odds
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 MAX_PHOTOGRAPHS = 500
@@ -38,7 +39,7 @@ SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
 # Share of photographs that must have a time for the order to count.
 _TIMED = 0.8
-# Log odds of a photograph of none of the rooms, beside the best pose of other homes.
+# Log odds of a photograph of none of the rooms, beside the best pose of other homes; half of them are taken outside.
 _ELSEWHERE = -2.0
 _CERTAIN = 1e4
 # How much the number of photographs of a room keeps to what its size lets expect.
@@ -182,7 +183,8 @@ def _room_shares(
     for number, (each, state) in enumerate(zip(photographs, states, strict=True)):
         arrays = memory.evidence[each.id]
         alone[number, :rooms] = state.best_of_rooms(rooms) + arrays["room_types"]
-        alone[number, rooms] = float(arrays["chance"]) + _ELSEWHERE
+        elsewhere = _ELSEWHERE + float(np.logaddexp(0.0, _outside(each))) - math.log(2.0)
+        alone[number, rooms] = float(arrays["chance"]) + elsewhere
         if each.id in constraints:
             wanted = constraints[each.id].room
             alone[number] -= _CERTAIN
@@ -196,6 +198,13 @@ def _room_shares(
         tightness=_TIGHTNESS,
     )
     return assign_rooms(evidence, pause=pause)
+
+
+def _outside(photograph: AlbumPhotograph) -> float:
+    """Return the log likelihood ratio of a photograph taken outside to one of a room; 0 if no objects are known."""
+    features = photograph.view.features
+    probability = None if features is None else features.outputs.get(OBJECT_OUTPUTS[0])
+    return 0.0 if probability is None else outside_odds(probability)
 
 
 def _pin(
@@ -234,6 +243,8 @@ def _pin(
         return _corrected(ground, base, constraint)
     if share[rooms] > 0.5 or not suggestions:
         reason = "it fits none of the rooms of the plan better than rooms of other buildings"
+        if _outside(photograph) > 0.0:
+            reason = "it shows nothing that rooms hold, as a photograph of a façade or a garden does"
         return replace(base, state="set_aside", reason=reason)
     confidence = float(share[order[0]])
     is_sure = confidence >= SURE

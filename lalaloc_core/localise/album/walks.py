@@ -14,7 +14,7 @@ _STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.05, 0.5, 4
 # Rooms nearer than this (m) are joined if the plan draws no doors.
 _JOINED_M = 0.4
 # Probability of a photograph of none of the rooms, after one of a room and after another of none.
-_LEAVE, _STAY_AWAY = 0.02, 0.5
+_LEAVE, _STAY_AWAY = 0.05, 0.5
 # Rooms smaller than this (m²) are often left out.
 _SMALL_M2, _SMALL_SHARE = 3.0, 0.5
 

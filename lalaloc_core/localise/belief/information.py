@@ -10,13 +10,14 @@ from jaxtyping import Float
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief.posterior import area_shares
+from lalaloc_core.localise.query import SeenObjects
 from lalaloc_core.render.sampling import PoseSet
 
 # Confidence from which no advice is given.
 CONFIDENT = 0.5
 # Azimuths (radians) that usually suffice; a photograph that shows less can lack what tells places apart.
 _ENOUGH = math.radians(240.0)
-# Confidence below which an answer without any warning gets a reason.
+# Confidence below which an answer without any warning gets a reason, whatever the photograph shows.
 UNSURE = 0.1
 # Arcs that are closer than this (radians) are one.
 _TOUCHING = math.radians(0.5)
@@ -70,12 +71,17 @@ def advice_for(arcs: list[tuple[float, float]], confidence: float) -> str | None
     )
 
 
-def reason_for(confidence: float, elsewhere: float) -> str | None:
-    """Return why an answer's confidence is very low; None where it is not.
+def reason_for(confidence: float, elsewhere: float, objects: SeenObjects | None, *, is_warned: bool) -> str | None:
+    """Return why an answer's confidence is low; None where it is not, or where a warning tells already.
 
-    `elsewhere` is the probability that the photograph shows no place of the plan.
+    `elsewhere` is the probability that the photograph shows no place of the plan, `objects` what it shows.
     """
-    if confidence >= UNSURE:
+    if confidence < CONFIDENT and objects is not None and objects.outside > 0.0:
+        return (
+            "the photograph shows nothing that is recognised of what rooms hold, as one of a façade or a garden does: "
+            "send one taken in a room of the plan"
+        )
+    if confidence >= UNSURE or is_warned:
         return None
     low = f"the confidence is {confidence:.1%}, below {UNSURE:.0%}"
     if elsewhere < CONFIDENT:

@@ -163,7 +163,7 @@ class Searches:
         outcomes: list[list[Draw]] = [[] for _ in range(len(places))]
         for _ in range(count):
             for number, query in enumerate(self._queries(places, condition, rng)):
-                costs = grid_costs(self._plan, self._grid, query, weights, config)
+                costs = grid_costs(self._plan, self._grid, query, weights, config, best_only=True)
                 place = places.position_m[number], int(places.room_index[number])
                 outcomes[number].append(self._outcome(costs, *place, _EQUAL / weights.temperature))
         return outcomes

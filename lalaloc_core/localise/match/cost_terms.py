@@ -135,7 +135,8 @@ def class_losses(
     missing = prior * (1.0 - drawn)
     kind = drawn[:, None] * np.eye(len(drawn)) + (1.0 - drawn[:, None]) * (missing / missing.sum())
     seen = kind if appearance is None else kind @ np.asarray(appearance)
-    return -np.log(floor + (1.0 - floor) * (probability / prior) @ seen.T)
+    ratio = probability / prior.astype(probability.dtype)
+    return -np.log(floor + ratio @ ((1.0 - floor) * seen.T).astype(probability.dtype))
 
 
 def opening_losses(
@@ -197,7 +198,7 @@ def smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np
     if deviation < 0.3:
         return probability
     offset = (np.arange(columns) + columns // 2) % columns - columns // 2
-    kernel = np.exp(-0.5 * np.square(offset / deviation))
+    kernel = np.exp(-0.5 * np.square(offset / deviation)).astype(probability.dtype)
     kernel = (kernel / kernel.sum())[(np.arange(columns)[:, None] - np.arange(columns)[None]) % columns]
     # One matrix product for all hypotheses.
     blurred = kernel @ probability.transpose(1, 0, 2).reshape(columns, -1)

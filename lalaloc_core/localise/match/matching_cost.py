@@ -39,7 +39,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES
+from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match.cost_terms import (
     SeenWalls,
@@ -360,10 +360,21 @@ class MatchingCost:
             return None
         # Openings appear displaced by up to the reach, seen at the median distance.
         median_m = median_distance_m(self._first.centre[0], self._first.precision[0])
-        probability = smoothed(np.exp(predicted.log_probability), self._reach_m / median_m)
-        return opening_losses(
+        # Hypotheses are mostly one prediction, turned, whose losses are computed once.
+        turned = self._turned_columns(predicted.log_probability) if self._stride == 1 else None
+        log_probability = predicted.log_probability if turned is None else predicted.log_probability[:1]
+        probability = smoothed(np.exp(log_probability), self._reach_m / median_m)
+        loss = opening_losses(
             probability[:, :: self._stride], predicted.prior, trusts, self._config.floor, self._weights.appearance
         )
+        return loss if turned is None else loss[:, 0].take(turned, axis=1)
+
+    def _turned_columns(self, values: Float[np.ndarray, "k w c"]) -> Int[np.ndarray, "k w"] | None:
+        """Return the columns of the first hypothesis that all others have, by column; None if they are not turned."""
+        width, roll = values.shape[1], self._query.roll
+        shift = np.rint((roll - roll[0]) / TWO_PI * width).astype(np.intp)
+        columns = (np.arange(width) - shift[:, None]) % width
+        return columns if np.array_equal(values[0].take(columns, axis=0), values) else None
 
     @cached_property
     def _room_types(self) -> Float[np.ndarray, "r"]:

@@ -138,7 +138,9 @@ class SeenObjects:
     Attributes:
         room_type: its probabilities presume that all types are equally frequent.
         objects: the most probable first.
+        outside: log likelihood ratio of a photograph taken outside to one of a room.
     """
 
     room_type: PredictedRoomType
     objects: tuple[SeenObject, ...]
+    outside: float = 0.0

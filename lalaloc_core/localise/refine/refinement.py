@@ -149,6 +149,9 @@ def latent_distances_at(
     camera_height_m: float,
 ) -> Float[np.ndarray, "k"]:
     """Return the distances of the latents at poses to those of the query's hypotheses."""
+    if not query.latents.any():
+        # Views have no latents, and those of layouts are of unit length.
+        return np.ones(len(poses))
     latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
     return np.linalg.norm(latents - query.latents[hypotheses], axis=1)
 

@@ -17,8 +17,8 @@ from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZI
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, HintName, Hints, Query
 
-# Limits of the number of pairs of a pose and a hypothesis that are compared in full.
-_MIN_COMPARED, _MAX_COMPARED = 1024, 4096
+# Limits of the number of pairs of a pose and a hypothesis that are compared in full, and the most a pose between them.
+_MIN_COMPARED, _MANY_COMPARED, _MAX_COMPARED, _PER_POSE = 1024, 2048, 4096, 4
 # Up to this number of pairs, as in a single room, all are compared in full.
 _ALL_COMPARED = 2560
 # Maximum number of pairs whose cost the coarse pass estimates.
@@ -38,10 +38,13 @@ def grid_costs(
     weights: MatchingWeights,
     config: MatchingConfig,
     hints: Hints = NO_HINTS,
+    *,
+    best_only: bool = False,
 ) -> GridCosts:
     """Return the costs of the best and all probable pairs of a grid pose and a hypothesis.
 
-    The coarse pass (`coarse_pass.py`) excludes most pairs; the rest, or all of few pairs, are compared in full.
+    The coarse pass (`coarse_pass.py`) excludes most pairs; the rest, or all of few pairs, are compared in full. With
+    `best_only`, just the best are, which answers need, but not their probabilities.
 
     Raises:
         InvalidHintError: strict hints exclude every pose of the grid.
@@ -56,7 +59,8 @@ def grid_costs(
     matching_cost = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
     relaxed = _place_cost(plan, grid, query, weights, hints.relaxed) if hints.strict else None
     temperature = weights.temperature
-    pair, compared, coarse, estimate = _choose(plan, grid, matching_cost, temperature, place_cost, relaxed)
+    window = 0.0 if best_only else _MARGIN + NEGLIGIBLE / temperature
+    pair, compared, coarse, estimate = _choose(plan, grid, matching_cost, window, place_cost, relaxed)
     pose, hypothesis = np.divmod(pair, len(query.roll))
     cost, offset = matching_cost.pairs(grid.layouts(plan), pose[:compared], hypothesis[:compared])
     if config.latent_weight:
@@ -79,14 +83,14 @@ def _choose(
     plan: FloorPlan,
     grid: PoseGrid,
     matching_cost: MatchingCost,
-    temperature: float,
+    window: float,
     place_cost: PlaceCost | None,
     relaxed: PlaceCost | None,
 ) -> tuple[Int[np.ndarray, "m"], int, Float[np.ndarray, "c"], Float[np.ndarray, "e"]]:
     """Choose the pairs to compare in full and to estimate.
 
-    `place_cost` is that of hints and fixtures, and `relaxed` the same if strict hints were not; the best pairs
-    by that are compared as well.
+    Pairs that cost `window` more than the best are improbable. `place_cost` is that of hints and fixtures, and
+    `relaxed` the same if strict hints were not; the best pairs by that are compared as well.
 
     Returns:
         The pairs to compare in full, then the others: pose times the number of hypotheses, plus hypothesis; the number
@@ -95,12 +99,12 @@ def _choose(
     pairs, nothing = len(grid.poses) * matching_cost.hypotheses, np.empty(0, np.float32)
     if pairs <= _ALL_COMPARED:
         return np.arange(pairs), pairs, nothing, nothing
-    window = _MARGIN + NEGLIGIBLE / temperature
     binned = grid.binned(plan, VIEW_AZIMUTHS if matching_cost.is_view else SPHERE_AZIMUTHS)
     compare = partial(likeliest, binned, matching_cost, grid.poses.room_index, at_least=_MIN_COMPARED)
-    total, pair = compare(place_cost, at_most=_ESTIMATED, window=window)
+    total, pair = compare(place_cost, at_most=_ESTIMATED if window else _MIN_COMPARED, window=window)
     probable = int(np.searchsorted(total, total[0] + window))
-    compared = min(max(probable, _MIN_COMPARED), _MAX_COMPARED, len(pair))
+    most = min(max(_PER_POSE * len(grid.poses), _MANY_COMPARED), _MAX_COMPARED)
+    compared = min(max(probable, _MIN_COMPARED), most, len(pair))
     cost = total if place_cost is None else total - place_cost.of_pairs(*np.divmod(pair, matching_cost.hypotheses))
     first, others = pair[:compared], pair[compared:probable]
     if relaxed is not None:
