@@ -77,7 +77,7 @@ from lalaloc_client.model import (
     VenuePlan,
 )
 from lalaloc_client.on_device import TurnFeatures
-from lalaloc_client.requests import QueryOptions, ViewOptions
+from lalaloc_client.options import FilmOptions, QueryOptions, SequenceOptions, ViewOptions
 from lalaloc_client.retry import RetryPolicy
 from lalaloc_client.tracking import Motion, PathPoint, Rival, Session, SessionOptions, TrackedPose
 
@@ -96,6 +96,7 @@ __all__ = [
     "ConflictError",
     "ConfusedRooms",
     "ConnectionFailedError",
+    "FilmOptions",
     "FilmReading",
     "FloorPlan",
     "FloorPlanFailedError",
@@ -137,6 +138,7 @@ __all__ = [
     "RoomLayout",
     "RosPose",
     "SequenceLocalisation",
+    "SequenceOptions",
     "SequencePose",
     "Session",
     "SessionOptions",

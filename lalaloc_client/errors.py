@@ -1,20 +1,4 @@
-"""Errors of the client.
-
-Tree of the classes::
-
-    ClientError
-    ├── ConnectionFailedError     the service did not answer, retries included
-    ├── MalformedAnswerError      an answer has another form than the API's
-    ├── FloorPlanFailedError      the service could not prepare the plan
-    ├── OnDeviceError             the features of a photograph cannot be computed on this device
-    ├── NotReadyError             the plan was still preparing at the timeout (also a TimeoutError)
-    └── ProblemError              the service answered with a problem (RFC 9457)
-        ├── InvalidError          the request is wrong: 400, 413, 415, 422
-        ├── UnauthorisedError     the key is missing, invalid, or lacks the scope: 401, 403
-        ├── NotFoundError         the resource does not exist: 404
-        ├── ConflictError         the resource is in another state: 409, 412
-        └── OverloadedError       the service is overloaded or the rate limit exceeded, retries included: 429, 503
-"""
+"""Errors of the client."""
 
 from __future__ import annotations
 

@@ -24,7 +24,8 @@ from pydantic import Field
 
 from lalaloc_client.asynchronous.client import AsyncClient
 from lalaloc_client.errors import ClientError, ConnectionFailedError, ProblemError
-from lalaloc_client.requests import QueryOptions, ViewOptions, film_request, http_options
+from lalaloc_client.options import QueryOptions, ViewOptions
+from lalaloc_client.requests import film_request, http_options
 
 _INSTRUCTIONS = (
     "Finds where in a floor plan photographs were taken. Import the plan first, then localise photographs by its id. "

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from lalaloc_client.answers import DroppedFrames, FilmReading, SequenceLocalisation
 from lalaloc_client.errors import OnDeviceError
-from lalaloc_client.requests import Photograph, QueryOptions, ViewOptions, picture_file
+from lalaloc_client.options import Options, ViewOptions
+from lalaloc_client.requests import Photograph, picture_file
 
 if TYPE_CHECKING:
     from lalaloc_core.localise.encode.features import FeatureEncoder
@@ -217,10 +218,10 @@ def filmed(answer: SequenceLocalisation, sent: TurnFeatures) -> SequenceLocalisa
     return replace(answer, poses=tuple(poses), film=sent.film)
 
 
-def split_options(options: QueryOptions | ViewOptions) -> tuple[dict[str, Any], QueryOptions]:
+def split_options(options: Options) -> tuple[dict[str, Any], Options]:
     """Return the options about the camera, which features contain, and all others."""
     camera = {name: value for name, value in options.items() if name in _CAMERA and value is not None}
-    return camera, cast("QueryOptions", {name: value for name, value in options.items() if name not in _CAMERA})
+    return camera, cast("Options", {name: value for name, value in options.items() if name not in _CAMERA})
 
 
 def _stated_camera(options: Mapping[str, Any]) -> StatedCamera:

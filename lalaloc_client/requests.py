@@ -14,11 +14,12 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import httpx
 
 from lalaloc_client.model import ImportStep
+from lalaloc_client.options import FilmOptions, Options, QueryOptions, SequenceOptions, ViewOptions
 from lalaloc_client.retry import Safety
 
 if TYPE_CHECKING:
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
 
 Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
 Photograph: TypeAlias = "bytes | str | os.PathLike[str] | Image"
-Projection = Literal["auto", "equirectangular", "perspective", "cylindrical", "fisheye"]
-Refine = Literal["none", "vdr", "lpo"]
-SequenceRefine = Literal["none", "lpo"]
 Picture = Literal["both", "plan", "photograph"]
 PictureFormat = Literal["png", "svg"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
@@ -42,57 +40,6 @@ _FEATURES = b"LLFT"
 # Names of the GeoPose protocol for picture files, by the bytes that the files begin with.
 _IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
-
-
-class ViewOptions(TypedDict, total=False):
-    """Options about the camera; an option that is left out or None has the default, from the photograph's metadata.
-
-    Attributes:
-        projection: `perspective` for ordinary cameras, `equirectangular` for 360° cameras, `cylindrical` for strips of
-            a phone's panorama mode, `fisheye`. Default: `auto`.
-        hfov_deg: horizontal field of view of the upright photograph.
-        intrinsics: camera matrix and distortion by OpenCV instead, such as {"fx": 2870, "fy": 2868, "k1": -0.03}: "fx",
-            "fy", "cx", "cy", "k1", "k2", "k3", "p1", "p2"; "k4" for `fisheye`, without "p1" and "p2".
-        pitch_deg: elevation of the photograph's centre above the horizon. Default: estimated.
-        roll_deg: clockwise rotation of the camera about its optical axis. Default: estimated.
-    """
-
-    projection: Projection | None
-    hfov_deg: float | None
-    intrinsics: Mapping[str, float] | None
-    pitch_deg: float | None
-    roll_deg: float | None
-
-
-class QueryOptions(ViewOptions, total=False):
-    """Options of a query; an option that is left out or None has the default. See `ViewOptions` as well.
-
-    Attributes:
-        heading_deg: azimuth of the photograph's centre, clockwise from the plan's +y. Default: search for it.
-        heading_tolerance_deg: maximum error of `heading_deg`, up to 45. Default: 0.
-        camera_height_m: camera height over the floor. Default: that of the plan; unknown if the plan has none.
-        camera_height_std_m: standard deviation of the camera height, which is then estimated; 0 means exact. Default:
-            that of the plan, or 0.1.
-        near: approximate camera position, as {"x_m": 3.5, "y_m": 2.0} in the plan, or as {"latitude": 48.1372,
-            "longitude": 11.5757} if the plan has an anchor.
-        radius_m: maximum distance from `near`, which requires it.
-        rooms: ids or names of the rooms in which the camera may have stood.
-        strict: search only the places and headings that the options allow. Default: treat them as hints, which may be
-            wrong.
-        refine: last stage to run: `none`, `vdr` or `lpo`. Default: the last one that the service has.
-        top_k: number of candidates. Default: set by the service.
-    """
-
-    heading_deg: float | None
-    heading_tolerance_deg: float | None
-    camera_height_m: float | None
-    camera_height_std_m: float | None
-    near: Mapping[str, float] | None
-    radius_m: float | None
-    rooms: Sequence[str] | None
-    strict: bool | None
-    refine: Refine | None
-    top_k: int | None
 
 
 @dataclass(frozen=True)
@@ -217,7 +164,7 @@ def query_request(
     path: str,
     photographs: Sequence[Photograph],
     values: Mapping[str, object],
-    options: QueryOptions | ViewOptions | None = None,
+    options: Options | None = None,
     *,
     params: Mapping[str, str] | None = None,
     accept: str = JSON,
@@ -230,8 +177,7 @@ def query_request(
         ValueError: a number is not finite, or photographs and features are mixed.
     """
     known = dict(options or {})
-    if unknown := known.keys() - (QueryOptions.__optional_keys__ | QueryOptions.__required_keys__):
-        raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see QueryOptions")
+    _check_known(known, SequenceOptions if path.endswith("/sequence") else QueryOptions)
     if isinstance(rooms := known.get("rooms"), str):
         known["rooms"] = [rooms]
     contents = [picture_file(photograph) for photograph in photographs]
@@ -245,7 +191,7 @@ def query_request(
 
 
 def film_request(
-    path: str, film: bytes | str | os.PathLike[str], values: Mapping[str, object], options: ViewOptions
+    path: str, film: bytes | str | os.PathLike[str], values: Mapping[str, object], options: FilmOptions | ViewOptions
 ) -> Request:
     """Return a query about a film.
 
@@ -253,8 +199,7 @@ def film_request(
         TypeError: an option is unknown.
         ValueError: a number is not finite.
     """
-    if unknown := options.keys() - (ViewOptions.__optional_keys__ | ViewOptions.__required_keys__):
-        raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see ViewOptions")
+    _check_known(options, FilmOptions)
     content = film if isinstance(film, bytes) else Path(film).read_bytes()
     media, body = _form("film", [("film", content)], {**values, **options})
     return Request("POST", path, headers={"Content-Type": media, "Accept": JSON}, content=body)
@@ -321,6 +266,11 @@ def preview_params(
         (xx, xy), (_, yy) = covariance_m2
         params["covariance_m2"] = [str(xx), str(xy), str(yy)]
     return params
+
+
+def _check_known(options: Mapping[str, object], kind: Any) -> None:
+    if unknown := options.keys() - kind.__optional_keys__:
+        raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see {kind.__name__}")
 
 
 def _headers(if_match: str | None, idempotency_key: str | None) -> dict[str, str]:

@@ -1,26 +1,4 @@
-"""Exceptions of the core. Messages name the wrong value and the limit; `service.errors` adds those of the service.
-
-LaLaLocError
-├── InvalidInputError            the caller's data are wrong (a 4xx over HTTP, exit code 2 on the command line)
-│   ├── InvalidFloorPlanError    a floor plan is invalid; names the room
-│   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
-│   ├── MissingExtraError        a format needs a package that is not installed; names the extra
-│   ├── InvalidPhotographError     a picture is not a usable photograph, or a statement about it is invalid
-│   ├── InvalidFilmError         a film cannot be read, exceeds a limit, or shows nothing
-│   ├── InvalidFeaturesError     features of a photograph are damaged or out of range
-│   ├── ForeignFeaturesError     features of a photograph are another model's
-│   ├── InvalidPoseError         a position, heading or height is outside its limits
-│   ├── InvalidHintError         a hint is invalid; names the hint
-│   ├── InvalidMotionError       a motion between two photographs is invalid
-│   ├── InvalidCorrectionError   a correction of a pin is incomplete or does not fit the plan
-│   └── DatasetError             a file of a data set is missing, damaged or invalid; names scene, room and path
-├── InvalidEntryError            the stored entry of a photograph of an album is damaged
-├── ConfigError                  unknown key or value of a wrong type in a configuration
-├── BundleError                  a model bundle is missing, incomplete or altered
-├── CheckpointError              a checkpoint is missing or belongs to another configuration
-├── ExportError                  an exported network disagrees with its source
-└── RunError                     an evaluation run is missing, damaged, or has other settings
-"""
+"""Exceptions of the core. Messages name the wrong value and the limit; `service.errors` adds those of the service."""
 
 from __future__ import annotations
 
@@ -37,7 +15,7 @@ class LaLaLocError(Exception):
 
 
 class InvalidInputError(LaLaLocError, ValueError):
-    """The caller's data are wrong; the message names the value and the limit."""
+    """The caller's data are wrong: a 4xx over HTTP, exit code 2 on the command line."""
 
 
 class InvalidFloorPlanError(InvalidInputError):

@@ -30,8 +30,9 @@ from service.http.middleware import (
 from service.http.problems import install_problem_handlers
 from service.http.server import ServedApp, bound_uvicorn
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
+from service.query_components import LOCAL_BACKENDS, Backends
 from service.routes import ROUTERS
-from service.runtime import LOCAL_BACKENDS, Backends, start_runtime
+from service.runtime import start_runtime
 from service.settings import Settings
 from service.telemetry import Telemetry, configure_logging
 

@@ -112,7 +112,7 @@ SERVICE_LAYERS = (
     "grids security decoding plan_files",
     "http venues",
     "query http.middleware",
-    "albums",
+    "albums query_components",
     "runtime",
     "routes",
     "app openapi",

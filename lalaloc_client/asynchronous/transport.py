@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -13,29 +13,22 @@ from typing import Any, ParamSpec, TypeVar
 
 import httpx
 
-from lalaloc_client.albums import Album, AlbumPage, AlbumPhotograph, AlbumPhotographPage
+from lalaloc_client.albums import AddedPhotograph, Album, AlbumPage, AlbumPhotograph, AlbumPhotographPage
+from lalaloc_client.answers import BatchAnswer
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
 from lalaloc_client.asynchronous.device import AsyncDevice
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, ImportStep, Venue, VenuePage, VenuePlanPage
 from lalaloc_client.on_device import Film, TurnFeatures, split_options
+from lalaloc_client.options import Options
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import (
-    JSON,
-    NDJSON,
-    Photograph,
-    QueryOptions,
-    Request,
-    ViewOptions,
-    http_options,
-    query_request,
-    text_values,
-)
+from lalaloc_client.requests import JSON, NDJSON, Photograph, Request, http_options, query_request, text_values
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
 StoredT = TypeVar("StoredT", FloorPlan, Venue, Album, AlbumPhotograph)
+LineT = TypeVar("LineT", BatchAnswer, AddedPhotograph)
 PageT = TypeVar("PageT", FloorPlanPage, VenuePage, VenuePlanPage, AlbumPage, AlbumPhotographPage)
 
 # Used when the service does not state its limit; every service allows this many.
@@ -107,7 +100,7 @@ class AsyncTransport:
         path: str,
         photographs: Sequence[Photograph],
         values: Mapping[str, object],
-        options: QueryOptions | ViewOptions,
+        options: Options,
         *,
         on_device: bool = False,
     ) -> bytes:
@@ -115,34 +108,39 @@ class AsyncTransport:
         if not on_device:
             return await self.query(query_request, path, photographs, values, options)
         camera, others = split_options(options)
-        features = await self._device.features(photographs, camera)
-        try:
+
+        async def send() -> bytes:
+            features = await self._device.features(photographs, camera)
             return await self.query(query_request, path, features, values, others)
-        except ConflictError as error:
-            if error.type != _FOREIGN_FEATURES:
-                raise
-        self._device.forget()
-        features = await self._device.features(photographs, camera)
-        return await self.query(query_request, path, features, values, others)
+
+        return await self._with_current_model(send)
 
     async def localise_turn(
-        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: ViewOptions
+        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: Options
     ) -> tuple[bytes, TurnFeatures]:
         """Send the features of a turn with its angles; return the answer, and what was sent."""
         camera, others = split_options(options)
-        for attempt in range(2):
+        fields = {**values, **others, "motion": "turn"}
+
+        async def send() -> tuple[bytes, TurnFeatures]:
             sent = await self._device.turn(turn, camera)
             angles: dict[str, object] = {"relative_heading_deg": sent.relative_heading_deg}
             if sent.relative_heading_deg is not None:
                 angles["relative_heading_std_deg"] = sent.relative_heading_std_deg
-            try:
-                fields = {**values, "motion": "turn", **angles}
-                return await self.query(query_request, "/localise/sequence", sent.features, fields, others), sent
-            except ConflictError as error:
-                if attempt or error.type != _FOREIGN_FEATURES:
-                    raise
-            self._device.forget()
-        raise AssertionError("the second attempt answers or raises")
+            path = "/localise/sequence"
+            return await self.query(query_request, path, sent.features, {**fields, **angles}), sent
+
+        return await self._with_current_model(send)
+
+    async def _with_current_model(self, send: Callable[[], Any]) -> Any:
+        """Return what `send` does; if the service has another model than its features, load that and send again."""
+        try:
+            return await send()
+        except ConflictError as error:
+            if error.type != _FOREIGN_FEATURES:
+                raise
+        self._device.forget()
+        return await send()
 
     async def _fetch(self, path: str) -> bytes:
         return await self.content(Request("GET", path, headers={"Accept": "*/*"}))
@@ -161,6 +159,21 @@ class AsyncTransport:
             cursor = page.next_cursor
             if cursor is None:
                 return
+
+    async def _lines(self, kind: type[LineT], request: Request) -> AsyncGenerator[LineT]:
+        """Send a streamed request, and yield the lines of its answer as they arrive.
+
+        Raises:
+            ConnectionFailedError: the connection broke off before the last line.
+        """
+        async with aclosing(await self._send(request)) as response:
+            try:
+                async for line in response.aiter_lines():
+                    yield parse(kind, line, "line")
+            except httpx.TransportError as error:
+                raise ConnectionFailedError(
+                    f"{request.method} {request.path} broke off: {type(error).__name__} {error}".rstrip()
+                ) from error
 
     async def content(self, request: Request) -> bytes:
         """Send a request and return the answer's content."""

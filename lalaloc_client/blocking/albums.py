@@ -11,8 +11,6 @@ from random import random
 from time import monotonic
 from typing import Any, Unpack
 
-import httpx
-
 from lalaloc_client.albums import (
     FORMAT_MEDIA,
     AddedPhotograph,
@@ -24,18 +22,9 @@ from lalaloc_client.albums import (
 )
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.transport import Transport
-from lalaloc_client.errors import AlbumFailedError, ConnectionFailedError, NotReadyError
-from lalaloc_client.parsing import parse
-from lalaloc_client.requests import (
-    NDJSON,
-    Photograph,
-    Request,
-    ViewOptions,
-    json_request,
-    query_request,
-    resource_path,
-    text_values,
-)
+from lalaloc_client.errors import AlbumFailedError, NotReadyError
+from lalaloc_client.options import ViewOptions
+from lalaloc_client.requests import NDJSON, Photograph, Request, json_request, query_request, resource_path, text_values
 
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 
@@ -114,19 +103,13 @@ class Albums(Transport):
                 busy = list[AddedPhotograph]()
                 part = [panoramas[index] for index in left]
                 request = run_blocking(query_request, path, part, {}, accept=NDJSON, streamed=True)
-                with closing(self._send(request)) as response:
-                    try:
-                        for text in response.iter_lines():
-                            line = parse(AddedPhotograph, text, "line")
-                            line = replace(line, index=left[line.index])
-                            if line.retry_after_s is None:
-                                yield line
-                            else:
-                                busy.append(line)
-                    except httpx.TransportError as error:
-                        raise ConnectionFailedError(
-                            f"POST {path} broke off: {type(error).__name__} {error}".rstrip()
-                        ) from error
+                with closing(self._lines(AddedPhotograph, request)) as lines:
+                    for line in lines:
+                        line = replace(line, index=left[line.index])
+                        if line.retry_after_s is None:
+                            yield line
+                        else:
+                            busy.append(line)
                 after_s = max((line.retry_after_s or 0.0 for line in busy), default=0.0)
                 wait_s = self._retry.wait_s(attempt, waited_s, after_s, random())
                 left = [line.index for line in busy]

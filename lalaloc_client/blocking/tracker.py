@@ -9,8 +9,9 @@ from typing import Any, Unpack
 
 from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import ConflictError, NotFoundError
+from lalaloc_client.options import ViewOptions
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import Photograph, Request, ViewOptions, json_request, resource_path
+from lalaloc_client.requests import Photograph, Request, json_request, resource_path
 from lalaloc_client.tracking import Motion, Session, SessionOptions
 
 _OUT_OF_ORDER = "urn:lalaloc:problem:photograph-out-of-order"

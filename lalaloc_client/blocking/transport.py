@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,29 +14,22 @@ from typing import Any, ParamSpec, TypeVar
 
 import httpx
 
-from lalaloc_client.albums import Album, AlbumPage, AlbumPhotograph, AlbumPhotographPage
+from lalaloc_client.albums import AddedPhotograph, Album, AlbumPage, AlbumPhotograph, AlbumPhotographPage
+from lalaloc_client.answers import BatchAnswer
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from lalaloc_client.blocking.device import Device
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
 from lalaloc_client.model import FloorPlan, FloorPlanPage, ImportStep, Venue, VenuePage, VenuePlanPage
 from lalaloc_client.on_device import Film, TurnFeatures, split_options
+from lalaloc_client.options import Options
 from lalaloc_client.parsing import parse
-from lalaloc_client.requests import (
-    JSON,
-    NDJSON,
-    Photograph,
-    QueryOptions,
-    Request,
-    ViewOptions,
-    http_options,
-    query_request,
-    text_values,
-)
+from lalaloc_client.requests import JSON, NDJSON, Photograph, Request, http_options, query_request, text_values
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
 StoredT = TypeVar("StoredT", FloorPlan, Venue, Album, AlbumPhotograph)
+LineT = TypeVar("LineT", BatchAnswer, AddedPhotograph)
 PageT = TypeVar("PageT", FloorPlanPage, VenuePage, VenuePlanPage, AlbumPage, AlbumPhotographPage)
 
 # Used when the service does not state its limit; every service allows this many.
@@ -108,7 +101,7 @@ class Transport:
         path: str,
         photographs: Sequence[Photograph],
         values: Mapping[str, object],
-        options: QueryOptions | ViewOptions,
+        options: Options,
         *,
         on_device: bool = False,
     ) -> bytes:
@@ -116,34 +109,39 @@ class Transport:
         if not on_device:
             return self.query(query_request, path, photographs, values, options)
         camera, others = split_options(options)
-        features = self._device.features(photographs, camera)
-        try:
+
+        def send() -> bytes:
+            features = self._device.features(photographs, camera)
             return self.query(query_request, path, features, values, others)
-        except ConflictError as error:
-            if error.type != _FOREIGN_FEATURES:
-                raise
-        self._device.forget()
-        features = self._device.features(photographs, camera)
-        return self.query(query_request, path, features, values, others)
+
+        return self._with_current_model(send)
 
     def localise_turn(
-        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: ViewOptions
+        self, turn: Film | Sequence[Photograph], values: Mapping[str, object], options: Options
     ) -> tuple[bytes, TurnFeatures]:
         """Send the features of a turn with its angles; return the answer, and what was sent."""
         camera, others = split_options(options)
-        for attempt in range(2):
+        fields = {**values, **others, "motion": "turn"}
+
+        def send() -> tuple[bytes, TurnFeatures]:
             sent = self._device.turn(turn, camera)
             angles: dict[str, object] = {"relative_heading_deg": sent.relative_heading_deg}
             if sent.relative_heading_deg is not None:
                 angles["relative_heading_std_deg"] = sent.relative_heading_std_deg
-            try:
-                fields = {**values, "motion": "turn", **angles}
-                return self.query(query_request, "/localise/sequence", sent.features, fields, others), sent
-            except ConflictError as error:
-                if attempt or error.type != _FOREIGN_FEATURES:
-                    raise
-            self._device.forget()
-        raise AssertionError("the second attempt answers or raises")
+            path = "/localise/sequence"
+            return self.query(query_request, path, sent.features, {**fields, **angles}), sent
+
+        return self._with_current_model(send)
+
+    def _with_current_model(self, send: Callable[[], Any]) -> Any:
+        """Return what `send` does; if the service has another model than its features, load that and send again."""
+        try:
+            return send()
+        except ConflictError as error:
+            if error.type != _FOREIGN_FEATURES:
+                raise
+        self._device.forget()
+        return send()
 
     def _fetch(self, path: str) -> bytes:
         return self.content(Request("GET", path, headers={"Accept": "*/*"}))
@@ -162,6 +160,21 @@ class Transport:
             cursor = page.next_cursor
             if cursor is None:
                 return
+
+    def _lines(self, kind: type[LineT], request: Request) -> Generator[LineT]:
+        """Send a streamed request, and yield the lines of its answer as they arrive.
+
+        Raises:
+            ConnectionFailedError: the connection broke off before the last line.
+        """
+        with closing(self._send(request)) as response:
+            try:
+                for line in response.iter_lines():
+                    yield parse(kind, line, "line")
+            except httpx.TransportError as error:
+                raise ConnectionFailedError(
+                    f"{request.method} {request.path} broke off: {type(error).__name__} {error}".rstrip()
+                ) from error
 
     def content(self, request: Request) -> bytes:
         """Send a request and return the answer's content."""

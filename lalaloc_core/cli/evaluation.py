@@ -24,6 +24,14 @@ _SHARES = ("within_10cm", "within_50cm", "within_1m", "within_1m_30deg", "correc
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
+    _add_evaluate(commands)
+    _add_score(commands)
+    _add_report(commands)
+    _add_worst(commands)
+    _add_calibrate(commands)
+
+
+def _add_evaluate(commands: Any) -> None:
     evaluate = commands.add_parser(
         "evaluate", help="localise the queries of a data set or of generated homes, and score the answers"
     )
@@ -71,11 +79,15 @@ def add_commands(commands: Any) -> None:
     evaluate.add_argument("--json", action="store_true", help="print all figures as JSON")
     evaluate.set_defaults(run=_evaluate)
 
+
+def _add_score(commands: Any) -> None:
     score = commands.add_parser("score", help="score the stored predictions of runs again, without model or data")
     score.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
     score.add_argument("--json", action="store_true", help="print all figures as JSON")
     score.set_defaults(run=_score)
 
+
+def _add_report(commands: Any) -> None:
     report = commands.add_parser("report", help="write a self-contained HTML report about runs")
     report.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
     report.add_argument(
@@ -84,6 +96,8 @@ def add_commands(commands: Any) -> None:
     report.add_argument("--pictures", type=Path, metavar="DIR", help="folder to write the page's pictures to as well")
     report.set_defaults(run=_report)
 
+
+def _add_worst(commands: Any) -> None:
     worst = commands.add_parser("worst", help="draw the worst queries of a run and count their properties")
     worst.add_argument("folder", type=Path, metavar="RUN", help="folder of the run")
     worst.add_argument("--count", type=count, default=100, metavar="N", help="number of queries (default: %(default)s)")
@@ -92,6 +106,8 @@ def add_commands(commands: Any) -> None:
     )
     worst.set_defaults(run=_worst)
 
+
+def _add_calibrate(commands: Any) -> None:
     calibrate = commands.add_parser(
         "calibrate", help="fit a bundle's matching weights and confidence on generated validation homes"
     )

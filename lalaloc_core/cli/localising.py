@@ -17,9 +17,13 @@ from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, pose_document, 
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
 if TYPE_CHECKING:
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.answer import DrawnAnswer
     from lalaloc_core.floorplan import FloorPlan
-    from lalaloc_core.photograph import StatedCamera
+    from lalaloc_core.localise.local_model import LocalModel
+    from lalaloc_core.localise.match import PoseGrid
+    from lalaloc_core.localise.search.pipeline import Localisation
+    from lalaloc_core.photograph import Photograph, StatedCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +145,8 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
 
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.answer import drawn_answer
-    from lalaloc_core.localise.belief import advice_for, information_bits, reason_for
-    from lalaloc_core.localise.encode.features import is_features, read_features
     from lalaloc_core.localise.local_model import LocalModel
-    from lalaloc_core.localise.localisability.step_report import step_after
     from lalaloc_core.localise.query import known_heading, stated_height
-    from lalaloc_core.photograph import StatedCamera
 
     bundle = Bundle.open(arguments.bundle)
     model = LocalModel(bundle)
@@ -159,12 +159,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         try:
             content = content_of(path)
             with named(path):
-                if is_features(content):
-                    if stated != StatedCamera():
-                        raise InvalidPhotographError("the camera is stated to `lalaloc encode`; leave its options out")
-                    view = read_features(content, bundle)
-                else:
-                    view = model.open(content, stated)
+                view = _opened(content, model, bundle, stated)
                 model.encoder.check(view)
         except InvalidPhotographError as error:
             if len(arguments.photographs) == 1:
@@ -177,30 +172,56 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
         found = model.localise(plan, grid, query)
         confidence_model = bundle.manifest.confidence_for(view=query.is_view)
         drawn = drawn_answer(plan, grid, found, confidence_model, _SOURCES[known.source], photograph=view)
-        confidence = found.confidence(confidence_model)
-        sure = found.posterior.position if confidence is None else confidence.position
-        advice = advice_for([view.azimuths], sure)
-        step = step_after(
-            plan, bundle.manifest, found, confidence, arcs=[view.azimuths], field=view.hfov.value, step_m=grid.step_m
-        )
         source = "searched" if found.heading_contradicted else known.source
-        warnings = ["the photograph contradicts the heading, which was estimated instead"]
-        warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
-        if confidence is not None:
-            objects, is_warned = query.objects, bool(warnings)
-            reason = reason_for(confidence.position, confidence.elsewhere, objects, is_warned=is_warned)
-            warnings += [] if reason is None else [reason]
-        details = {
-            "stage": found.stage,
-            "heading_source": source,
-            "heading_confidence": None if confidence is None else confidence.heading,
-            "probability_elsewhere": None if confidence is None else confidence.elsewhere,
-            "warnings": [*warnings, *([] if advice is None else [advice]), *([] if step is None else [step["text"]])],
-            "view": view_document(view)
-            | {"information_bits": information_bits(plan, grid.poses, found.posterior.pose), "next_step": step},
-            "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
-        }
+        details = {"stage": found.stage, "heading_source": source, **_details(plan, grid, bundle, view, found)}
         yield _Found(path, content, drawn, _document(path, drawn) | details)
+
+
+def _opened(content: bytes, model: LocalModel, bundle: Bundle, stated: StatedCamera) -> Photograph:
+    """Return a photograph, or the one whose features a file has.
+
+    Raises:
+        InvalidPhotographError: it cannot be read, or options about the camera are given with features.
+    """
+    from lalaloc_core.localise.encode.features import is_features, read_features
+    from lalaloc_core.photograph import StatedCamera
+
+    if not is_features(content):
+        return model.open(content, stated)
+    if stated != StatedCamera():
+        raise InvalidPhotographError("the camera is stated to `lalaloc encode`; leave its options out")
+    return read_features(content, bundle)
+
+
+def _details(plan: FloorPlan, grid: PoseGrid, bundle: Bundle, view: Photograph, found: Localisation) -> dict[str, Any]:
+    """Return the fields of an answer about its photograph, with warnings, advice and the next step."""
+    from lalaloc_core.localise.belief import advice_for, information_bits, reason_for
+    from lalaloc_core.localise.localisability.step_report import step_after
+
+    confidence = found.confidence(bundle.manifest.confidence_for(view=found.query.is_view))
+    sure = found.posterior.position if confidence is None else confidence.position
+    advice = advice_for([view.azimuths], sure)
+    step = step_after(
+        plan, bundle.manifest, found, confidence, arcs=[view.azimuths], field=view.hfov.value, step_m=grid.step_m
+    )
+    warnings = ["the photograph contradicts the heading, which was estimated instead"]
+    warnings = [*view.warnings, *(warnings if found.heading_contradicted else [])]
+    if confidence is not None:
+        objects, is_warned = found.query.objects, bool(warnings)
+        reason = reason_for(confidence.position, confidence.elsewhere, objects, is_warned=is_warned)
+        warnings += [] if reason is None else [reason]
+    return {
+        "heading_confidence": None if confidence is None else confidence.heading,
+        "probability_elsewhere": None if confidence is None else confidence.elsewhere,
+        "warnings": [*warnings, *([] if advice is None else [advice]), *([] if step is None else [step["text"]])],
+        "view": view_document(view)
+        | {"information_bits": information_bits(plan, grid.poses, found.posterior.pose), "next_step": step},
+        "model": _model_document(bundle),
+    }
+
+
+def _model_document(bundle: Bundle) -> dict[str, str]:
+    return {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256}
 
 
 def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamera) -> _Found:
@@ -236,7 +257,7 @@ def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedC
         "heading_source": "searched",
         "confidence": confidence,
         "warnings": turn.warnings,
-        "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
+        "model": _model_document(bundle),
     }
     return _Found(path, b"", drawn, _document(path, drawn) | details | turn_document(turn, found))
 

@@ -39,6 +39,12 @@ _GROUPS = (
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
+    _add_bench(commands)
+    _add_photographs(commands)
+    _add_reproduce(commands)
+
+
+def _add_bench(commands: Any) -> None:
     bench = commands.add_parser("bench", help="measure the figures of the results page and print them as JSON")
     add_options(bench, "--bundle", "--textures")
     bench.add_argument(
@@ -58,6 +64,8 @@ def add_commands(commands: Any) -> None:
     bench.add_argument("--queries", type=count, default=10, help="queries for --profile (default: %(default)s)")
     bench.set_defaults(run=_bench)
 
+
+def _add_photographs(commands: Any) -> None:
     photographs = commands.add_parser(
         "photographs", help="measure a model on annotated photographs of real rooms and draw its predictions"
     )
@@ -78,6 +86,8 @@ def add_commands(commands: Any) -> None:
     )
     photographs.set_defaults(run=_photographs)
 
+
+def _add_reproduce(commands: Any) -> None:
     reproduce = commands.add_parser("reproduce", help="measure a table of the paper and print it beside the paper's")
     reproduce.add_argument("--list", action="store_true", dest="only_list", help="list the tables and exit")
     reproduce.add_argument("--table", action="append", default=[], metavar="NAME", help="table; repeat for more")

@@ -9,11 +9,14 @@ import json
 import os
 import platform
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.cli.options import add_options
+from lalaloc_core.cli.options import add_options, count, processes
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from lalaloc_core.learn.training.config import TrainConfig
 
 # Four panoramas each; rendering one takes a third of a second, and validation uses all of them every few minutes.
 _VALIDATION_HOMES = 50
@@ -25,6 +28,13 @@ _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
+    _add_train(commands)
+    _add_export(commands)
+    _add_export_again(commands)
+    _add_add_objects(commands)
+
+
+def _add_train(commands: Any) -> None:
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
     train.add_argument(
         "stage",
@@ -85,7 +95,7 @@ def add_commands(commands: Any) -> None:
     train.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
     train.add_argument("--device", help="cpu or cuda (default: cuda if available)")
     train.add_argument(
-        "--workers", type=int, default=1, help="processes that make batches; 0 uses none (default: %(default)s)"
+        "--workers", type=processes, default=1, help="processes that make batches; 0 uses none (default: %(default)s)"
     )
     train.add_argument(
         "--render",
@@ -95,13 +105,15 @@ def add_commands(commands: Any) -> None:
     )
     train.add_argument(
         "--validation-homes",
-        type=int,
+        type=count,
         default=_VALIDATION_HOMES,
         metavar="N",
         help="maximum number of homes or scenes for validation (default: %(default)s)",
     )
     train.set_defaults(run=_train)
 
+
+def _add_export(commands: Any) -> None:
     export = commands.add_parser("export", help="export a trained run to a model bundle")
     export.add_argument("--run", type=Path, required=True, dest="folder", metavar="DIR", help="folder of the run")
     export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the bundle")
@@ -118,10 +130,14 @@ def add_commands(commands: Any) -> None:
     export.add_argument("--last", action="store_true", help="export the last weights instead of the best by validation")
     export.set_defaults(run=_export)
 
+
+def _add_export_again(commands: Any) -> None:
     again = commands.add_parser("export-again", help="export the networks of a model bundle again from its own weights")
     again.add_argument("bundle", type=Path, help="folder of the bundle")
     again.set_defaults(run=_export_again)
 
+
+def _add_add_objects(commands: Any) -> None:
     objects = commands.add_parser(
         "add-objects", help="add the pretrained classifier of objects, which tells types of rooms, to a model bundle"
     )
@@ -134,44 +150,16 @@ def _train(arguments: argparse.Namespace) -> None:
 
     from lalaloc_core.learn.data.dataset_detection import open_dataset
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
-    from lalaloc_core.learn.training.presets import PRESETS
     from lalaloc_core.learn.training.run import train_stage
     from lalaloc_core.learn.training.training_data import TrainingData
 
-    if arguments.data is not None and arguments.textures is not None:
-        raise InvalidInputError("--textures is for generated homes, not for --data")
-    if arguments.data is None and arguments.skip_bad:
-        raise InvalidInputError("--skip-bad is for --data")
-    if arguments.data is not None and arguments.render is not None:
-        raise InvalidInputError("--render is for generated homes, not for --data")
-    if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
-        raise InvalidInputError("--from starts a new run of one stage; it excludes --resume and end-to-end")
-    for option, name, stages in (
-        ("--layout-from", "layout_from", ("image",)),
-        ("--photographs", "photographs", ("image", "view")),
-        ("--teacher", "teacher", ("image", "view")),
-    ):
-        if arguments.stage not in stages and getattr(arguments, name) is not None:
-            raise InvalidInputError(f"{option} is for the stage {' or '.join(stages)}, not for '{arguments.stage}'")
-    config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
-    # End-to-end training takes its schedule from the image stage.
-    part = "layout" if arguments.stage == "layout" else "image"
-    changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("minutes", "steps")}
-    stage = dataclasses.replace(
-        getattr(config, part), **{name: value for name, value in changes.items() if value is not None}
-    )
-    config = dataclasses.replace(config, **{part: stage})
-    if arguments.seed is not None:
-        config = dataclasses.replace(config, seed=arguments.seed)
+    _check_train_options(arguments)
+    config = _train_config(arguments)
     device = torch.device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if device.type == "cpu":
         # Workers need cores of their own: threads that share cores are slower than fewer threads.
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
         _keep_freed_memory()
-    if arguments.workers < 0:
-        raise InvalidInputError(f"--workers is {arguments.workers}; it must be at least 0")
-    if arguments.validation_homes < 1:
-        raise InvalidInputError(f"--validation-homes is {arguments.validation_homes}; it must be at least 1")
     render = arguments.render or ("workers" if device.type == "cpu" else "device")
     heldout_homes = max(arguments.validation_homes // _PER_HELDOUT_HOME, 1)
     data = TrainingData(
@@ -195,6 +183,44 @@ def _train(arguments: argparse.Namespace) -> None:
         init_from=arguments.init_from,
         layout_from=arguments.layout_from,
     )
+
+
+def _check_train_options(arguments: argparse.Namespace) -> None:
+    """Check that the options of `train` belong together.
+
+    Raises:
+        InvalidInputError: one is for other data or stages.
+    """
+    if arguments.data is not None and arguments.textures is not None:
+        raise InvalidInputError("--textures is for generated homes, not for --data")
+    if arguments.data is None and arguments.skip_bad:
+        raise InvalidInputError("--skip-bad is for --data")
+    if arguments.data is not None and arguments.render is not None:
+        raise InvalidInputError("--render is for generated homes, not for --data")
+    if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
+        raise InvalidInputError("--from starts a new run of one stage; it excludes --resume and end-to-end")
+    for option, name, stages in (
+        ("--layout-from", "layout_from", ("image",)),
+        ("--photographs", "photographs", ("image", "view")),
+        ("--teacher", "teacher", ("image", "view")),
+    ):
+        if arguments.stage not in stages and getattr(arguments, name) is not None:
+            raise InvalidInputError(f"{option} is for the stage {' or '.join(stages)}, not for '{arguments.stage}'")
+
+
+def _train_config(arguments: argparse.Namespace) -> TrainConfig:
+    """Return the preset with the settings, schedule and seed of the options."""
+    from lalaloc_core.learn.training.presets import PRESETS
+
+    config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
+    # End-to-end training takes its schedule from the image stage.
+    part = "layout" if arguments.stage == "layout" else "image"
+    given = {name: getattr(arguments, name) for name in ("minutes", "steps")}
+    schedule = {name: value for name, value in given.items() if value is not None}
+    changes: dict[str, Any] = {part: dataclasses.replace(getattr(config, part), **schedule)}
+    if arguments.seed is not None:
+        changes["seed"] = arguments.seed
+    return dataclasses.replace(config, **changes)
 
 
 def _keep_freed_memory() -> None:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
 from datetime import datetime, timedelta
+from typing import Any
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
@@ -107,6 +108,14 @@ def build_parser() -> argparse.ArgumentParser:
     serving = commands.add_parser("serve", help="run the service")
     add_serve_arguments(serving)
     serving.set_defaults(run=serve)
+    _add_key_commands(commands)
+    add_tenant_commands(commands)
+    add_audit_commands(commands)
+    add_backup_commands(commands)
+    return parser
+
+
+def _add_key_commands(commands: Any) -> None:
     keys = commands.add_parser("keys", help="create, list, rotate and revoke API keys").add_subparsers(required=True)
 
     create = keys.add_parser("create", help="create a key and print it; it cannot be shown again")
@@ -151,10 +160,6 @@ def build_parser() -> argparse.ArgumentParser:
     revoke = keys.add_parser("revoke", help="revoke a key; it is rejected within LALALOC_KEY_CACHE_S")
     revoke.add_argument("id", help="id of the key: the part between the underscores")
     revoke.set_defaults(run=_revoke)
-    add_tenant_commands(commands)
-    add_audit_commands(commands)
-    add_backup_commands(commands)
-    return parser
 
 
 def _create(arguments: argparse.Namespace) -> int:

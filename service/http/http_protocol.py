@@ -114,135 +114,159 @@ class _Flow(FlowControl):
             super().resume_reading()
 
 
+class _Bounds:
+    """Limits and pace that the connections of a server share.
+
+    Attributes:
+        head_deadline_s: timeout for the head of a request, and for the rest of a refused body.
+        max_connections: maximum number of open connections.
+        dropping: pace of bodies of refused requests.
+    """
+
+    def __init__(self, head_deadline_s: float, max_connections: int) -> None:
+        self.head_deadline_s = head_deadline_s
+        self.max_connections = max_connections
+        self.dropping = Pace(_DROPPING_S)
+        self._penalties: dict[str, Pace] = {}
+
+    def penalise(self, address: str) -> None:
+        """Let the next connections of an address wait."""
+        if len(self._penalties) >= self.max_connections:
+            self._penalties.clear()
+        self._penalties.setdefault(address, Pace(_PENALTY_S)).wait_s(1)
+
+    def penalty_s(self, address: str) -> float:
+        """Return the time (s) for which a new connection of an address is not read."""
+        penalty = self._penalties.get(address)
+        return 0.0 if penalty is None else min(penalty.wait_s(0), _MAX_PENALTY_S)
+
+
 def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[asyncio.Protocol]:
     """Return an HTTP/1.1 protocol that bounds connections, heads, events and bodies of refused requests."""
-    dropping = Pace(_DROPPING_S)
-    penalties: dict[str, Pace] = {}
 
-    class BoundedProtocol(H11Protocol):
-        """Protocol that ends connections without a request in progress after a while, and reads refused bodies slowly.
-
-        The server's own keep-alive timer stops at the first byte of a head; this one does not.
-        """
-
-        _limit: asyncio.TimerHandle | None = None
-        _pause: asyncio.TimerHandle | None = None
-        _idle_since = 0.0
-        _is_socket = False
-        _parser: PacedParser
-        conn: _CountedConnection
-
-        def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-            super().connection_made(transport)
-            self.conn = _CountedConnection(lambda: self._parser)
-            account = ParsingAccount(self.config.app, lambda: self.scope, self._address)
-            self._parser = PacedParser(
-                transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused, account.add
-            )
-            self.flow = _Flow(transport, self._parser)
-            _send_at_once(transport)
-            self._idle_since = monotonic()
-            self._make_room()
-            self._watch()
-            penalty = penalties.get(self._address)
-            if penalty is not None and (wait_s := penalty.wait_s(0)) > 0.0:
-                self._parser.block("penalty")
-                self.loop.call_later(min(wait_s, _MAX_PENALTY_S), self._end_penalty)
-
-        def data_received(self, data: bytes) -> None:
-            self._unset_keepalive_if_required()
-            self._parser.feed(data)
-            if self.conn.our_state is h11.DONE and self.conn.their_state is h11.SEND_BODY:
-                self.transport.pause_reading()
-                self._pause = self.loop.call_later(dropping.wait_s(len(data)), self._parser.resume)
-            self._watch()
-
-        def send_400_response(self, msg: str) -> None:
-            """Refuse what the client sent, and close the connection."""
-            if self.cycle is not None and not self.cycle.response_complete:
-                # The application reads the body, and its answer would follow this one.
-                self.cycle.disconnected = True
-                self.cycle.message_event.set()
-            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-                status, text = self.conn.refusal or (400, msg)
-                headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"connection", b"close")]
-                for event in (
-                    h11.Response(status_code=status, headers=headers, reason=STATUS_PHRASES[status]),
-                    h11.Data(data=text.encode()),
-                    h11.EndOfMessage(),
-                ):
-                    self.transport.write(self.conn.send(event) or b"")
-            self.transport.close()
-
-        def handle_websocket_upgrade(self, event: h11.Request) -> None:
-            super().handle_websocket_upgrade(event)
-            self._parser.close()
-            self._is_socket = True
-
-        def on_response_complete(self) -> None:
-            super().on_response_complete()
-            self._idle_since = monotonic()
-            if self.conn.is_answered_in_small_chunks:
-                self._penalise()
-                self.transport.close()
-            # Requests that were sent with the last one are handled outside the feeder.
-            self._parser.settle()
-            self._watch()
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            super().connection_lost(exc)
-            self._unwatch()
-            self._parser.close()
-            if self._pause is not None:
-                self._pause.cancel()
-
-        @property
-        def _address(self) -> str:
-            return self.client[0] if self.client else ""
-
-        def _penalise(self) -> None:
-            if len(penalties) >= max_connections:
-                penalties.clear()
-            penalties.setdefault(self._address, Pace(_PENALTY_S)).wait_s(1)
-
-        def _end_penalty(self) -> None:
-            if not self.transport.is_closing():
-                self._parser.unblock("penalty")
-
-        def _parse(self, piece: bytes) -> None:
-            if piece:
-                self.conn.receive_data(piece)
-            self.handle_events()
-
-        def _make_room(self) -> None:
-            """Close the connection that is idle the longest if there are too many."""
-            if len(self.connections) <= max_connections:
-                return
-            idle = [peer for peer in self.connections if isinstance(peer, BoundedProtocol) and not peer._in_work]
-            oldest = min(idle, key=lambda peer: peer._idle_since, default=self)
-            if oldest is not self:
-                # Removed now, because its end is only noted in the loop's next round.
-                self.connections.discard(oldest)
-                oldest.transport.abort()
-
-        @property
-        def _in_work(self) -> bool:
-            cycle: Any = self.cycle
-            return cycle is not None and not cycle.response_complete
-
-        def _watch(self) -> None:
-            if self._in_work or self._is_socket:
-                self._unwatch()
-            elif self._limit is None:
-                delay_s = self.timeout_keep_alive + head_deadline_s
-                self._limit = self.loop.call_later(delay_s, self.transport.abort)
-
-        def _unwatch(self) -> None:
-            if self._limit is not None:
-                self._limit.cancel()
-                self._limit = None
+    class BoundedProtocol(_BoundedProtocol):
+        _bounds = _Bounds(head_deadline_s, max_connections)
 
     return BoundedProtocol
+
+
+class _BoundedProtocol(H11Protocol):
+    """Protocol that ends connections without a request in progress after a while, and reads refused bodies slowly.
+
+    The server's own keep-alive timer stops at the first byte of a head; this one does not.
+    """
+
+    _bounds: _Bounds
+    _limit: asyncio.TimerHandle | None = None
+    _pause: asyncio.TimerHandle | None = None
+    _idle_since = 0.0
+    _is_socket = False
+    _parser: PacedParser
+    conn: _CountedConnection
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().connection_made(transport)
+        self.conn = _CountedConnection(lambda: self._parser)
+        account = ParsingAccount(self.config.app, lambda: self.scope, self._address)
+        self._parser = PacedParser(
+            transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused, account.add
+        )
+        self.flow = _Flow(transport, self._parser)
+        _send_at_once(transport)
+        self._idle_since = monotonic()
+        self._make_room()
+        self._watch()
+        if (penalty_s := self._bounds.penalty_s(self._address)) > 0.0:
+            self._parser.block("penalty")
+            self.loop.call_later(penalty_s, self._end_penalty)
+
+    def data_received(self, data: bytes) -> None:
+        self._unset_keepalive_if_required()
+        self._parser.feed(data)
+        if self.conn.our_state is h11.DONE and self.conn.their_state is h11.SEND_BODY:
+            self.transport.pause_reading()
+            self._pause = self.loop.call_later(self._bounds.dropping.wait_s(len(data)), self._parser.resume)
+        self._watch()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what the client sent, and close the connection."""
+        if self.cycle is not None and not self.cycle.response_complete:
+            # The application reads the body, and its answer would follow this one.
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            status, text = self.conn.refusal or (400, msg)
+            headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"connection", b"close")]
+            for event in (
+                h11.Response(status_code=status, headers=headers, reason=STATUS_PHRASES[status]),
+                h11.Data(data=text.encode()),
+                h11.EndOfMessage(),
+            ):
+                self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        super().handle_websocket_upgrade(event)
+        self._parser.close()
+        self._is_socket = True
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._idle_since = monotonic()
+        if self.conn.is_answered_in_small_chunks:
+            self._bounds.penalise(self._address)
+            self.transport.close()
+        # Requests that were sent with the last one are handled outside the feeder.
+        self._parser.settle()
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._unwatch()
+        self._parser.close()
+        if self._pause is not None:
+            self._pause.cancel()
+
+    @property
+    def _address(self) -> str:
+        return self.client[0] if self.client else ""
+
+    def _end_penalty(self) -> None:
+        if not self.transport.is_closing():
+            self._parser.unblock("penalty")
+
+    def _parse(self, piece: bytes) -> None:
+        if piece:
+            self.conn.receive_data(piece)
+        self.handle_events()
+
+    def _make_room(self) -> None:
+        """Close the connection that is idle the longest if there are too many."""
+        if len(self.connections) <= self._bounds.max_connections:
+            return
+        idle = [peer for peer in self.connections if isinstance(peer, _BoundedProtocol) and not peer._in_work]
+        oldest = min(idle, key=lambda peer: peer._idle_since, default=self)
+        if oldest is not self:
+            # Removed now, because its end is only noted in the loop's next round.
+            self.connections.discard(oldest)
+            oldest.transport.abort()
+
+    @property
+    def _in_work(self) -> bool:
+        cycle: Any = self.cycle
+        return cycle is not None and not cycle.response_complete
+
+    def _watch(self) -> None:
+        if self._in_work or self._is_socket:
+            self._unwatch()
+        elif self._limit is None:
+            delay_s = self.timeout_keep_alive + self._bounds.head_deadline_s
+            self._limit = self.loop.call_later(delay_s, self.transport.abort)
+
+    def _unwatch(self) -> None:
+        if self._limit is not None:
+            self._limit.cancel()
+            self._limit = None
 
 
 def _send_at_once(transport: asyncio.Transport) -> None:

@@ -1,23 +1,18 @@
-"""Reading request bodies, with limits on size and time, and checks of every part."""
+"""Reading request bodies, with limits on size and time, and checks of fields; `multipart.py` reads their parts."""
 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Iterator, Mapping
+from collections.abc import AsyncGenerator, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from tempfile import SpooledTemporaryFile, TemporaryFile
 from time import monotonic
-from types import MappingProxyType
-from typing import Literal, NamedTuple, Self, TypeVar
+from typing import Literal, Self, TypeVar
 
 from fastapi import Request
 from pydantic import BaseModel, ValidationError
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect
 
 from service import errors
@@ -30,18 +25,6 @@ JSON = "application/json"
 GEOJSON = "application/geo+json"
 GEOPOSE = "application/geopose+json"
 MULTIPART = "multipart/form-data"
-# Boundaries and part headers, which do not count towards the limit.
-_ENVELOPE_BYTES = 64 * 1024
-_MAX_PARTS = 20
-# The motions between 100 photographs have about 16 kB.
-_MAX_FIELD_BYTES = 32 * 1024
-# Beginning of the parser's message about more files than it was allowed to read.
-_TOO_MANY_FILES = "Too many files"
-# Beginning of its message about a part without a file name that exceeds `_MAX_FIELD_BYTES`.
-_TOO_LARGE_PART = "Part exceeded maximum size"
-_NO_FILE = "must be a file (a part with a file name)"
-_LARGE_FIELD = f"has more than {_MAX_FIELD_BYTES} bytes, the limit of a field"
-_UTF_8 = b"utf-8"
 
 # Settings that limit an upload.
 Settable = Literal["max_plan_bytes", "max_photograph_bytes", "max_sequence_bytes", "max_film_bytes", "max_venue_bytes"]
@@ -81,39 +64,6 @@ class UploadLimits:
         )
 
 
-class Repeats(NamedTuple):
-    """Smallest and largest number of files of one name, and the setting of the largest, if it can be set."""
-
-    least: int
-    most: int
-    setting: str = ""
-
-    def fault(self, count: str) -> str:
-        """Return the message about a wrong number of files."""
-        if not self.setting:
-            return f"is given {count} times; send one"
-        return f"is given {count} times, {self.least} to {self.most} are needed (LALALOC_{self.setting.upper()})"
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Multipart body: fields and files; repeated files are `name[0]`, `name[1]`..."""
-
-    fields: dict[str, str]
-    files: dict[str, UploadedFile]
-
-    def named(self, name: str) -> list[UploadedFile]:
-        """Return the files of a name, in order: the single one, or those that were repeated."""
-        return [file for key, file in self.files.items() if key.partition("[")[0] == name]
-
-
-Check = Callable[[Mapping[str, str]], list[tuple[str, str]]]
-
-
-def _no_fields(_fields: Mapping[str, str]) -> list[tuple[str, str]]:
-    return []
-
-
 def media_type(request: Request, accepted: tuple[str, ...]) -> str:
     """Return the body's media type without parameters.
 
@@ -138,113 +88,13 @@ async def read_body(request: Request, limits: UploadLimits) -> UploadedFile:
         UploadTooLargeError, UploadTimeoutError, BytesInFlightError: a limit is exceeded.
         StoreFullError: the body cannot be written to disk.
     """
-    # Closed by `_kept`.
-    body = UploadFile(SpooledTemporaryFile(_memory_bytes(limits)), size=0)  # noqa: SIM115  # pyright: ignore[reportArgumentType]
-    with _spooling(limits):
-        async with _in_time(limits):
-            async for chunk in _counted(request, limits):
+    # Closed by `kept_file`.
+    body = UploadFile(SpooledTemporaryFile(memory_bytes_of(limits)), size=0)  # noqa: SIM115  # pyright: ignore[reportArgumentType]
+    with spooling(limits):
+        async with in_time(limits):
+            async for chunk in counted_chunks(request, limits):
                 await body.write(chunk)
-    return _kept(request, body)
-
-
-async def read_parts(
-    request: Request,
-    limits: UploadLimits,
-    *,
-    files: set[str],
-    fields: set[str],
-    check: Check = _no_fields,
-    repeated: Mapping[str, Repeats] = MappingProxyType({}),
-    aliases: Mapping[str, str] = MappingProxyType({}),
-    substitutes: Mapping[str, str] = MappingProxyType({}),
-) -> Parts:
-    """Read a multipart body.
-
-    Args:
-        request: the request.
-        limits: limits of the upload.
-        files: names of required files.
-        fields: names of optional fields.
-        check: returns (field, message) for invalid values of fields.
-        repeated: files that can be repeated.
-        aliases: other names of files, and the names under which they are returned.
-        substitutes: other kinds of files, and the names of the files that they can be sent instead of.
-
-    Raises:
-        UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
-        MalformedRequestError: not valid multipart.
-        UnsupportedMediaError: a charset other than UTF-8.
-        InvalidRequestError: a part is missing, unknown, duplicate or of the wrong kind, or `check` found a fault.
-    """
-    stated = request.headers.get("content-type", "")
-    options = parse_options_header(stated)[1]
-    charset = options.get(b"charset", _UTF_8)
-    if charset.lower() != _UTF_8:
-        raise errors.UnsupportedMediaError(stated, (f"{MULTIPART}; charset=utf-8",))
-    # One more than allowed, so that the error states the limit.
-    max_files = max(_MAX_PARTS, *(repeats.most + 1 for repeats in repeated.values())) if repeated else _MAX_PARTS
-    chunks = _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES)
-    parser = _NamingParser(
-        request.headers,
-        _within_parts(chunks, options.get(b"boundary", b""), max_files + _MAX_PARTS),
-        max_files=max_files,
-        max_fields=_MAX_PARTS,
-        max_part_size=_MAX_FIELD_BYTES,
-    )
-    parser.spool_max_size = _memory_bytes(limits)
-    try:
-        with _spooling(limits):
-            async with _in_time(limits):
-                form = await parser.parse()
-    except MultiPartException as error:
-        if repeated and error.message.startswith(_TOO_MANY_FILES):
-            faults = [
-                (name, repeats.fault(f"more than {repeats.most}"))
-                for name, repeats in repeated.items()
-                if repeats.most > 1
-            ]
-            raise errors.InvalidRequestError(faults) from error
-        if error.message.startswith(_TOO_LARGE_PART):
-            name = parser.part_name[:50]
-            is_file = aliases.get(name, name) in {*files, *repeated, *substitutes}
-            raise errors.InvalidRequestError([(name, _NO_FILE if is_file else _LARGE_FIELD)]) from error
-        raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error.message}") from error
-    except FormParserError as error:
-        raise errors.MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
-    uploaded = {id(value): _kept(request, value) for _, value in form.multi_items() if isinstance(value, UploadFile)}
-    items = [
-        (aliases.get(name, name), value if isinstance(value, str) else uploaded[id(value)])
-        for name, value in form.multi_items()
-    ]
-    return _sort(items, limits, files, fields, check, repeated, substitutes)
-
-
-class _NamingParser(MultiPartParser):
-    """Parser that tells the name of the part that it reads, for errors.
-
-    Attributes:
-        part_name: name of the last part whose head was read; empty before.
-    """
-
-    part_name = ""
-    _header_name = _header_value = b""
-
-    def on_header_field(self, data: bytes, start: int, end: int) -> None:
-        """Read a piece of a header's name."""
-        super().on_header_field(data, start, end)
-        self._header_name += data[start:end]
-
-    def on_header_value(self, data: bytes, start: int, end: int) -> None:
-        """Read a piece of a header's value."""
-        super().on_header_value(data, start, end)
-        self._header_value += data[start:end]
-
-    def on_header_end(self) -> None:
-        """Note the name of the part."""
-        super().on_header_end()
-        if self._header_name.lower() == b"content-disposition":
-            self.part_name = parse_options_header(self._header_value)[1].get(b"name", b"").decode("utf-8", "replace")
-        self._header_name = self._header_value = b""
+    return kept_file(request, body)
 
 
 def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
@@ -270,64 +120,14 @@ def faults_of(
     return []
 
 
-def _sort(
-    items: list[tuple[str, UploadedFile | str]],
-    limits: UploadLimits,
-    files: set[str],
-    fields: set[str],
-    check: Check,
-    repeated: Mapping[str, Repeats],
-    substitutes: Mapping[str, str],
-) -> Parts:
-    faults: list[tuple[str, str]] = []
-    found = Parts({}, {})
-    repeated = {**{other: repeated[name] for other, name in substitutes.items() if name in repeated}, **repeated}
-    needed, given = files | (repeated.keys() - substitutes.keys()), {name for name, _ in items}
-    files, counts = needed | substitutes.keys(), Counter[str]()
-    for part, value in items:
-        label, name = part[:50], part
-        if part not in files | fields:
-            known = ", ".join(sorted(files | fields))
-            faults.append((label, f"unknown part; known: {known}"))
-            continue
-        if part in repeated:
-            name = f"{part}[{counts[part]}]"
-            counts[part] += 1
-        if name in found.fields or name in found.files:
-            faults.append((label, "given more than once"))
-        elif part in fields:
-            if isinstance(value, UploadedFile):
-                faults.append((label, "must be a plain field, not a file"))
-            else:
-                found.fields[name] = value
-        elif isinstance(value, UploadedFile):
-            if len(value) > limits.max_bytes:
-                raise errors.UploadTooLargeError(limits.name, limits.max_bytes, len(value))
-            found.files[name] = value
-        else:
-            faults.append((label, _NO_FILE))
-    substituted = {name for other, name in substitutes.items() if other in given}
-    faults.extend((name, "is missing") for name in sorted(needed - given - substituted))
-    for name in sorted(set(substitutes.values())):
-        kinds = [kind for kind in (name, *substitutes) if kind in given and substitutes.get(kind, name) == name]
-        faults.extend((kind, f"is given beside {kinds[0]}; send one of the two") for kind in kinds[1:])
-    for name, repeats in repeated.items():
-        if name in given and not repeats.least <= counts[name] <= repeats.most:
-            faults.append((name, repeats.fault(str(counts[name]))))
-    faults.extend(check(found.fields))
-    if faults:
-        raise errors.InvalidRequestError(faults)
-    return found
-
-
-def _kept(request: Request, upload: UploadFile) -> UploadedFile:
+def kept_file(request: Request, upload: UploadFile) -> UploadedFile:
     """Return an uploaded file, which is deleted at the end of the request."""
     file = UploadedFile(upload.file, upload.filename)
     on_request_end(request.scope, file.close)
     return file
 
 
-def _memory_bytes(limits: UploadLimits) -> int:
+def memory_bytes_of(limits: UploadLimits) -> int:
     """Return the size beyond which a file is written to disk; 0, never, without a usable folder for it."""
     try:
         with TemporaryFile():
@@ -337,7 +137,7 @@ def _memory_bytes(limits: UploadLimits) -> int:
 
 
 @contextmanager
-def _spooling(limits: UploadLimits) -> Iterator[None]:
+def spooling(limits: UploadLimits) -> Iterator[None]:
     """Turn errors of temporary files into the error of a full disk."""
     try:
         yield
@@ -347,7 +147,9 @@ def _spooling(limits: UploadLimits) -> Iterator[None]:
         raise errors.SpoolFullError(limits.memory_bytes) from error
 
 
-async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: int = 0) -> AsyncGenerator[bytes, None]:
+async def counted_chunks(
+    request: Request, limits: UploadLimits, *, envelope_bytes: int = 0
+) -> AsyncGenerator[bytes, None]:
     """Yield the body as it arrives, within the limits of size and rate."""
     max_bytes = limits.max_bytes + envelope_bytes
     stated = request.headers.get("content-length", "")
@@ -367,26 +169,6 @@ async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: in
         yield chunk
 
 
-async def _within_parts(
-    chunks: AsyncGenerator[bytes, None], boundary: bytes, limit: int
-) -> AsyncGenerator[bytes, None]:
-    """Yield a multipart body whose boundary occurs a bounded number of times.
-
-    A boundary costs the parser as much as hundreds of bytes, also if the next bytes show that it is none.
-
-    Raises:
-        MalformedRequestError: the boundary occurs in the content of the parts.
-    """
-    found = 0
-    async for chunk in chunks:
-        found += chunk.count(b"--" + boundary)
-        if found > limit + 1:
-            raise errors.MalformedRequestError(
-                f"the boundary occurs more than {limit} times; choose one that does not occur in the parts"
-            )
-        yield chunk
-
-
 async def _next_chunk(chunks: AsyncGenerator[bytes, None], patience_s: float, limits: UploadLimits) -> bytes | None:
     """Return the next bytes of a body, None at its end."""
     try:
@@ -402,7 +184,8 @@ async def _next_chunk(chunks: AsyncGenerator[bytes, None], patience_s: float, li
 
 
 @asynccontextmanager
-async def _in_time(limits: UploadLimits) -> AsyncGenerator[None, None]:
+async def in_time(limits: UploadLimits) -> AsyncGenerator[None, None]:
+    """Turn the timeout of a whole upload into its error."""
     try:
         async with asyncio.timeout(limits.deadline_s):
             yield

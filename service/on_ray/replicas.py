@@ -27,7 +27,8 @@ from service.on_ray.index_shards import RemoteIndices, Stage
 from service.on_ray.outcome import Success, returning_failures
 from service.on_ray.remote import RemoteLocaliser, RemoteOptimiser, RemotePhotographEncoder, StoredPlace
 from service.query import Nearby, Where
-from service.runtime import Backends, start_runtime, warm_encoder
+from service.query_components import Backends, warm_encoder
+from service.runtime import start_runtime
 from service.settings import Settings
 from service.telemetry import Telemetry, configure_logging
 from service.venues.plan_list import PlanList

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from lalaloc_core.bundle import Bundle, Manifest
+from lalaloc_core.bundle import Bundle, ConfidenceModel, Manifest
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.localise.belief import Posterior, photograph_heading, pose_uncertainty, probability_map, reason_for
 from lalaloc_core.localise.query import KnownHeading, Query
@@ -59,10 +59,7 @@ def compose_answer(
         with_step: compute the next step of an answer that is not sure.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view, turn=found.query.is_turn)
-    final, uncertainty = found.best[found.stage], None
-    if model is not None and final.information is not None:
-        placed = ground.place(final)
-        uncertainty = pose_uncertainty(final.information, placed.plan.rooms[placed.candidate.room_index], model)
+    position_m2, heading_std_deg = _uncertainty(found, ground, model)
     confidence = found.confidence(model, ground.share(found))
     candidates = [
         _candidate(ground.place(candidate), found.query, None if confidence is None else confidence.candidates[index])
@@ -87,10 +84,8 @@ def compose_answer(
         heading_confidence=None if confidence is None else confidence.heading,
         probability_elsewhere=None if confidence is None else confidence.elsewhere,
         warnings=warnings,
-        covariance_m2=None if uncertainty is None else uncertainty.position_m2.tolist(),
-        heading_std_deg=None
-        if uncertainty is None or uncertainty.heading_std is None
-        else math.degrees(uncertainty.heading_std),
+        covariance_m2=position_m2,
+        heading_std_deg=heading_std_deg,
         stage=found.stage,
         cost=best.cost,
         latent_distance=best.latent_distance,
@@ -101,6 +96,21 @@ def compose_answer(
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
         model=ModelAnswer.of(bundle),
     )
+
+
+def _uncertainty(
+    found: Localisation, ground: Ground, model: ConfidenceModel | None
+) -> tuple[list[list[float]] | None, float | None]:
+    """Return the covariance (m²) of the position and the standard deviation (degrees) of the heading, where known."""
+    final = found.best[found.stage]
+    if model is None or final.information is None:
+        return None, None
+    placed = ground.place(final)
+    uncertainty = pose_uncertainty(final.information, placed.plan.rooms[placed.candidate.room_index], model)
+    if uncertainty is None:
+        return None, None
+    std = uncertainty.heading_std
+    return uncertainty.position_m2.tolist(), None if std is None else math.degrees(std)
 
 
 def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:

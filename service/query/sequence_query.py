@@ -77,20 +77,7 @@ class SequenceSearch:
         timings_ms = self._parts.executor.observe(context, found.stage)
 
         def compose() -> SequenceAnswer:
-            spots = _spots(photographs, found, one_spot=form.motion == "turn")
-            answers = [
-                compose_answer(
-                    picture,
-                    ground,
-                    spot,
-                    heading,
-                    timings_ms=timings_ms,
-                    bundle=self._parts.bundle,
-                    # Angles of a turn count from its first photograph; a walk goes on from its last.
-                    with_step=index == (0 if form.motion == "turn" else count - 1),
-                )
-                for index, (heading, picture, spot) in enumerate(zip(known, found.pictures, spots, strict=True))
-            ]
+            answers = self._answers(form, photographs, known, found, ground, timings_ms)
             answers = _with_relative_headings(answers, form, linked)
             share = min(ground.share(picture) for picture in found.pictures)
             answer = compose_sequence_answer(answers, found, form.steps(count), self._parts.bundle.manifest, share)
@@ -104,6 +91,32 @@ class SequenceSearch:
             return answer.model_copy(update=extras)
 
         return await self._parts.executor.compute(context, compose)
+
+    def _answers(
+        self,
+        form: SequenceForm,
+        photographs: Sequence[Photograph],
+        known: Sequence[KnownHeading],
+        found: SequenceLocalisation,
+        ground: Ground,
+        timings_ms: dict[str, float],
+    ) -> list[LocaliseAnswer]:
+        """Return the answer for each photograph; one of them has the next step."""
+        spots = _spots(photographs, found, one_spot=form.motion == "turn")
+        # Angles of a turn count from its first photograph; a walk goes on from its last.
+        with_step = 0 if form.motion == "turn" else len(photographs) - 1
+        return [
+            compose_answer(
+                picture,
+                ground,
+                spot,
+                heading,
+                timings_ms=timings_ms,
+                bundle=self._parts.bundle,
+                with_step=index == with_step,
+            )
+            for index, (heading, picture, spot) in enumerate(zip(known, found.pictures, spots, strict=True))
+        ]
 
     async def _decode(self, query: SequenceQuery) -> tuple[list[Photograph], LinkedTurn | None, Film | None]:
         """Return the photographs, or the film's frames, and the angles of a turn that their overlap tells."""

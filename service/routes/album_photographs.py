@@ -20,9 +20,10 @@ from service.http.accept import preferred
 from service.http.conditional import expected_revision, not_modified, revision_etag, tagged_answer
 from service.http.cursors import cursor_text, parse_venue_cursor
 from service.http.fields import parse_document
+from service.http.multipart import Repeats
 from service.http.piecewise import NDJSON, LinesResponse
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON, MULTIPART, Repeats
+from service.http.uploads import GEOJSON, JSON, MULTIPART
 from service.query import AlbumPhotographQuery, Content, QueryContext
 from service.routes.albums import album_of
 from service.routes.batch_lines import BatchLines

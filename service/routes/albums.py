@@ -14,8 +14,9 @@ from service import errors
 from service.http.conditional import not_modified, revision_etag, tagged_answer
 from service.http.events import EventStream
 from service.http.fields import parse_document
+from service.http.multipart import Parts
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, Parts
+from service.http.uploads import JSON
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
 from service.routes.descriptions import (
     BODY_ERRORS,

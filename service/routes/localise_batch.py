@@ -9,9 +9,9 @@ from fastapi import APIRouter, Response
 from lalaloc_core.errors import InvalidHintError
 from service import errors
 from service.capacity.admission_control import BATCH
+from service.http.multipart import Repeats
 from service.http.piecewise import NDJSON, LinesResponse
 from service.http.problems import problem_responses
-from service.http.uploads import Repeats
 from service.query import Content, PhotographQuery, QueryContext
 from service.routes.batch_lines import BatchLines
 from service.routes.dependencies import Call

@@ -9,8 +9,9 @@ from fastapi import APIRouter, Response
 from lalaloc_core.errors import InvalidFilmError, InvalidMotionError
 from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
 from service.http.accept import preferred
+from service.http.multipart import Parts, Repeats
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, GEOPOSE, JSON, Parts, Repeats, Settable
+from service.http.uploads import GEOJSON, GEOPOSE, JSON, Settable
 from service.query import Content, QueryContext, SequenceQuery
 from service.query.geopose import geojson_features, geopose_documents
 from service.routes.dependencies import ApiCall, Call

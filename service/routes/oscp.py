@@ -17,9 +17,10 @@ from service.errors import (
     UploadTooLargeError,
 )
 from service.http.fields import parse_document
+from service.http.multipart import Parts
 from service.http.problems import problem_responses
 from service.http.request_end import on_request_end
-from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
+from service.http.uploads import JSON, UploadLimits, media_type, read_body
 from service.query import Nearby, PhotographQuery, QueryContext
 from service.query.oscp import (
     camera_fields,

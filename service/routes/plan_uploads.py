@@ -12,7 +12,8 @@ from pydantic import BaseModel
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, OnStep, building_name
 from service.errors import InvalidRequestError
-from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
+from service.http.multipart import Parts, read_parts
+from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_body
 from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
 from service.routes.dependencies import ApiCall
 from service.routes.descriptions import json_body

@@ -15,18 +15,16 @@ from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
 from lalaloc_core.localise.search.pipeline import StageClock
 from service import errors
+from service.http.multipart import Parts, Repeats, read_parts
 from service.http.uploads import (
     GEOJSON,
     GEOPOSE,
     JSON,
     MULTIPART,
-    Parts,
-    Repeats,
     Settable,
     UploadLimits,
     faults_of,
     media_type,
-    read_parts,
     validate_fields,
 )
 from service.query import Content, QueryContext

@@ -14,8 +14,9 @@ from lalaloc_core.render.sampling import grid_size
 from service import errors
 from service.http.accept import preferred
 from service.http.fields import parse_document
+from service.http.multipart import Parts
 from service.http.problems import problem_responses
-from service.http.uploads import GEOPOSE, JSON, MULTIPART, Parts, media_type
+from service.http.uploads import GEOPOSE, JSON, MULTIPART, media_type
 from service.query import MAX_POSES, TrackQuery
 from service.query.geopose import geopose_document
 from service.routes.dependencies import ApiCall, Call, is_id

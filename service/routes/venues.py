@@ -21,8 +21,9 @@ from service.errors import (
 from service.http.conditional import not_modified, revision_etag, tagged_answer
 from service.http.cursors import parse_venue_cursor
 from service.http.fields import Model, parse_document
+from service.http.multipart import Parts
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, Parts, media_type
+from service.http.uploads import JSON, MULTIPART, media_type
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
 from service.routes.descriptions import (
     BODY_ERRORS,

@@ -50,12 +50,12 @@ class ChosenPlans:
 
     Attributes:
         members: rows of the plans, see `Venues.searchable_plans`.
-        log_mass: (p,) log masses of all plans that are ready, see `localise.venue.plan_index`.
+        log_mass: (p,) log masses of all plans that are ready, see `localise.venue.plan_index`; None if all are chosen.
         index: (m,) numbers of the chosen plans among these.
     """
 
     members: Sequence[Row[Any]]
-    log_mass: Float[np.ndarray, "p"]
+    log_mass: Float[np.ndarray, "p"] | None
     index: Int[np.ndarray, "m"]
 
 

@@ -26,7 +26,7 @@ from service.storage.records import PlanRecord
 from service.venues.plan_indices import IndexSource
 from service.venues.plan_list import PlanList
 from service.venues.venue_hints import VenueHints
-from service.venues.venue_plans import VenuePlans, possible_plans
+from service.venues.venue_plans import ChosenPlans, VenuePlans, possible_plans
 
 # Interval (s) of polling while no plan of a venue is ready.
 _POLL_INTERVAL_S = 0.25
@@ -137,25 +137,18 @@ class VenueSearch:
             DeadlineExceededError: the deadline passed.
         """
         query = max(queries, key=lambda encoded: len(encoded.roll))
-        rows, log_mass, numbers = ready, None, list(range(len(ready)))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
+        chosen = ChosenPlans(ready, None, np.arange(len(ready)))
         if query.profile is not None and self._plans.needs_choice(ready, query):
-            possible = possible_plans(ready, hints.log_prior(ready, shares))
-            whole_venue = venue_id if possible is ready else None
+            prior = partial(hints.log_prior, shares=shares)
             # Another query may be making the index, in the time that it has itself.
             async with context.bounded():
-                known, plan_index = await self._indices.index(tenant, possible, compute, venue_id=whole_venue)
-            manifest = self._encoder.manifest
-            choosing = [(encoded, manifest.evidence_for(view=encoded.is_view)) for encoded in queries]
-            log_prior = hints.log_prior(known, shares)
-            preferred = None if favour is None else favour(known)
-            chosen = await compute(partial(self._plans.choose, known, plan_index, choosing, log_prior, preferred))
-            rows, log_mass, numbers = chosen.members, chosen.log_mass, chosen.index.tolist()
+                chosen = await self._choose(tenant, venue_id, ready, queries, prior, compute, favour)
             if hints.rooms:
                 warnings.append(
-                    f"the hint rooms was applied to the {len(rows)} most probable of {len(ready)} floor plans"
+                    f"the hint rooms was applied to the {len(chosen.members)} most probable of {len(ready)} floor plans"
                 )
-        loaded = await self._plans.load(tenant, rows)
+        loaded = await self._plans.load(tenant, chosen.members)
         kept = [entry for entry in loaded if _height_is_possible(entry[1], form)]
         if len(kept) < len(loaded):
             left_out = len(loaded) - len(kept)
@@ -164,18 +157,37 @@ class VenueSearch:
             if loaded:
                 check_height_m(loaded[0][1], query.camera_height.height_m)
             raise VenueNotReadyError(venue_id, len(ready), 0.0)
-        number_of = {row.plan_id: number for row, number in zip(rows, numbers, strict=True)}
+        number_of = {row.plan_id: int(number) for row, number in zip(chosen.members, chosen.index, strict=True)}
         searched = [row for row, _, _ in kept]
         return LoadedPlans(
             rows=searched,
             records=[record for _, record, _ in kept],
             grids=[grid for _, _, grid in kept],
-            log_mass=log_mass,
+            log_mass=chosen.log_mass,
             area_share=sum(row.area_m2 for row in searched) / float(ready.area_m2.sum()),
             numbers=[number_of[row.plan_id] for row in searched],
             hint_shares=shares,
             warnings=warnings,
         )
+
+    async def _choose(
+        self,
+        tenant: str,
+        venue_id: str,
+        ready: PlanList,
+        queries: Sequence[Query],
+        prior: Callable[[PlanList], Float[np.ndarray, "p"]],
+        compute: Callable[..., Any],
+        favour: Favour | None,
+    ) -> ChosenPlans:
+        """Return the most probable plans; `prior` returns their log prior by the hints."""
+        possible = possible_plans(ready, prior(ready))
+        whole_venue = venue_id if possible is ready else None
+        known, plan_index = await self._indices.index(tenant, possible, compute, venue_id=whole_venue)
+        manifest = self._encoder.manifest
+        choosing = [(encoded, manifest.evidence_for(view=encoded.is_view)) for encoded in queries]
+        preferred = None if favour is None else favour(known)
+        return await compute(partial(self._plans.choose, known, plan_index, choosing, prior(known), preferred))
 
 
 def _height_is_possible(record: PlanRecord, form: HeightFields) -> bool:

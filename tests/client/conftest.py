@@ -13,12 +13,31 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from time import monotonic
 from typing import Any
 
+import httpx
 import pytest
 
 from lalaloc_client import AsyncClient, Client
-from tests.service.conftest import _clean_environment, database_of, empty_database, panorama, postgres, start_app
+from tests.service.conftest import (
+    _clean_environment,
+    app_settings,
+    database_of,
+    empty_database,
+    panorama,
+    postgres,
+    start_app,
+)
+from tests.service.conftest import client as app
 
-__all__ = ["_clean_environment", "database_of", "empty_database", "panorama", "postgres", "start_app"]
+__all__ = [
+    "_clean_environment",
+    "app",
+    "app_settings",
+    "database_of",
+    "empty_database",
+    "panorama",
+    "postgres",
+    "start_app",
+]
 
 MakeClient = Callable[..., AbstractContextManager[Any]]
 
@@ -117,3 +136,10 @@ def _blocking(*arguments: Any, **options: Any) -> Iterator[_BlockingAdapter]:
 def make_client(request: pytest.FixtureRequest) -> MakeClient:
     """Return a function that creates a client of either kind."""
     return Client if request.param == "sync" else _blocking
+
+
+@pytest.fixture
+def service(app: httpx.Client, make_client: MakeClient) -> Iterator[Any]:
+    """Return a client of the module's app."""
+    with make_client(str(app.base_url)) as client:
+        yield client

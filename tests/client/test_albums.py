@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -15,24 +14,15 @@ from service.errors import DeadlineExceededError
 from service.query.album_search import AlbumSearch
 from tests.client.conftest import MakeClient
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import StartApp
+from tests.service.conftest import HOME
 
-HOME = json.loads((EXAMPLES / "flat.json").read_text())
 FILES = [EXAMPLES / "kitchen.jpg", EXAMPLES / "bedroom.jpg"]
 
 
 @pytest.fixture(scope="module")
-def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Return an app with the shipped model, as the tiny one gives no features."""
-    with start_app(tmp_path_factory.mktemp("data"), bundle=default_bundle(), request_deadline_s=90.0) as started:
-        yield started
-
-
-@pytest.fixture
-def service(app: httpx.Client, make_client: MakeClient) -> Iterator[Any]:
-    """Return a client of that app."""
-    with make_client(str(app.base_url)) as client:
-        yield client
+def app_settings() -> dict[str, Any]:
+    # The tiny model gives no features.
+    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 def test_folder_is_pinned_corrected_and_taken_away(service: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -16,25 +15,22 @@ from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from tests.client.conftest import FailingServer, Planned
 from tests.client.test_retries import LOCALISATION
-from tests.service.conftest import FLAT, StartApp, upload
+from tests.service.conftest import FLAT, upload
 
 COUNT = 14
-# Four concurrent queries, three of them per client, and no queue.
-NARROW = {"max_queries": 4, "max_waiting_queries": 0}
 ONCE = RetryPolicy(attempts=1)
 
 
 @pytest.fixture(scope="module")
-def narrow(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Return a service with a low limit of concurrent queries."""
-    with start_app(tmp_path_factory.mktemp("data"), **NARROW) as started:
-        yield started
+def app_settings() -> dict[str, Any]:
+    # Four concurrent queries, three of them per client, and no queue.
+    return {"max_queries": 4, "max_waiting_queries": 0}
 
 
 @pytest.fixture(scope="module")
-def plan_id(narrow: httpx.Client) -> str:
+def plan_id(app: httpx.Client) -> str:
     """Return the id of a stored plan."""
-    return upload(narrow, FLAT)
+    return upload(app, FLAT)
 
 
 def query_on_threads(client: Client, plan_id: str, panorama: bytes) -> list[Any]:
@@ -48,33 +44,33 @@ def count_rejections(service: httpx.Client) -> float:
     return next(float(line.removeprefix(prefix)) for line in lines if line.startswith(prefix))
 
 
-def test_concurrent_queries_are_not_rejected(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    before = count_rejections(narrow)
-    with Client(str(narrow.base_url), retry=ONCE) as client:
+def test_concurrent_queries_are_not_rejected(app: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    before = count_rejections(app)
+    with Client(str(app.base_url), retry=ONCE) as client:
         answers = query_on_threads(client, plan_id, panorama)
     assert len({answer.position for answer in answers}) == 1
-    assert count_rejections(narrow) == before
+    assert count_rejections(app) == before
 
 
-def test_concurrent_queries_with_asyncio_are_not_rejected(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_concurrent_queries_with_asyncio_are_not_rejected(app: httpx.Client, plan_id: str, panorama: bytes) -> None:
     async def query() -> list[Any]:
-        async with AsyncClient(str(narrow.base_url), retry=ONCE) as client:
+        async with AsyncClient(str(app.base_url), retry=ONCE) as client:
             return await asyncio.gather(*(client.localise(plan_id, panorama, refine="none") for _ in range(COUNT)))
 
-    before = count_rejections(narrow)
+    before = count_rejections(app)
     answers = asyncio.run(query())
     assert len(answers) == COUNT
-    assert count_rejections(narrow) == before
+    assert count_rejections(app) == before
 
 
 @pytest.mark.slow
-def test_rejected_queries_are_retried(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    before = count_rejections(narrow)
+def test_rejected_queries_are_retried(app: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    before = count_rejections(app)
     patient = RetryPolicy(attempts=40, total_s=60.0)
-    with Client(str(narrow.base_url), retry=patient, max_queries=COUNT) as client:
+    with Client(str(app.base_url), retry=patient, max_queries=COUNT) as client:
         answers = query_on_threads(client, plan_id, panorama)
     assert len(answers) == COUNT
-    assert count_rejections(narrow) > before
+    assert count_rejections(app) > before
 
 
 def test_sequential_queries_do_not_fetch_limits(failing: FailingServer) -> None:

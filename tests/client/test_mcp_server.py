@@ -8,7 +8,7 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,8 @@ _JPEG = "data:image/jpeg;base64,"
 
 
 @pytest.fixture(scope="module")
-def app(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    """Return an app for all tests over stdio."""
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
-        yield started
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 @pytest.fixture

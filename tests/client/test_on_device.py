@@ -16,17 +16,14 @@ from lalaloc_core.localise.encode.features import DEVICE_FILES
 from tests.client.conftest import FailingServer, MakeClient, Planned
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import EXAMPLES, jpeg
-from tests.service.conftest import StartApp, upload
+from tests.service.conftest import upload
 
 KITCHEN, PHONE = EXAMPLES / "kitchen.jpg", EXAMPLES / "phone.jpg"
 
 
 @pytest.fixture(scope="module")
-def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Return an app that takes features only."""
-    folder, bundle = tmp_path_factory.mktemp("data"), default_bundle()
-    with start_app(folder, bundle=bundle, require_features=True, request_deadline_s=90.0) as started:
-        yield started
+def app_settings() -> dict[str, Any]:
+    return {"bundle": default_bundle(), "require_features": True, "request_deadline_s": 90.0}
 
 
 @pytest.fixture(scope="module")

@@ -26,19 +26,8 @@ from tests.service.conftest import FLAT, StartApp
 
 
 @pytest.fixture(scope="module")
-def app(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    """Return an app for all tests of this file."""
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
-        yield started
-
-
-@pytest.fixture
-def service(app: httpx.Client, make_client: MakeClient) -> Iterator[Any]:
-    """Return a client of that app."""
-    with make_client(str(app.base_url)) as client:
-        yield client
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 def test_plan_is_stored_listed_and_deleted(service: Any, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -25,15 +24,9 @@ from lalaloc_client import (
     world_from_plan,
     yaw_of,
 )
-from tests.service.conftest import StartApp, upload
+from tests.service.conftest import upload
 
 COVARIANCE = ((0.04, 0.01, 0.3), (0.01, 0.09, -0.2), (0.3, -0.2, 4.0))
-
-
-@pytest.fixture(scope="module")
-def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data")) as started:
-        yield started
 
 
 def pose_at(heading_deg: float) -> TrackedPose:

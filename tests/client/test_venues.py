@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from lalaloc_client import ConflictError, InvalidError, NotFoundError, VenueAnchor, VenuePlan
-from tests.client.conftest import MakeClient
 from tests.importers.test_roomplan import two_stories
-from tests.service.conftest import FLAT, StartApp
+from tests.service.conftest import FLAT
 
 ANCHOR = VenueAnchor(51.7546, -1.2545, altitude_m=61.0, north_deg=12.5)
-
-
-@pytest.fixture(scope="module")
-def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Return an app for all tests of this file."""
-    with start_app(tmp_path_factory.mktemp("data")) as started:
-        yield started
-
-
-@pytest.fixture
-def service(app: httpx.Client, make_client: MakeClient) -> Iterator[Any]:
-    """Return a client of that app."""
-    with make_client(str(app.base_url)) as client:
-        yield client
 
 
 def test_venue_is_stored_changed_and_deleted(service: Any) -> None:

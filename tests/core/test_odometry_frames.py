@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from lalaloc_core.errors import InvalidMotionError
-from lalaloc_core.localise.tracking.trajectories import FRAMES, OdometryErrors, read_trajectory
+from lalaloc_core.localise.tracking.trajectories import Frame, OdometryErrors, read_trajectory
 
 # Azimuths (radians, clockwise) and places (m, to the right and forward of the first pose) of a walk.
 TURNS = np.radians([0.0, -40.0, -90.0, -100.0, 30.0])
@@ -74,7 +75,7 @@ def test_straight_ways_tell_the_frame_by_their_heights() -> None:
 def test_poses_that_are_upright_in_no_frame_are_refused() -> None:
     lying = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     text = tum(lying, REP103)
-    for frame in FRAMES:
+    for frame in get_args(Frame):
         with pytest.raises(InvalidMotionError, match=r"lean by up to \d+° .*; the limit is 35°: .*--odometry-frame"):
             read_trajectory(text, frame)
     with pytest.raises(InvalidMotionError, match="has no rotation"):

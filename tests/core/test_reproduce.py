@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import safetensors.torch
@@ -14,7 +15,7 @@ from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bund
 from lalaloc_core.cli import main
 from lalaloc_core.errors import CheckpointError, ConfigError, RunError
 from lalaloc_core.evaluate.reproduce import ablations
-from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
+from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, Budget, train_ablation
 from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, markdown
 from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
@@ -217,7 +218,7 @@ class TestTable:
             image, layout = ABLATIONS[name].config["full"].image, ABLATIONS[name].config["full"].layout
             assert (image.batch, image.steps, image.optimiser) == (4, layout.steps, layout.optimiser)
 
-    @pytest.mark.parametrize("budget", BUDGETS)
+    @pytest.mark.parametrize("budget", get_args(Budget))
     def test_variants_share_networks_of_the_base(self, budget: Budget) -> None:
         for ablation in ABLATIONS.values():
             if ablation.layout_from is not None:

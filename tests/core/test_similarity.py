@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections import defaultdict
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from lalaloc_core.evaluate.methods import similarity
 from lalaloc_core.evaluate.methods.icp import Icp, IcpConfig, align, best_motion, merge_cells, scan_of, wall_cloud
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import (
-    LAYOUT_METRICS,
     ChamferGrid,
     DepthGrid,
     EdgeGrid,
@@ -174,7 +174,7 @@ class TestEdges:
 
 
 class TestAnyMetric:
-    @pytest.mark.parametrize("metric", LAYOUT_METRICS)
+    @pytest.mark.parametrize("metric", get_args(LayoutMetric))
     @given(seed=seeds())
     @settings(max_examples=5)
     def test_grid_pose_is_nearest_to_itself(self, metric: LayoutMetric, seed: int) -> None:
@@ -186,7 +186,7 @@ class TestAnyMetric:
             assert grid.distances(query)[index] < 1e-6
             assert grid.nearest(query) == index
 
-    @pytest.mark.parametrize("metric", LAYOUT_METRICS)
+    @pytest.mark.parametrize("metric", get_args(LayoutMetric))
     def test_other_profile_width_is_refused(self, metric: LayoutMetric) -> None:
         plan = crooked_flat()
         grid = layout_grid(metric, plan, some_poses(plan, 0), CAMERA_M)
@@ -197,7 +197,7 @@ class TestAnyMetric:
 
 
 class TestRetrieval:
-    @pytest.mark.parametrize("metric", LAYOUT_METRICS)
+    @pytest.mark.parametrize("metric", get_args(LayoutMetric))
     def test_similarity_retrieval_takes_the_nearest_layout(self, metric: LayoutMetric) -> None:
         method = SimilarityRetrieval(metric)
         for heading in (0.0, 2.0):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.ceilings import ceiling_boxes
 from lalaloc_core.learn.synth.scene.doors import boards, hang_leaves
-from lalaloc_core.learn.synth.scene.facts import FACTS, facts_of
+from lalaloc_core.learn.synth.scene.facts import Fact, facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.mirrors import Reflection
 from lalaloc_core.learn.synth.scene.render_scene import Sun
@@ -71,10 +72,10 @@ def test_hard_places_include_openings_and_clear_walls() -> None:
 
 
 def test_each_fact_occurs_sometimes(known: list[tuple[Shot, frozenset[str]]]) -> None:
-    for fact in FACTS:
+    for fact in get_args(Fact):
         share = sum(fact in facts for _, facts in known) / len(known)
         assert 0.02 < share < 0.9, fact
-    assert set().union(*(facts for _, facts in known)) <= set(FACTS)
+    assert set().union(*(facts for _, facts in known)) <= set(get_args(Fact))
 
 
 @pytest.mark.slow

@@ -21,7 +21,9 @@ import svgelements
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
-from benchmarks.hostile_plans import HOSTILE_PLANS, HostilePlan, pdf, star
+from benchmarks.hostile_drawings import pdf
+from benchmarks.hostile_plans import HOSTILE_PLANS
+from benchmarks.hostile_shapes import HostilePlan, star
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from itertools import cycle
 from pathlib import Path
@@ -22,11 +23,13 @@ import uvicorn
 from fastapi import FastAPI
 from PIL import Image
 
+from lalaloc_core.bundle import default_bundle
 from service.app import create_app
 from service.pools.supervisor import Watchdog
 from service.settings import Settings
 from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
+from tests.core.taken import EXAMPLES
 from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
 from tests.service.ray_cluster import ray_cluster, serving
 
@@ -40,11 +43,15 @@ FLAT: dict[str, Any] = {
     ],
 }
 
+# The flat of the example photographs.
+HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
+
 _DATABASE = os.environ.get("TEST_DATABASE", "sqlite")
 _REPLICAS = 2 if _DATABASE == "replicas" else 1
 
 # From an app's data folder to the address of its database.
 DatabaseOf = Callable[[Path], str]
+OpenStore = Callable[[], Store]
 StartApp = Callable[..., AbstractContextManager[httpx.Client]]
 
 
@@ -153,10 +160,63 @@ class InTurn(httpx.BaseTransport):
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def app_settings() -> dict[str, Any]:
+    """Settings of a module's app; a module that needs others has a fixture of this name."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def client(
+    start_app: StartApp, app_settings: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[httpx.Client]:
     """Yield one app for the tests of a module, which do not disturb each other."""
-    with start_app(tmp_path_factory.mktemp("data")) as started:
+    with start_app(tmp_path_factory.mktemp("data"), **app_settings) as started:
         yield started
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """Yield an app with the shipped model and a ready worker."""
+    deadlines = {"lpo_deadline_s": 60.0, "lpo_stall_s": 60.0, "request_deadline_s": 90.0}
+    with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), workers=1, **deadlines) as started:
+        wait_for(lambda: started.get("/readyz").status_code == 200, 120.0)
+        yield started
+
+
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    """Return the id of the example flat in the app with the shipped model."""
+    return upload(shipped, HOME)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Return the URL of an empty database of either kind."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}"
+    return request.getfixturevalue("postgres").new_database()
+
+
+@pytest.fixture
+def configured_url(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the URL of an empty database of either kind, which the settings in the environment name."""
+    monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("LALALOC_DATABASE_URL", url)
+    return url
+
+
+@pytest.fixture
+def open_store(url: str) -> Iterator[OpenStore]:
+    """Return a function that opens a database of either kind again, as another process does."""
+    with ExitStack() as stack:
+        yield lambda: stack.enter_context(closing(Store(url, wait_s=60.0)))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """Yield an empty store on SQLite."""
+    with closing(Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")) as opened:
+        yield opened
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import asyncio
 import json
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -33,16 +34,10 @@ NEW_KEY = {"tenant": "acme", "name": "camera 7", "scopes": ["read", "localise"]}
 DAY_S = 86400.0
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def store(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    address = f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}"
-    if request.param == "postgresql":
-        address = request.getfixturevalue("postgres").new_database()
-    monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path))
-    monkeypatch.setenv("LALALOC_DATABASE_URL", address)
-    opened = Store(address, audit_keep_s=DAY_S, max_audit_entries=20)
-    yield opened
-    opened.close()
+@pytest.fixture
+def store(configured_url: str) -> Iterator[Store]:
+    with closing(Store(configured_url, audit_keep_s=DAY_S, max_audit_entries=20)) as opened:
+        yield opened
 
 
 @pytest.fixture

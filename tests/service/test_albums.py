@@ -29,10 +29,9 @@ from service.schemas.albums import PinAnswer
 from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, HOME, DatabaseOf, StartApp, assert_problem, upload, wait_for
 from tests.service.test_security import bearer, make_key
 
-HOME = json.loads((EXAMPLES / "flat.json").read_text())
 ANCHORED = {**HOME, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0}
 NAMES = ("living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg")
 

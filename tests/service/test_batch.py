@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,8 @@ from tests.service.test_security import bearer, make_key
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    limits = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_photograph_bytes": 500_000}
-    with start_app(tmp_path_factory.mktemp("data"), **limits) as started:
-        yield started
+def app_settings() -> dict[str, Any]:
+    return {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_photograph_bytes": 500_000}
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,8 @@ The homes are rendered from the validation split, outside the range that the cal
 from __future__ import annotations
 
 import io
-import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -17,14 +15,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.painted import painted_room
-from tests.service.conftest import StartApp, localise, upload, wait_for
+from tests.service.conftest import localise, upload
 
-BUNDLE = Path(__file__).parents[2] / "models" / "default"
 HOMES = 12
 FIRST_HOME = 1000
 HEIGHT, WIDTH = 128, 256
@@ -57,17 +53,6 @@ def shots() -> list[Shot]:
         height_m = plan["camera_height_m"]
         found.append(Shot(plan, picture, camera.position_m, np.degrees(camera.heading) % 360.0, height_m))
     return found
-
-
-@pytest.fixture(scope="module")
-def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Yield a client of the production app with the shipped bundle and a ready worker."""
-    assert Bundle.open(BUNDLE).manifest.confidence is not None, "calibrate the bundle before it ships"
-    deadlines = {"lpo_deadline_s": 60.0, "request_deadline_s": 90.0}
-    with start_app(tmp_path_factory.mktemp("data"), bundle=BUNDLE, workers=1, **deadlines) as client:
-        client.timeout = 100.0
-        wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
-        yield client
 
 
 @pytest.fixture(scope="module")
@@ -293,17 +278,16 @@ def test_plain_corridor_is_uncertain_along_only(shipped: httpx.Client, given: bo
     assert min(abs(answer["position"]["y_m"] - y_m) for y_m in (0.8, 1.0)) < 0.15
 
 
-def test_unsure_answer_has_a_next_step_and_a_sure_one_none(shipped: httpx.Client) -> None:
-    flat = upload(shipped, json.loads((EXAMPLES / "flat.json").read_text()))
+def test_unsure_answer_has_a_next_step_and_a_sure_one_none(shipped: httpx.Client, home: str) -> None:
     wall = jpeg(take(sphere("living_room"), Perspective.of_hfov(480, 640, np.radians(53.0)), heading_deg=70.0))
-    unsure = ask(shipped, flat, wall, None, hfov_deg=53.0)
+    unsure = ask(shipped, home, wall, None, hfov_deg=53.0)
     assert unsure["confidence"] < 0.5 < 1.0 - unsure["probability_elsewhere"]
     step = unsure["view"]["next_step"]
     assert unsure["confidence"] + 0.02 <= step["expected_confidence"] <= 1.0
     assert step["expected_bits"] > 0.0
     assert (step["turn_deg"] is None) == (step["kind"] in ("heading", "rooms"))
     assert "; the expected confidence is then " in step["text"]
-    assert ask(shipped, flat, wall, None, hfov_deg=53.0)["view"]["next_step"] == step
-    sure = ask(shipped, flat, (EXAMPLES / "kitchen.jpg").read_bytes(), None)
+    assert ask(shipped, home, wall, None, hfov_deg=53.0)["view"]["next_step"] == step
+    sure = ask(shipped, home, (EXAMPLES / "kitchen.jpg").read_bytes(), None)
     assert sure["confidence"] >= 0.5
     assert sure["view"]["next_step"] is None

@@ -11,13 +11,12 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from service.storage import database
 from service.telemetry import LOGGER_NAME
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.test_disk_space import limit_pages
 
 pytestmark = pytest.mark.one_replica
 
@@ -62,13 +61,7 @@ def test_deleted_data_folder_is_store_unavailable(start_app: StartApp, tmp_path:
 def test_full_disk_is_a_507_and_reads_continue(
     start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prepare = database._prepare_sqlite
-
-    def with_little_room(connection: Any, record: Any) -> None:
-        prepare(connection, record)
-        connection.execute("PRAGMA max_page_count = 250")
-
-    monkeypatch.setattr(database, "_prepare_sqlite", with_little_room)
+    limit_pages(monkeypatch, 250)
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         _sqlite(tmp_path)

@@ -205,16 +205,21 @@ def test_start_without_plans_is_a_warning(start_app: StartApp, tmp_path: Path) -
         logger.removeHandler(handler)
 
 
-def test_full_database_refuses_uploads_and_allows_deletions(
-    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def limit_pages(monkeypatch: pytest.MonkeyPatch, pages: int) -> None:
+    """Limit the size of SQLite files that are opened later."""
     prepare = database._prepare_sqlite
 
     def with_little_room(connection: Any, record: Any) -> None:
         prepare(connection, record)
-        connection.execute("PRAGMA max_page_count = 1000")
+        connection.execute(f"PRAGMA max_page_count = {pages}")
 
     monkeypatch.setattr(database, "_prepare_sqlite", with_little_room)
+
+
+def test_full_database_refuses_uploads_and_allows_deletions(
+    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limit_pages(monkeypatch, 1000)
     padded = json.dumps(FLAT).encode() + b" " * 1_100_000
     headers = {"content-type": "application/json"}
     with start_app(tmp_path) as client:

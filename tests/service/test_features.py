@@ -11,7 +11,7 @@ import shutil
 import signal
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,14 +27,13 @@ from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.photograph import Photograph, open_photograph
 from service.routes import model_files
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import HOME, StartApp, assert_problem, upload, wait_for
 from tests.service.test_oscp import ANCHOR, NORTH_DEG, oscp_request
 from tests.service.test_process import children
 from tests.service.test_stopping import running_service
 from tests.service.test_telemetry import collector
 
 KITCHEN, PHONE = ((EXAMPLES / name).read_bytes() for name in ("kitchen.jpg", "phone.jpg"))
-HOME = json.loads((EXAMPLES / "flat.json").read_text())
 PREFIX = struct.Struct("<4sHI")
 
 
@@ -59,9 +58,8 @@ def device() -> Device:
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), bundle=default_bundle(), request_deadline_s=90.0) as started:
-        yield started
+def app_settings() -> dict[str, Any]:
+    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,8 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def client(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    folder = tmp_path_factory.mktemp("data")
-    with start_app(folder, bundle=tiny_view_bundle, max_film_bytes=2_000_000, max_sequence_bytes=3_000_000) as started:
-        yield started
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle, "max_film_bytes": 2_000_000, "max_sequence_bytes": 3_000_000}
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import PoseGrid
 from service.capacity.bounded_cache import BoundedCache
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
@@ -47,7 +48,7 @@ from service.storage.plan_lookup import PlanLookup
 from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, DatabaseOf, OpenStore, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -89,36 +90,20 @@ def encoders(bundle: Bundle) -> CountingEncoders:
     return CountingEncoders(bundle)
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def open_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[[], Store]]:
-    """Return a function that opens one database of either kind again, as a replica does."""
-    url = f"sqlite:///{tmp_path / 'test.sqlite3'}"
-    if request.param == "postgresql":
-        url = request.getfixturevalue("postgres").new_database()
-    opened: list[Store] = []
-
-    def open_another() -> Store:
-        opened.append(Store(url))
-        return opened[-1]
-
-    yield open_another
-    for store in opened:
-        store.close()
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")
-    yield opened
-    opened.close()
-
-
 def _permits() -> FairSemaphore:
     return FairSemaphore(2, CpuAccounts())
 
 
 def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord:
     return store.plans.add("default", plan_id, NewPlan(plan, Original(b"{}")), limit=20)
+
+
+def _begun(encoders: CountingEncoders, grids: GridProvider, record: PlanRecord) -> Future[PoseGrid]:
+    """Begin to compute a grid, which waits for `encoders.go_on` within its first chunk."""
+    encoders.go_on.clear()
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    return future
 
 
 @pytest.fixture
@@ -135,7 +120,6 @@ def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvide
 
 
 MakeGrids = Callable[..., GridProvider]
-OpenStore = Callable[[], Store]
 
 
 def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: PhotographEncoder) -> None:
@@ -361,9 +345,7 @@ def test_overtaken_replica_gives_way(open_store: OpenStore, make_grids: MakeGrid
     store = open_store()
     grids, record = make_grids(store, grid_lease_s=0.2), _add(store, HALL)
     key = grids.key(record.revision_id, 1.5)
-    encoders.go_on.clear()
-    future = grids.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, grids, record)
     time.sleep(0.3)
     assert store.leases.claim(key, "another replica", 60.0)
     encoders.go_on.set()
@@ -380,9 +362,7 @@ def test_remote_deletion_cancels_the_grid(
 ) -> None:
     store = open_store()
     grids, record = make_grids(store, grid_lease_s=0.1), _add(store, HALL)
-    encoders.go_on.clear()
-    future = grids.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, grids, record)
     assert open_store().plans.delete("default", "p")
     encoders.go_on.set()
     wait_for(lambda: _looked(grids) or future.done())
@@ -396,9 +376,7 @@ def test_work_of_stopped_replica_is_taken_over(
 ) -> None:
     first, second = open_store(), open_store()
     stopping, record = make_grids(first), _add(first, HALL)
-    encoders.go_on.clear()
-    future = stopping.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, stopping, record)
     closing = threading.Thread(target=stopping.close)
     closing.start()
     wait_for(stopping._jobs.closing.is_set)
@@ -488,9 +466,7 @@ def test_remote_job_of_replaced_revision_ends(open_store: OpenStore, make_grids:
 def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_step_m=0.4)
     large, small = _add(store, HALL, "large"), _add(store, PLAN, "small")
-    encoders.go_on.clear()
-    slow = grids.compute(large, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    slow = _begun(encoders, grids, large)
     quick = grids.compute(small, 1.5)
     encoders.go_on.set()
     quick.result(30.0)
@@ -502,9 +478,7 @@ def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, e
 def test_overtaken_grid_keeps_its_lease(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_lease_s=2.0)
     large, small = _add(store, LARGE_HALL, "large"), _add(store, HALL, "small")
-    encoders.go_on.clear()
-    slow = grids.compute(large, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    slow = _begun(encoders, grids, large)
     quick = grids.compute(small, 1.5)
     # Six chunks, which take longer than the lease.
     encoders.pause_s = 0.5
@@ -532,9 +506,7 @@ def test_grid_of_replaced_revision_is_cancelled(
     store: Store, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     grids, record = make_grids(store), _add(store, HALL)
-    encoders.go_on.clear()
-    future = grids.compute(record, 1.5)
-    wait_for(lambda: encoders.embedded > 0)
+    future = _begun(encoders, grids, record)
     new = store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
     grids.forget({record.revision_id})
     encoders.go_on.set()

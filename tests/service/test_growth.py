@@ -14,7 +14,8 @@ from lalaloc_core.errors import LaLaLocError
 from service.http.conditional import expected_revision
 from service.http.cursors import parse_cursor
 from service.http.idempotent_request import _key_of
-from service.http.uploads import UploadLimits, read_parts
+from service.http.multipart import read_parts
+from service.http.uploads import UploadLimits
 from service.security.exposure import is_allowed_host
 from service.security.keys import parse_authorization
 from service.telemetry.trace_context import parse_traceparent

@@ -29,7 +29,7 @@ from service.errors import (
     UploadTimeoutError,
 )
 from service.http.idempotent_request import IdempotentRequest, parts_sha256
-from service.http.uploads import Parts
+from service.http.multipart import Parts
 from service.pools.job_queue import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Claimed, NewPlan, Original
@@ -251,13 +251,6 @@ def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypa
     for answer in (replaced, own.get(created.headers["location"])):
         assert answer.headers["etag"] == replaced.headers["etag"]
         assert answer.json()["grid"]["poses"] == 110
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")
-    yield opened
-    opened.close()
 
 
 def _idempotent(store: Store) -> IdempotentRequest:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,12 @@ import httpx
 import numpy as np
 import pytest
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.core.taken import EXAMPLES
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, upload
 
-ROOT = Path(__file__).parents[2]
-EXAMPLES = ROOT / "examples"
 POSES = {pose["file"]: pose for pose in json.loads((EXAMPLES / "poses.json").read_text())}
-HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
 NORTH_DEG = 25.0
 PRIVACY = {name: [] for name in ("dataRetention", "dataAcceptableUse", "dataSanitizationApplied",
@@ -55,20 +54,17 @@ def gps(east_m: float, north_m: float, accuracy_m: float) -> dict[str, float]:
 
 
 @pytest.fixture(scope="module")
-def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    data_dir = tmp_path_factory.mktemp("data")
-    with start_app(data_dir, bundle=ROOT / "models" / "default", request_deadline_s=90.0, max_top_k=3) as client:
-        client.timeout = 100.0
-        yield client
+def app_settings() -> dict[str, Any]:
+    return {"bundle": default_bundle(), "request_deadline_s": 90.0, "max_top_k": 3}
 
 
 @pytest.fixture(scope="module")
-def home(shipped: httpx.Client) -> str:
+def home(client: httpx.Client) -> str:
     """Id of the anchored example flat; another lies 400 m north, a third has no anchor."""
-    upload(shipped, FLAT)
+    upload(client, FLAT)
     north = {name: value for name, value in gps(0.0, 400.0, 0.0).items() if name != "accuracy"}
-    upload(shipped, FLAT | {"anchor": north, "north_deg": 0})
-    return upload(shipped, HOME | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
+    upload(client, FLAT | {"anchor": north, "north_deg": 0})
+    return upload(client, HOME | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
 
 
 def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
@@ -93,42 +89,42 @@ def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
     assert position["h"] == pytest.approx(519.5 + pose.get("camera_height_m", 1.5), abs=0.3)
 
 
-def test_query_by_plan_id(shipped: httpx.Client, home: str) -> None:
+def test_query_by_plan_id(client: httpx.Client, home: str) -> None:
     body = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes())
-    response = shipped.post("/geopose", params={"floorplan_id": home}, json=body)
+    response = client.post("/geopose", params={"floorplan_id": home}, json=body)
     assert response.status_code == 200, response.text
     check_answer(response.json(), home, "kitchen.jpg")
     assert response.json()["lalaloc"]["warnings"] == []
 
 
-def test_query_by_geolocation(shipped: httpx.Client, home: str) -> None:
+def test_query_by_geolocation(client: httpx.Client, home: str) -> None:
     # Storeys of a house share its anchor.
-    upper = upload(shipped, FLAT | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
+    upper = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
     body = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(12.0, 8.0, 30.0))
     body["sensorReadings"]["wiFiReadings"] = [{"SSID": "x"}]
-    response = shipped.post("/geopose", json=body)
+    response = client.post("/geopose", json=body)
     assert response.status_code == 200, response.text
     check_answer(response.json(), home, "kitchen.jpg")
     assert "wiFiReadings are not used" in response.json()["lalaloc"]["warnings"]
-    shipped.delete(f"/floorplans/{upper}")
-    nowhere = shipped.post("/geopose", json=oscp_request(b"x", gps(0.0, -3000.0, 50.0)))
+    client.delete(f"/floorplans/{upper}")
+    nowhere = client.post("/geopose", json=oscp_request(b"x", gps(0.0, -3000.0, 50.0)))
     assert "within 50 m of latitude" in assert_problem(nowhere, 404, "no-floorplan-nearby")["detail"]
 
 
-def test_query_in_a_venue_ignores_a_wrong_reading(shipped: httpx.Client, home: str) -> None:
-    plain = upload(shipped, HOME)
+def test_query_in_a_venue_ignores_a_wrong_reading(client: httpx.Client, home: str) -> None:
+    plain = upload(client, HOME)
     anchor = ANCHOR | {"north_deg": NORTH_DEG}
-    venue = shipped.post("/venues", json={"plans": [{"floorplan_id": plain, "level": 2}], "anchor": anchor}).json()
+    venue = client.post("/venues", json={"plans": [{"floorplan_id": plain, "level": 2}], "anchor": anchor}).json()
     body = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(900.0, 0.0, 20.0))
-    response = shipped.post("/geopose", params={"venue_id": venue["id"]}, json=body)
+    response = client.post("/geopose", params={"venue_id": venue["id"]}, json=body)
     assert response.status_code == 200, response.text
     check_answer(response.json(), plain, "kitchen.jpg")
     assert response.json()["lalaloc"]["level"] == 2.0
     [warning] = response.json()["lalaloc"]["warnings"]
     assert "geolocation reading" in warning
-    in_plan = shipped.post("/geopose", params={"floorplan_id": home}, json=body).json()
+    in_plan = client.post("/geopose", params={"floorplan_id": home}, json=body).json()
     assert "its accuracy is 20 m: it was not used" in in_plan["lalaloc"]["warnings"][0]
-    bare = shipped.post("/geopose", params={"floorplan_id": plain}, json=body)
+    bare = client.post("/geopose", params={"floorplan_id": plain}, json=body)
     assert_problem(bare, 409, "floorplan-unanchored")
 
 

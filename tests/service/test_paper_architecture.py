@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -15,22 +14,21 @@ from lalaloc_core.learn.export.bundle_export import export_bundle
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.nets.paper_encoders import PaperConfig
-from tests.service.conftest import FLAT, StartApp, localise, upload, wait_for
+from tests.service.conftest import FLAT, localise, upload, wait_for
 
 # Seconds of LPO on the small networks, even on a busy machine.
 LPO_DEADLINE_S = 60.0
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Yield an app with one LPO worker, on untrained networks of the paper's architecture."""
+def app_settings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Return the settings of an app with one LPO worker, on untrained networks of the paper's architecture."""
     sizes = PaperConfig(width=8, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128)
     config = dataclasses.replace(PRESETS["paper"], paper=sizes)
     folder = tmp_path_factory.mktemp("paper")
     networks = build_layout_encoder(config), build_image_encoder(config)
     export_bundle(folder, config, *networks, name="paper", version="test")
-    with start_app(tmp_path_factory.mktemp("data"), bundle=folder, workers=1, lpo_deadline_s=LPO_DEADLINE_S) as started:
-        yield started
+    return {"bundle": folder, "workers": 1, "lpo_deadline_s": LPO_DEADLINE_S}
 
 
 @pytest.mark.slow

@@ -3,47 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import default_bundle
 from lalaloc_core.photograph.file_segments import END
 from tests.core.fault_photographs import CONTRADICTED, FAULTS, LIBRARY_WORDS, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, assert_problem, upload
 from tests.service.test_photographs import PHONE, ask, shown
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
 
 
 @pytest.fixture(scope="module")
-def client(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
-        yield started
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 @pytest.fixture(scope="module")
 def flat(client: httpx.Client) -> str:
     return upload(client, FLAT)
-
-
-@pytest.fixture(scope="module")
-def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    deadlines = {"request_deadline_s": 90.0, "lpo_deadline_s": 60.0}
-    with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), workers=1, **deadlines) as started:
-        wait_for(lambda: started.get("/readyz").json()["lpo_pool"]["ready"] > 0, 120.0)
-        yield started
-
-
-@pytest.fixture(scope="module")
-def home(shipped: httpx.Client) -> str:
-    return upload(shipped, json.loads((EXAMPLES / "flat.json").read_text()))
 
 
 def data_of(fault: Fault, plan_id: str) -> dict[str, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +26,8 @@ QUICK = {"refine": "none", "top_k": 1}
 
 
 @pytest.fixture(scope="module")
-def client(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
-        yield started
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,13 +21,6 @@ from tests.service.conftest import FLAT
 
 GEOD = pyproj.Geod(ellps="WGS84")
 WITHIN_M = 200.0
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}", wait_s=5.0)
-    yield store
-    store.close()
 
 
 def _beside(place: tuple[float, float], azimuth_deg: float, distance_m: float) -> tuple[float, float]:

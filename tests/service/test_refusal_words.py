@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import pytest
 
 from tests.core.fault_photographs import LIBRARY_WORDS
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import FLAT, StartApp, upload
+from tests.service.conftest import FLAT, upload
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
 DIGITS = "9" * 4400
@@ -53,11 +52,8 @@ FILES: dict[str, bytes] = {
 
 
 @pytest.fixture(scope="module")
-def client(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as started:
-        yield started
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 @pytest.fixture(scope="module")

@@ -59,13 +59,6 @@ def maker(monkeypatch: pytest.MonkeyPatch) -> _BlockedMaker:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}")
-    yield store
-    store.close()
-
-
-@pytest.fixture
 def cache(store: Store) -> Iterator[RenditionCache]:
     converter = Converter(Settings(import_workers=1), Telemetry())
     bundle = Bundle.open(default_bundle())

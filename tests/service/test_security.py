@@ -10,7 +10,7 @@ import re
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +33,7 @@ from service.security.keys import PresentedKey, hash_of, key_text, new_secret, p
 from service.security.permissions import NEEDED, OPEN_PATHS, PAGES, Permission
 from service.security.rate_limits import RateLimits
 from service.settings import Settings
+from service.storage.records import ApiKey
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME
 from service.telemetry.logs import JsonFormatter
@@ -554,54 +555,59 @@ def test_known_keys_work_without_the_database(
         wait_for(lambda: client.get("/limits", headers=bearer(new_key)).status_code == 200, 10.0)
 
 
-def test_key_is_cached_ten_minutes_without_database(tmp_path: Path) -> None:
+@dataclass
+class CachedKey:
+    """Key in a cache, on a store with a single connection; `clock_s` is the clock of the cache."""
+
+    store: Store
+    key_id: str
+    find: Callable[[], ApiKey | None]
+    clock_s: float = 1000.0
+
+
+@pytest.fixture
+def cached(tmp_path: Path) -> Iterator[CachedKey]:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
-    clock_s = [1000.0]
-    ring = KeyCache(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
-    presented = parse_authorization([f"Bearer {make_key(store)}"])
+    cache = KeyCache(store.keys, fresh_s=5.0, clock=lambda: cached.clock_s)
+    text = make_key(store)
+    presented = parse_authorization([f"Bearer {text}"])
     assert presented is not None
+    cached = CachedKey(store, id_of(text), lambda: asyncio.run(cache.find(presented)))
     try:
-        key = asyncio.run(ring.find(presented))
-        assert key is not None
+        assert cached.find() is not None
         wait_for(lambda: store.keys.list_keys()[0].last_used_at is not None)
-        # The only connection is in use.
-        with store._database.reading():
-            for clock_s[0] in (1004.0, 1006.0, 1300.0, 1600.0):
-                assert asyncio.run(ring.find(presented)) == key
-            clock_s[0] = 1606.0
-            with pytest.raises(StoreUnavailableError):
-                asyncio.run(ring.find(presented))
-        clock_s[0] = 1608.0
-        store.keys.revoke(key.id)
-        assert asyncio.run(ring.find(presented)) is None
+        yield cached
     finally:
-        ring.close()
+        cache.close()
         store.close()
 
 
-def test_busy_database_does_not_extend_the_key_cache(tmp_path: Path) -> None:
-    store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
-    clock_s = [1000.0]
-    ring = KeyCache(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
-    presented = parse_authorization([f"Bearer {make_key(store)}"])
-    assert presented is not None
-    try:
-        key = asyncio.run(ring.find(presented))
-        assert key is not None
-        wait_for(lambda: store.keys.list_keys()[0].last_used_at is not None)
-        with store._database.reading():
-            # Other queries succeed in the meantime.
-            store._database._answered_s = float("inf")
-            clock_s[0] = 1006.0
-            with pytest.raises(StoreBusyError):
-                asyncio.run(ring.find(presented))
-        # A busy database is queried again at the next request.
-        again = asyncio.run(ring.find(presented))
-        assert again is not None
-        assert again.id == key.id
-    finally:
-        ring.close()
-        store.close()
+def test_key_is_cached_ten_minutes_without_database(cached: CachedKey) -> None:
+    # The only connection is in use.
+    with cached.store._database.reading():
+        for cached.clock_s in (1004.0, 1006.0, 1300.0, 1600.0):
+            key = cached.find()
+            assert key is not None
+            assert key.id == cached.key_id
+        cached.clock_s = 1606.0
+        with pytest.raises(StoreUnavailableError):
+            cached.find()
+    cached.clock_s = 1608.0
+    cached.store.keys.revoke(cached.key_id)
+    assert cached.find() is None
+
+
+def test_busy_database_does_not_extend_the_key_cache(cached: CachedKey) -> None:
+    with cached.store._database.reading():
+        # Other queries succeed in the meantime.
+        cached.store._database._answered_s = float("inf")
+        cached.clock_s = 1006.0
+        with pytest.raises(StoreBusyError):
+            cached.find()
+    # A busy database is queried again at the next request.
+    again = cached.find()
+    assert again is not None
+    assert again.id == cached.key_id
 
 
 # --- Without keys -----------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -15,15 +14,14 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.sequence import Motion
 from service.schemas import SequenceForm
 from service.schemas.sequence import StatedMotion
-from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
+from tests.service.conftest import FLAT, assert_problem, encode_picture, localise, upload
 
 MOTION = {"distance_m": 1.5, "distance_std_m": 0.1, "turn_deg": 30, "turn_std_deg": 3}
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), max_sequence_photographs=30, max_sequence_bytes=300_000) as started:
-        yield started
+def app_settings() -> dict[str, Any]:
+    return {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
 
 
 @pytest.fixture(scope="module")

@@ -32,28 +32,19 @@ def test_answer_body_is_not_delayed() -> None:
             connection = transport.get_extra_info("socket")
             no_delay.append(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
 
-    app, settings = FastAPI(), Settings()
-    config = server_config(app, settings)
-    config.http = Watched
-    # As the command line does: of a socket made like this, asyncio does not see that it is one of TCP.
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        running = Server(config, app, settings)
-        thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            wait_for(lambda: running.started)
-            httpx.get(f"http://127.0.0.1:{listener.getsockname()[1]}/openapi.json").raise_for_status()
-        finally:
-            running.should_exit = True
-            thread.join(30.0)
+    with served(FastAPI(), Settings(), Watched) as port:
+        httpx.get(f"http://127.0.0.1:{port}/openapi.json").raise_for_status()
     assert no_delay == [1]
 
 
 @contextmanager
-def served(app: FastAPI, settings: Settings) -> Iterator[int]:
-    """Run an app as the command line does; gives its port."""
+def served(app: FastAPI, settings: Settings, protocol: type[asyncio.Protocol] | None = None) -> Iterator[int]:
+    """Run an app as the command line does, by default with its own protocol; gives its port."""
+    config = server_config(app, settings)
+    config.http = protocol or config.http
+    # Of a socket made like this, asyncio does not see that it is one of TCP.
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        running = Server(server_config(app, settings), app, settings)
+        running = Server(config, app, settings)
         thread = threading.Thread(target=running.run, kwargs={"sockets": [listener]})
         thread.start()
         try:

@@ -67,10 +67,8 @@ class Log:
 
 
 @pytest.fixture(scope="module")
-def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """App that logs requests."""
-    with start_app(tmp_path_factory.mktemp("data"), log_level="debug") as started:
-        yield started
+def app_settings() -> dict[str, Any]:
+    return {"log_level": "debug"}
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,22 +38,10 @@ PLAN = FloorPlan.from_dict(FLAT)
 MIB = 2**20
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the URL of an empty database of either kind, which the settings in the environment name."""
-    address = f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}"
-    if request.param == "postgresql":
-        address = request.getfixturevalue("postgres").new_database()
-    monkeypatch.setenv("LALALOC_DATA_DIR", str(tmp_path))
-    monkeypatch.setenv("LALALOC_DATABASE_URL", address)
-    return address
-
-
 @pytest.fixture
-def store(url: str) -> Iterator[Store]:
-    opened = Store(url, stored_bytes=10 * MIB, idempotency_bytes=MIB)
-    yield opened
-    opened.close()
+def store(configured_url: str) -> Iterator[Store]:
+    with closing(Store(configured_url, stored_bytes=10 * MIB, idempotency_bytes=MIB)) as opened:
+        yield opened
 
 
 def _add(store: Store, tenant: str, plan_id: str, size: int = MIB, **options: object) -> str:
@@ -78,7 +67,7 @@ def _recounted(store: Store, tenant: str) -> None:
 # Limits of the operator
 
 
-def test_limits_are_set_and_reset(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_are_set_and_reset(configured_url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tenants", "limit", "acme", "--stored-bytes", "1000", "--cpu-share", "0.5"]) == 0
     assert main(["tenants", "limit", "acme", "--bytes-in-flight", "2000", "--cpu-share", "default"]) == 0
     assert capsys.readouterr().out.splitlines()[-3:] == [

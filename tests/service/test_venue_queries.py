@@ -6,7 +6,6 @@ import itertools
 import json
 import math
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +16,13 @@ from lalaloc_core.localise.match import PoseGrid
 from service.grids import builder
 from service.storage.stored_grids import StoredGrids
 from service.venues import venue_plans
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
+from tests.core.taken import EXAMPLES
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, upload, wait_for
 from tests.service.test_localise import HALL
 
-ROOT = Path(__file__).parents[2]
-EXAMPLES = ROOT / "examples"
-HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
 # Pose of each example in the plan above.
 POSES = {pose["file"]: pose for pose in json.loads((EXAMPLES / "poses.json").read_text())}
 STUDIO = {"ceiling_height_m": 2.6, "rooms": [{"name": "studio", "polygon": [[0, 0], [9, 0], [9, 2.2], [0, 2.2]]}]}
-
-
-@pytest.fixture(scope="module")
-def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Start the app with the shipped model and a warm worker."""
-    deadlines = {"lpo_deadline_s": 60.0, "lpo_stall_s": 60.0, "request_deadline_s": 90.0}
-    data_dir = tmp_path_factory.mktemp("data")
-    with start_app(data_dir, bundle=ROOT / "models" / "default", workers=1, **deadlines) as client:
-        client.timeout = 100.0
-        wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
-        yield client
 
 
 def venue_of(client: httpx.Client, *plan_ids: str, **more: Any) -> str:
@@ -61,11 +47,6 @@ def turned(plan: dict[str, Any]) -> dict[str, Any]:
     rooms = [{**room, "polygon": swapped(room["polygon"])} for room in plan["rooms"]]
     openings = [{**opening, "line": swapped(opening["line"])} for opening in plan.get("openings", [])]
     return {**plan, "rooms": rooms} | ({"openings": openings} if openings else {})
-
-
-@pytest.fixture(scope="module")
-def home(shipped: httpx.Client) -> str:
-    return upload(shipped, HOME)
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -12,25 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lalaloc_core.bundle import default_bundle
-from tests.core.taken import EXAMPLES, sphere
-from tests.service.conftest import StartApp, upload, wait_for
+from tests.core.taken import sphere
 
 # The robot turns on the spot.
 TURN_DEG = 45.0
-
-
-@pytest.fixture(scope="module")
-def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    folder = tmp_path_factory.mktemp("data")
-    with start_app(folder, bundle=default_bundle(), workers=1, lpo_deadline_s=9.0) as client:
-        wait_for(lambda: client.get("/readyz").json()["lpo_pool"]["ready"] > 0, 120.0)
-        yield client
-
-
-@pytest.fixture(scope="module")
-def home(shipped: httpx.Client) -> str:
-    return upload(shipped, json.loads((EXAMPLES / "flat.json").read_text()))
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,10 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
 
-from tests.service.conftest import (
-    StartApp,
-    _clean_environment,  # noqa: F401
-    database_of,  # noqa: F401
-    empty_database,  # noqa: F401
-    start_app,  # noqa: F401
-)
+from tests.service.conftest import _clean_environment, app_settings, database_of, empty_database, start_app
+from tests.service.conftest import client as service
+
+__all__ = ["_clean_environment", "app_settings", "database_of", "empty_database", "service", "start_app"]
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DESKTOP = {"width": 1280, "height": 900}
@@ -91,13 +88,6 @@ def browser() -> Iterator[Browser]:
         launched = playwright.chromium.launch(executable_path=path, args=_ARGUMENTS)
         yield launched
         launched.close()
-
-
-@pytest.fixture(scope="module")
-def service(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:  # noqa: F811
-    """Return an app without plans for the tests of a file."""
-    with start_app(tmp_path_factory.mktemp("data")) as client:
-        yield client
 
 
 def _context(browser: Browser, **options: Any) -> BrowserContext:

@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -17,7 +18,7 @@ from playwright.sync_api import Browser, CDPSession, Page, expect
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import jpeg, sphere, take
-from tests.service.conftest import StartApp, upload
+from tests.service.conftest import upload
 from tests.web.conftest import _ARGUMENTS, _BROWSERS, EXAMPLES, PHONE, Visit, visit, wait_until
 from tests.web.test_on_device import BOX, SLOW_MS, recorded
 
@@ -28,11 +29,8 @@ CAMERA = Perspective.of_hfov(360, 640, math.radians(53.0))
 
 
 @pytest.fixture(scope="module")
-def service(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as client:
-        yield client
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 @pytest.fixture(scope="module")

@@ -81,10 +81,8 @@ def recorded(client: httpx.Client) -> Iterator[tuple[Wire, httpx.Client]]:
 
 
 @pytest.fixture(scope="module")
-def service(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    data = tmp_path_factory.mktemp("data")
-    with start_app(data, bundle=default_bundle(), request_deadline_s=90.0) as client:
-        yield client
+def app_settings() -> dict[str, Any]:
+    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 def find(page: Visit) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import httpx
 import pytest
 from PIL import ExifTags, Image
 from playwright.sync_api import Page, Route, expect
@@ -15,16 +14,12 @@ from playwright.sync_api import Page, Route, expect
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
-from tests.service.conftest import StartApp
 from tests.web.conftest import Visit
 
 
 @pytest.fixture(scope="module")
-def service(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data"), bundle=tiny_view_bundle) as client:
-        yield client
+def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
+    return {"bundle": tiny_view_bundle}
 
 
 def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from cachetools import LRUCache, cachedmethod
@@ -28,7 +28,6 @@ from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 
 LayoutMetric = Literal["edges", "depth", "relative-depth", "chamfer"]
-LAYOUT_METRICS: tuple[LayoutMetric, ...] = get_args(LayoutMetric)
 
 # Deviation of a profile from a straight wall (radians) that counts as a corner; less is rounding.
 _CORNER_BEND = 0.1

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 
@@ -26,7 +26,6 @@ from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.render.sampling import TripletSampling
 
-BUDGETS: tuple[Budget, ...] = get_args(Budget)
 BASE = "paper"
 _BUNDLE = "bundle"
 _VALIDATION_SCENES = 12

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 
@@ -34,7 +34,6 @@ from lalaloc_core.nets.trunk import load_pretrained
 from lalaloc_core.nets.view_network import ViewNetwork
 
 StageName = Literal["layout", "image", "view", "end-to-end"]
-STAGES: tuple[StageName, ...] = get_args(StageName)
 # Added to the seed of a run, so that its stages begin with different weights.
 _SEED_OF_STAGE: dict[StageName, int] = {"layout": 0, "image": 1, "view": 2, "end-to-end": 0}
 ONLINE = TrainingData()

@@ -11,7 +11,7 @@ import csv
 import io
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +24,6 @@ _CSV = ("time_s", "x_m", "y_m", "yaw_deg")
 _TUM_VALUES = 8
 # Frames of TUM poses; "auto" chooses by gravity.
 Frame = Literal["auto", "optical", "rep103"]
-FRAMES: tuple[Frame, ...] = get_args(Frame)
 # Cosine of the largest tilt of a camera or robot that stays upright, and the advantage of a frame that is chosen.
 _UPRIGHT, _CLEARER = math.cos(math.radians(35.0)), 0.1
 # Share of the way on the floor that heights vary by, at most, and the shortest way (m) that tells.

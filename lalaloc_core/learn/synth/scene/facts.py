@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import get_args
 
 import numpy as np
 import shapely
@@ -16,8 +15,6 @@ from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene, Sun
 from lalaloc_core.learn.synth.scene.shots import Shot
-
-FACTS: tuple[Fact, ...] = get_args(Fact)
 
 _WIDE_M = 1.2
 _STUB_M = (0.08, 0.65)
