@@ -30,9 +30,8 @@ from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
-# Thickness of the ends of walls beside an empty gap, relative to the usual wall, up to two walls side by side; other
-# ends are of furniture.
-_LIKE_WALL = (0.5, 3.5)
+# Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
+_LIKE_WALL = (0.4, 1.6)
 _MIN_ROOM_M2 = 0.8
 _MAX_ISLAND_M2 = 2.0
 # Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area, or all rooms of
