@@ -23,8 +23,13 @@ _MIN_FLAT_OF_DRAWINGS, _MAX_SPREAD_OF_DRAWINGS, _MIN_PAPER, _MIN_UNIFORM = 0.94,
 # Plans with coloured rooms: differences of neighbours that are none, and that are an edge; shares of such pixels, and
 # of the most frequent tone, which overexposed photographs exceed.
 _SAME, _EDGE, _MIN_STILL, _MIN_EDGES, _UNIFORM = 1, 40, 0.75, 0.035, (0.3, 0.7)
-# Step of the sample of a photograph, and the smallest share of its most frequent tone in drawings.
-_SAMPLE, _MIN_SAMPLED = 4, 0.3
+# Scans: paper that is evenly bright from block to block (of 255), strokes relative to the paper around them, and tones
+# between both, which photographs of pale rooms have more of than of dark ones.
+_MIN_FLAT_OF_SCANS, _MIN_PAPER_OF_SCANS, _MAX_STEP, _MIN_INK, _MAX_BETWEEN = 0.85, 140.0, 16.0, 0.025, 1.2
+_STROKE, _PAPER = 0.6, 0.88
+# Step of the sample of a photograph; the smallest share of its most frequent tone in drawings, and in scans of tones
+# near the median.
+_SAMPLE, _MIN_SAMPLED, _NEAR, _MIN_NEAR = 4, 0.3, 45, 0.75
 _INK, _INK_SHARES = 70, (0.005, 0.4)
 
 
@@ -38,6 +43,8 @@ class Tones:
         darkest: tone of the paper in a dark block.
         uniform: share of pixels of the most frequent tone.
         ink: share of pixels that are much darker than the paper around them.
+        strokes, between: share of pixels that are darker than 0.6 of the paper around them, and between that and paper.
+        step: difference of the paper's tone in neighbouring blocks, the 95th percentile.
         still: share of pixels with the tone of their neighbours.
         edges: share of pixels with another tone than a neighbour.
     """
@@ -47,6 +54,9 @@ class Tones:
     darkest: float
     uniform: float
     ink: float
+    strokes: float
+    between: float
+    step: float
     still: float
     edges: float
 
@@ -64,6 +74,9 @@ class Tones:
         paper = np.percentile(blocks, _PAPER_PERCENTILE, axis=1)
         is_paper = np.abs(blocks - paper[:, None]) <= _NOISE
         dark, bright = np.percentile(paper, [5, 95])
+        relative = blocks / np.maximum(paper[:, None], 1.0)
+        tone = paper.reshape(rows, columns)
+        steps = np.concatenate([np.abs(np.diff(tone, axis=axis)).ravel() for axis in (0, 1)])
         counts = np.bincount(small.ravel(), minlength=256)
         frequent = int(counts.argmax())
         step = np.maximum(np.abs(np.diff(small, axis=0))[:, 1:], np.abs(np.diff(small, axis=1))[1:])
@@ -73,6 +86,9 @@ class Tones:
             darkest=float(dark),
             uniform=float(counts[max(frequent - 3, 0) : frequent + 4].sum() / small.size),
             ink=float((blocks < paper[:, None] - _INK).mean()),
+            strokes=float((relative < _STROKE).mean()),
+            between=float(((relative >= _STROKE) & (relative < _PAPER)).mean()),
+            step=float(np.percentile(steps, 95)) if len(steps) else 0.0,
             still=float((step <= _SAME).mean()),
             edges=float((step >= _EDGE).mean()),
         )
@@ -84,26 +100,36 @@ class Tones:
 
     @property
     def is_drawing(self) -> bool:
-        """True for ink on white paper or coloured areas, as a plan or a text; scans can give False.
+        """True for ink on paper or coloured areas, as a plan or a text; pale scans can give False.
 
         Overexposed photographs of white rooms can give True.
         """
         is_coloured = self.still >= _MIN_STILL and self.edges >= _MIN_EDGES
-        return (is_coloured and _UNIFORM[0] <= self.uniform <= _UNIFORM[1]) or (
+        is_white = (
             self.flat >= _MIN_FLAT_OF_DRAWINGS
             and self.spread <= _MAX_SPREAD_OF_DRAWINGS
             and self.darkest >= _MIN_PAPER
             and self.uniform >= _MIN_UNIFORM
             and _INK_SHARES[0] <= self.ink <= _INK_SHARES[1]
         )
+        is_scanned = (
+            self.flat >= _MIN_FLAT_OF_SCANS
+            and self.darkest >= _MIN_PAPER_OF_SCANS
+            and self.step <= _MAX_STEP
+            and _MIN_INK <= self.strokes <= _INK_SHARES[1]
+            and self.between <= _MAX_BETWEEN * self.strokes
+        )
+        return (is_coloured and _UNIFORM[0] <= self.uniform <= _UNIFORM[1]) or is_white or is_scanned
 
 
 def is_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> bool:
     """Return whether an RGB picture is a drawing (`Tones.is_drawing`), quickly for photographs."""
-    # A sample suffices to see that no tone is frequent.
-    counts = np.bincount(picture[::_SAMPLE, ::_SAMPLE, 1].ravel(), minlength=256)
-    frequent = int(counts.argmax())
-    if counts[max(frequent - 6, 0) : frequent + 7].sum() < _MIN_SAMPLED * counts.sum():
+    # A sample suffices to see that no tone is frequent, and that few are near the usual one.
+    sample = picture[::_SAMPLE, ::_SAMPLE, 1].ravel()
+    counts = np.bincount(sample, minlength=256)
+    frequent, median = int(counts.argmax()), int(np.median(sample))
+    is_even = counts[max(median - _NEAR, 0) : median + _NEAR].sum() >= _MIN_NEAR * counts.sum()
+    if not is_even and counts[max(frequent - 6, 0) : frequent + 7].sum() < _MIN_SAMPLED * counts.sum():
         return False
     tones = Tones.of(np.asarray(Image.fromarray(picture).convert("L")))
     return tones is not None and tones.is_drawing

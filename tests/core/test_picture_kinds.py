@@ -58,6 +58,11 @@ def test_plans_with_coloured_rooms_are_drawings(style: Style) -> None:
     assert is_drawing(np.asarray(Image.open(stream)))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_scanned_plans_are_drawings(seed: int) -> None:
+    assert is_drawing(np.asarray(Image.open(io.BytesIO(draw_plan("scanned", seed).jpeg())).convert("RGB")))
+
+
 def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked() -> None:
     with pytest.raises(InvalidFloorPlanError, match="is a photograph, not a floor plan"):
         import_plan((EXAMPLES / "real/hotel_room.jpg").read_bytes())
