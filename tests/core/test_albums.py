@@ -207,7 +207,7 @@ def test_photographs_of_a_facade_are_set_aside(
     assert [each.pose.room_id for each in pins[:-2] if each.pose] == list(ROOMS)
     for pin in pins[-2:]:
         assert (pin.state, pin.pose) == ("set_aside", None)
-        assert "nothing that rooms hold" in pin.reason
+        assert "façades and gardens" in pin.reason
 
 
 def test_photograph_that_shows_no_wall_is_not_sure(

@@ -244,7 +244,7 @@ def _pin(
     if share[rooms] > 0.5 or not suggestions:
         reason = "it fits none of the rooms of the plan better than rooms of other buildings"
         if _outside(photograph) > 0.0:
-            reason = "it shows nothing that rooms hold, as a photograph of a façade or a garden does"
+            reason = "no furniture or fittings are recognised in it, as in photographs of façades and gardens"
         return replace(base, state="set_aside", reason=reason)
     confidence = float(share[order[0]])
     is_sure = confidence >= SURE

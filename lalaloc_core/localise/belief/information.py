@@ -78,8 +78,8 @@ def reason_for(confidence: float, elsewhere: float, objects: SeenObjects | None,
     """
     if confidence < CONFIDENT and objects is not None and objects.outside > 0.0:
         return (
-            "the photograph shows nothing that is recognised of what rooms hold, as one of a façade or a garden does: "
-            "send one taken in a room of the plan"
+            "no furniture or fittings are recognised in the photograph, as in one of a façade or a garden: send one "
+            "that was taken in a room of the plan"
         )
     if confidence >= UNSURE or is_warned:
         return None
