@@ -142,6 +142,37 @@ def test_map_conversion_gives_anchor_and_north():
     assert plan.document["north_deg"] == pytest.approx(30.0 - convergence, abs=0.01)
 
 
+def _loose_space(model: _Model) -> Any:
+    return model.prism("IfcSpace", _box(0, 0, 4000, 3000), 0, 2600, LongName="Küche")
+
+
+def test_space_that_a_storey_contains_as_an_element_is_a_room():
+    model = _Model()
+    model.contain(_loose_space(model))
+    assert [room["name"] for room in import_plan(model.content()).document["rooms"]] == ["Küche"]
+
+
+def test_spaces_of_no_storey_belong_to_the_one_at_their_height():
+    model = _Model()
+    model.begin_storey("OG", 3000.0)
+    _loose_space(model)
+    model.prism("IfcSpace", _box(0, 0, 4000, 3000), 3000, 2600, LongName="Bad")
+    model.prism("IfcSpace", _box(0, 0, 4000, 3000), -9000, 2600, LongName="Keller")
+    plans = import_plans(model.content())
+    assert [(plan.level.name, plan.document["rooms"][0]["name"]) for plan in plans] == [("EG", "Küche"), ("OG", "Bad")]
+    assert any(use.layer == "IfcSpace" and "ignored" in use.used_as for use in plans[0].report.layers)
+
+
+def test_building_without_storeys_is_one_level():
+    model = _Model()
+    model.file.remove(model.storey)
+    model.file.create_entity("IfcBuilding", ifcopenshell.guid.new(), Name="Haus")
+    _loose_space(model)
+    plan = import_plan(model.content())
+    assert plan.level.name == "Haus"
+    assert [room["name"] for room in plan.document["rooms"]] == ["Küche"]
+
+
 def test_model_without_spaces_is_rejected_with_a_remedy():
     with pytest.raises(InvalidFloorPlanError, match=r"no IfcSpace .* export it with rooms"):
         import_plan(_Model().content())

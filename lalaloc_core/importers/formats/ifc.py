@@ -70,23 +70,23 @@ def _read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Impor
     budget.spend(content.count(b"=IFC") + content.count(b"= IFC"))
     model = open_model(content)
     budget.check_time()
-    storeys = _storeys(model)
+    meshes = _Meshes(budget)
+    storeys = _storeys(model, meshes)
     if not storeys:
         raise InvalidFloorPlanError(
             "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
     anchor = find_anchor(model, _unit(model))
-    meshes = _Meshes(budget)
     elements = _elements(model, storeys, meshes)
 
-    def make(level: Level, content: tuple[Any, list[Any]]) -> ImportedPlan:
-        storey, spaces = content
+    def make(level: Level, content: tuple[str, list[Any]]) -> ImportedPlan:
+        key, spaces = content
         builder = ReportBuilder("ifc", _unit(model), "the model's unit")
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
         floor_m = _add_spaces(spaces, sketch, builder, meshes)
-        _add_elements(elements.by_storey[str(storey.id())], floor_m, sketch, builder, meshes)
-        for name, count in elements.lost.items():
+        _add_elements(elements.by_storey[key], floor_m, sketch, builder, meshes)
+        for name, count in (+elements.lost).items():
             builder.use(name, "ignored (not in a storey with spaces)", count)
         if not sketch.rooms:
             raise NoRoomError(
@@ -104,26 +104,35 @@ def _unit(model: Any) -> float:
     return float(calculate_unit_scale(model))
 
 
-def _storeys(model: Any) -> Mapping[str, tuple[Level, tuple[Any, list[Any]]]]:
-    """Return the storeys that have spaces, by id."""
-    spaces: dict[int, list[Any]] = {}
-    for space in model.by_type("IfcSpace"):
-        storey = _storey_of(space)
-        if storey is not None:
-            spaces.setdefault(storey.id(), []).append(space)
+def _storeys(model: Any, meshes: _Meshes) -> Mapping[str, tuple[Level, tuple[str, list[Any]]]]:
+    """Return the storeys that have spaces, by id, with it and the spaces.
+
+    A space belongs to the storey that it is a part of, else to the one that contains it, else to the one at its height.
+    """
     unit = _unit(model)
-    heights = sorted(
-        (float(storey.Elevation or 0.0) * unit, storey.id()) for storey in model.by_type("IfcBuildingStorey")
-    )
-    with_rooms = [(height, key) for height, key in heights if key in spaces]
+    entities = _storey_entities(model)
+    places = sorted((_elevation_m(entity, unit), True, str(entity.id())) for entity in entities)
+    spaces: dict[str, list[Any]] = {}
+    for space in model.by_type("IfcSpace"):
+        storey = _storey_of(space) or _storey_around(space, model)
+        key = _storey_at(meshes.of(space), places) if storey is None else str(storey.id())
+        if key is not None:
+            spaces.setdefault(key, []).append(space)
+    heights = sorted((_stated_elevation_m(entity, unit), entity.id()) for entity in entities)
+    with_rooms = [(height, key) for height, key in heights if str(key) in spaces]
     # The ground floor is the storey nearest to zero.
     ground = min(range(len(with_rooms)), key=lambda i: abs(with_rooms[i][0]), default=0)
     found = {}
     for number, (height, key) in enumerate(with_rooms):
         storey = model.by_id(key)
         name = str(storey.LongName or storey.Name or f"level {number - ground}")[:200]
-        found[str(key)] = (Level(name, float(number - ground), height), (storey, spaces[key]))
+        found[str(key)] = (Level(name, float(number - ground), height), (str(key), spaces[str(key)]))
     return found
+
+
+def _storey_entities(model: Any) -> list[Any]:
+    """Return the storeys of a model; a building without storeys counts as one."""
+    return list(model.by_type("IfcBuildingStorey") or model.by_type("IfcBuilding")[:1])
 
 
 def _storey_of(element: Any) -> Any:
@@ -135,6 +144,15 @@ def _storey_of(element: Any) -> Any:
         element = parents[0]
         if element.is_a("IfcBuildingStorey"):
             return element
+    return None
+
+
+def _storey_around(space: Any, model: Any) -> Any:
+    """Return the storey that contains a space, as an element or by reference; None if none does."""
+    for relation in model.get_inverse(space):
+        place = getattr(relation, "RelatingStructure", None)
+        if place is not None and not place.is_a("IfcSpace"):
+            return place if place.is_a("IfcBuildingStorey") else _storey_of(place)
     return None
 
 
@@ -173,7 +191,7 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, m
 
 @dataclass(frozen=True)
 class _Elements:
-    """Doors, windows and columns by the id of their storey, and the number of those of no storey by their kind."""
+    """Doors, windows and columns by the id of their storey; `lost` counts elements and spaces of no storey by kind."""
 
     by_storey: dict[str, list[Any]]
     lost: Counter[str] = field(default_factory=Counter)
@@ -188,9 +206,10 @@ def _elements(model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Mes
     unit = _unit(model)
     heights = sorted(
         (_elevation_m(storey, unit), str(storey.id()) in storeys, str(storey.id()))
-        for storey in model.by_type("IfcBuildingStorey")
+        for storey in _storey_entities(model)
     )
     found = _Elements({key: [] for key in storeys})
+    found.lost["IfcSpace"] = len(model.by_type("IfcSpace")) - sum(len(spaces) for _, (_, spaces) in storeys.values())
     for name in (*_KINDS, "IfcColumn", *FURNISHINGS):
         for element in model.by_type(name):
             if name in FURNISHINGS and (fixture_kind(element) is None or not meshes.has_time_for_fixtures):
@@ -233,7 +252,12 @@ def _elevation_m(storey: Any, unit: float) -> float:
 
     if storey.ObjectPlacement is not None:
         return float(np.asarray(get_local_placement(storey.ObjectPlacement))[2, 3]) * unit
-    return float(storey.Elevation or 0.0) * unit
+    return _stated_elevation_m(storey, unit)
+
+
+def _stated_elevation_m(storey: Any, unit: float) -> float:
+    # A building, which can stand in for a storey, has none.
+    return float(getattr(storey, "Elevation", None) or 0.0) * unit
 
 
 def _add_elements(
