@@ -192,7 +192,7 @@ class _Turn:
         """Read the photographs."""
         self._model, self._taken = model, taken
         manifest = model.bundle.manifest
-        photographs = [
+        self._photographs = [
             open_photograph(
                 encode_jpeg(picture),
                 sphere_size=sphere_size(manifest),
@@ -203,8 +203,6 @@ class _Turn:
             )
             for picture in taken.pictures
         ]
-        # One reading serves all searches.
-        self._photographs = [model.encoder.with_features(photograph) for photograph in photographs]
 
     def located(
         self, plan: FloorPlan, scene: str, number: int, *, known: bool, height_factor: float = 1.0

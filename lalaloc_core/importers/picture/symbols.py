@@ -1,8 +1,10 @@
 """Symbols of fixtures in pictures, as most programs draw them; only clear ones are taken.
 
 A stove is a box with four circles in two rows. A toilet is an oval before the middle of a cistern at a wall. A bath is
-a box at a wall with a rounded tub inside. A bed is a box with pillows at its head, which is at a wall. Stairs are
-treads of one size in a row.
+a box at a wall with a rounded tub inside. A basin is a box at a wall with an oval in its middle, which is no circle in
+a square, as of a washing machine. A sink is a box at a wall with two bowls side by side, or one at an end. A shower is
+a square at a wall with a drain in its middle or a corner, and nothing else than its diagonals. A bed is a box with
+pillows at its head, which is at a wall. Stairs are treads of one size in a row.
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ _AT_WALL_M = 0.18
 _BURNER_M, _BURNERS_M, _HOB_M = (0.09, 0.33), (0.15, 0.5), ((0.4, 1.0), (0.4, 0.8))
 _BOWL_M, _CISTERN_M, _TOILET_M = ((0.32, 0.6), (0.26, 0.46)), ((0.3, 0.62), (0.08, 0.27)), (0.48, 0.88)
 _BATH_M, _TUB, _DRAIN_M2 = ((1.35, 1.95), (0.6, 0.95)), (0.5, 0.93), 0.03
+_BASIN_M, _BASIN_BOWL, _SQUARE = ((0.36, 0.8), (0.26, 0.6)), (0.25, 0.85), 1.2
+_SINK_M, _SINK_BOWL, _INSET_M, _OFF_MIDDLE = ((0.7, 1.3), (0.42, 0.68)), (0.15, 0.5), 0.02, 0.1
+_SHOWER_M, _SHOWER_DRAIN_M, _LEFT_OUT = ((0.7, 1.3), (0.68, 1.1)), (0.06, 0.2), 0.12
 _BED_M, _PILLOW_M, _DOUBLE_M = ((1.85, 2.3), (0.75, 2.1)), ((0.33, 0.95), (0.2, 0.6)), 1.2
 _ROUNDED_M2, _FURNITURE_M2, _TOUCHING_M = 0.03, 1.3, 0.06
 _TREAD_M, _TREADS, _FLIGHT_M = ((0.34, 2.2), (0.18, 0.36)), 5, 0.7
@@ -62,7 +67,7 @@ def _symbols(shapes: Sequence[Shape], given: Sequence[Symbol], check_time: Calla
     found = list(given)
     found += [symbol for symbol in (*_stairs(shapes), *_toilets(shapes)) if not is_taken(symbol.outline, given)]
     boxes = [shape for shape in shapes if shape.area >= _HOB_M[0][0] * _HOB_M[1][0] and shape.is_box]
-    for shape in sorted([*boxes, *_beds(boxes)], key=lambda shape: -shape.area):
+    for shape in sorted([*boxes, *_beds(boxes), *_crossed_boxes(shapes)], key=lambda shape: -shape.area):
         check_time()
         parts = [shapes[k] for k in tree.query(shape.outline, predicate="intersects") if shape.holds(shapes[k])]
         symbol = _symbol(shape, parts)
@@ -103,6 +108,10 @@ def _symbol(shape: Shape, parts: Sequence[Shape]) -> Symbol | None:
         return Symbol("stove", outline)
     if _is_bath(shape, parts):
         return Symbol("bath", outline, outline)
+    washed_in = (("basin", _is_basin), ("sink", _is_sink), ("shower", _is_shower))
+    kind = next((kind for kind, is_kind in washed_in if is_kind(shape, parts)), None)
+    if kind is not None:
+        return Symbol(kind, outline, outline)
     head = _head_of_bed(shape, parts)
     if head is not None:
         return Symbol("bed", outline, head)
@@ -113,7 +122,7 @@ def _symbol(shape: Shape, parts: Sequence[Shape]) -> Symbol | None:
 
 def _is_stove(shape: Shape, parts: Sequence[Shape]) -> bool:
     circles = [part for part in parts if part.is_circle and _BURNER_M[0] <= part.long_m <= _BURNER_M[1]]
-    burners = [part for part in circles if not any(other.holds(part) for other in circles)]
+    burners = _outermost(circles)
     if not _fits(shape, _HOB_M) or len(burners) != 4:
         return False
     # Centres of a grid of two by two, along the sides of the box.
@@ -153,7 +162,7 @@ def _is_bowl(part: Shape) -> bool:
 
 def _is_bath(shape: Shape, parts: Sequence[Shape]) -> bool:
     tubs = [part for part in parts if _TUB[0] * shape.area <= part.area <= _TUB[1] * shape.area]
-    inner = [tub for tub in tubs if not any(other.holds(tub) for other in tubs)]
+    inner = _outermost(tubs)
     if not _fits(shape, _BATH_M) or len(inner) != 1:
         return False
     (tub,) = inner
@@ -161,6 +170,69 @@ def _is_bath(shape: Shape, parts: Sequence[Shape]) -> bool:
     is_along = abs(float(tub.axis @ shape.axis)) > 0.95 and tub.long_m > 1.3 * tub.short_m
     is_centred = float(np.linalg.norm(tub.centre - shape.centre)) < 0.15
     return is_along and is_centred and not others and tub.rounded_corners >= 2
+
+
+def _is_basin(shape: Shape, parts: Sequence[Shape]) -> bool:
+    bowls = _outermost([part for part in parts if part.area > _DRAIN_M2])
+    if not _fits(shape, _BASIN_M) or len(bowls) != 1:
+        return False
+    (bowl,) = bowls
+    is_washer = bowl.is_circle and shape.long_m <= _SQUARE * shape.short_m
+    is_share = _BASIN_BOWL[0] * shape.area <= bowl.area <= _BASIN_BOWL[1] * shape.area
+    return bowl.is_oval and is_share and not is_washer and float(np.linalg.norm(bowl.centre - shape.centre)) < 0.08
+
+
+def _is_sink(shape: Shape, parts: Sequence[Shape]) -> bool:
+    bowls = _outermost([part for part in parts if part.area > _DRAIN_M2])
+    if not _fits(shape, _SINK_M) or not all(_is_sink_bowl(bowl, shape) for bowl in bowls):
+        return False
+    places = [float((bowl.centre - shape.centre) @ shape.axis) for bowl in bowls]
+    if len(places) == 1:
+        return abs(places[0]) > _OFF_MIDDLE * shape.long_m
+    return len(places) == 2 and places[0] * places[1] < 0.0
+
+
+def _is_sink_bowl(bowl: Shape, sink: Shape) -> bool:
+    """Return whether a part lies as a bowl in a sink: off its edges, and nearly as deep."""
+    reach = np.abs((bowl.box - sink.centre) @ sink.frame).max(axis=0)
+    depth = 2.0 * reach[1]
+    is_inset = bool(np.all(reach <= np.array([sink.long_m, sink.short_m]) / 2.0 - _INSET_M))
+    is_share = _SINK_BOWL[0] * sink.area <= bowl.area <= _SINK_BOWL[1] * sink.area
+    return is_inset and is_share and depth >= 0.55 * sink.short_m and bowl.filled >= 0.8
+
+
+def _crossed_boxes(shapes: Sequence[Shape]) -> list[Shape]:
+    """Return the boxes that diagonals divide around a drain."""
+    tree, found = shapely.STRtree([shape.outline for shape in shapes]), []
+    for drain in shapes:
+        if not _is_drain(drain):
+            continue
+        near = tree.query(drain.outline, predicate="dwithin", distance=3.0 * drain.pixel_m)
+        triangles = [shapes[k] for k in near if shapes[k].area > drain.area and not shapes[k].holds(drain)]
+        box = Shape.around([drain, *triangles])
+        if len(triangles) == 4 and box.is_box and _fits(box, _SHOWER_M):
+            found.append(box)
+    return found
+
+
+def _is_drain(part: Shape) -> bool:
+    return part.is_circle and _SHOWER_DRAIN_M[0] <= part.long_m <= _SHOWER_DRAIN_M[1]
+
+
+def _is_shower(shape: Shape, parts: Sequence[Shape]) -> bool:
+    drains = _outermost([part for part in parts if _is_drain(part)])
+    if not _fits(shape, _SHOWER_M) or shape.long_m > _SQUARE * shape.short_m or len(drains) != 1:
+        return False
+    (drain,) = drains
+    reach = np.abs((drain.centre - shape.centre) @ shape.frame) / np.array([shape.long_m, shape.short_m])
+    is_placed = bool(np.all(reach < _LEFT_OUT) or np.all(reach > 0.5 - 2.0 * _LEFT_OUT))
+    # Diagonals leave triangles.
+    others = [part for part in parts if part is not drain and not drain.holds(part)]
+    return is_placed and all(part.filled < 0.65 for part in others)
+
+
+def _outermost(parts: Sequence[Shape]) -> list[Shape]:
+    return [part for part in parts if not any(other.holds(part) for other in parts)]
 
 
 def _beds(boxes: Sequence[Shape]) -> list[Shape]:

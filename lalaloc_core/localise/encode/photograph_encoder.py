@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from lalaloc_core.bundle import Bundle, Manifest
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.encode.features import RING_HEIGHTS_M, at_height
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
@@ -18,7 +18,8 @@ from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEn
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
 from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, ViewEncoder
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects
-from lalaloc_core.photograph import PatchSize, Photograph, PhotographFeatures
+from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
+from lalaloc_core.photograph.patches import joined_patches
 
 
 class PhotographEncoder(LayoutEncoder):
@@ -86,11 +87,13 @@ class PhotographEncoder(LayoutEncoder):
         helper = None if photograph.features is not None or self._objects is None else self.helper()
         beside = None if helper is None else helper.submit(self._seen_objects, turned)
         if photograph.features is None:
-            outputs = self._views.outputs([patch.rgba for view, _ in turned for patch in view.patches], height_m)
+            patches = self._patches(turned)
+            outputs = self._views.outputs([patch.rgba for patch, _ in patches], height_m)
+            placed = [(patch.azimuth_rad, tilt_sd) for patch, tilt_sd in patches]
         else:
             parts = [at_height(view.features, height_m) for view, _ in turned if view.features]
             outputs = {name: np.concatenate([part[name] for part in parts]) for name in VIEW_OUTPUTS}
-        placed = [(azimuth + turn, view.tilt_sd(azimuth)) for view, turn in turned for azimuth in view.patch_azimuths]
+            placed = [(angle + turn, view.tilt_sd(angle)) for view, turn in turned for angle in view.patch_azimuths]
         query = self._views.query_of_outputs(
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
@@ -117,6 +120,16 @@ class PhotographEncoder(LayoutEncoder):
         if self._objects is not None:
             outputs |= self._objects.outputs(photograph)
         return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
+
+    def _patches(self, turned: Sequence[tuple[Photograph, float]]) -> list[tuple[Patch, float]]:
+        """Return the patches of photographs of one spot, which are joined, and the standard deviations of their tilt."""
+        if len(turned) == 1:
+            ((view, _),) = turned
+            return [(patch, view.tilt_sd(patch.azimuth_rad)) for patch in view.patches]
+        placed = [(patch, patch.azimuth_rad + turn) for view, turn in turned for patch in view.patches]
+        joined = joined_patches(placed, patch_size(self.manifest))
+        tilts = [_tilt_sd(turned, patch.azimuth_rad) for patch in joined]
+        return list(zip(joined, tilts, strict=True))
 
     def _seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
         """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
@@ -159,6 +172,12 @@ class PhotographEncoder(LayoutEncoder):
             self._views.query_of_outputs(outputs, [(0.0, 0.0)], None, height)
         if self._objects is not None:
             self._objects.warm_up()
+
+
+def _tilt_sd(turned: Sequence[tuple[Photograph, float]], azimuth: float) -> float:
+    """Return the standard deviation (radians) of elevations along an azimuth by the photograph that shows it best."""
+    view, turn = min(turned, key=lambda each: abs(float(wrap_angle(azimuth - each[1]))))
+    return view.tilt_sd(azimuth - turn)
 
 
 def sphere_size(manifest: Manifest) -> tuple[int, int]:
