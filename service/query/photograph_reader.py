@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -22,6 +23,9 @@ from service.query.spots import Spot
 from service.schemas import LocaliseForm, PhotographForm, StatedHeading
 from service.uploaded_file import UploadedFile
 
+# Photographs of a query that are decoded at the same time.
+_BESIDE = 2
+
 
 class PhotographReader:
     """Decoder, in worker processes, and encoder, on compute threads, of a query's photographs."""
@@ -37,17 +41,33 @@ class PhotographReader:
     async def decode(
         self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
     ) -> list[Photograph]:
-        """Decode photographs one at a time, so that a query occupies one decoder.
+        """Decode photographs, in their order.
 
         Raises:
             InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
         """
         with context.clock.stage("decode"):
-            photographs: list[Photograph] = []
-            for index, content in enumerate(contents):
-                with _named(index, contents):
-                    photographs.append(await self._decoder.decode(content, stated, context.deadline, context.client))
-            return photographs
+            return await self._decode_all(contents, stated, context)
+
+    async def _decode_all(
+        self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext, *, overview: int = 0
+    ) -> list[Photograph]:
+        """Decode photographs, a few at a time, so that a query leaves the other decoders to others."""
+
+        async def decode(index: int) -> Photograph:
+            with _named(index, contents):
+                return await self._decoder.decode(
+                    contents[index], stated, context.deadline, context.client, overview=overview
+                )
+
+        photographs: list[Photograph] = []
+        for first in range(0, len(contents), _BESIDE):
+            group = range(first, min(first + _BESIDE, len(contents)))
+            for decoded in await asyncio.gather(*map(decode, group), return_exceptions=True):
+                if isinstance(decoded, BaseException):
+                    raise decoded
+                photographs.append(decoded)
+        return photographs
 
     async def decode_turn(
         self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
@@ -60,14 +80,11 @@ class PhotographReader:
         Raises:
             InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
         """
-        decode = partial(self._decoder.decode, deadline=context.deadline, client=context.client)
         with context.clock.stage("decode"):
-            photographs: list[Photograph] = []
-            for index, content in enumerate(contents):
-                with _named(index, contents):
-                    photographs.append(await decode(content, stated, overview=TURN_SIDE))
+            photographs = await self._decode_all(contents, stated, context, overview=TURN_SIDE)
             if any(photograph.overview is None for photograph in photographs):
                 # Patches of the others are not cut yet.
+                decode = partial(self._decoder.decode, deadline=context.deadline, client=context.client)
                 each = zip(photographs, contents, strict=True)
                 return [
                     photograph if photograph.overview is None else await decode(content, stated)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import math
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -18,7 +20,7 @@ from lalaloc_core.nets.view_network import ViewEncoderConfig
 from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.bent_lines import measure_bend
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
-from lalaloc_core.photograph.patches import UNSEEN, patch_azimuths
+from lalaloc_core.photograph.patches import UNSEEN, Patch, joined_patches, patch_azimuths
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
@@ -244,6 +246,13 @@ class TestTilt:
         assert np.abs(view.sphere.astype(int) - expected).mean() < 4.0
 
 
+def _placed(headings_deg: Sequence[int]) -> list[tuple[Patch, float]]:
+    views = [
+        opened(jpeg(view_of(MAIN, heading_deg=heading), PHONE), pitch_deg=0.0, roll_deg=0.0) for heading in headings_deg
+    ]
+    return [(view.patches[0], math.radians(heading)) for view, heading in zip(views, headings_deg, strict=True)]
+
+
 def patch_error(view: Photograph, name: str, heading_deg: float = 0.0) -> float:
     """Return the mean difference (grey levels) of the patches from the panorama that the photograph was taken from."""
     size = PatchSize()
@@ -308,6 +317,33 @@ class TestPatches:
         resolution = PatchSize().width / PatchSize().hfov_deg
         assert len(seen_columns) / resolution == pytest.approx(67.3, abs=1.0)
         assert seen_columns.mean() == pytest.approx(127.5, abs=1.0)
+
+    @pytest.mark.parametrize(
+        ("headings_deg", "azimuths_deg"),
+        [
+            ((0,), [0]),
+            ((0, 40), [20]),
+            ((0, 40, 80, 120), [22.5, 60, 97.5]),
+            ((0, 120), [0, 120]),
+            ((180, 220), [-160]),
+            (range(0, 360, 40), [0, 45, 90, 135, 180, -135, -90, -45]),
+        ],
+    )
+    def test_joined_patches_show_the_panorama(self, headings_deg: Sequence[int], azimuths_deg: list[float]) -> None:
+        joined = joined_patches(_placed(headings_deg), PatchSize())
+        found = sorted(math.degrees(patch.azimuth_rad) % 360.0 for patch in joined)
+        np.testing.assert_allclose(found, sorted(azimuth % 360.0 for azimuth in azimuths_deg), atol=3.0)
+        seen_deg = sum(patch.seen.any(axis=0).sum() for patch in joined) * 112.5 / 256
+        assert seen_deg >= min(len(headings_deg) * 40.0, 360.0)
+        view = replace(opened(jpeg(view_of(MAIN), PHONE)), patches=tuple(joined))
+        assert patch_error(view, "living_room") < 8.0
+
+    def test_joined_patch_shows_one_run_of_azimuths(self) -> None:
+        joined = joined_patches(_placed((0, 75)), PatchSize())
+        assert len(joined) == 2
+        for patch in joined:
+            assert (patch.pixels[~patch.seen] == UNSEEN).all()
+            assert np.ptp(np.flatnonzero(patch.seen.any(axis=0))) * 112.5 / 256 < 70.0
 
     @pytest.mark.parametrize("hfov_deg", [60.0, 112.5, 140.0, 200.0, 300.0, 359.0, 360.0])
     def test_patches_cover_every_azimuth(self, hfov_deg: float) -> None:

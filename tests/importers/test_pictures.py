@@ -317,10 +317,10 @@ def test_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
 
 @pytest.mark.slow
 def test_clear_symbols_become_fixtures_and_other_shapes_are_counted():
-    plan = draw_plan("thick", 0, has_symbols=True)
+    plan = draw_plan("thick", 2, has_symbols=True)
     draft = import_plan(plan.png(), ImportOptions(metres_per_pixel=plan.metres_per_pixel))
     fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in draft.document["fixtures"]]
-    assert len({kind for kind, _ in fixtures}) >= 3
+    assert {kind for kind, _ in fixtures} == {"stairs", "sink", "bath", "stove", "basin", "shower"}
     for kind, outline in fixtures:
         assert any(symbol.kind == kind and _iou(symbol.outline, outline) > 0.6 for symbol in plan.symbols)
     assert any("fixtures are taken from their symbols" in line for line in draft.report.unsure)

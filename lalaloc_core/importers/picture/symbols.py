@@ -3,8 +3,8 @@
 A stove is a box with four circles in two rows. A toilet is an oval before the middle of a cistern at a wall. A bath is
 a box at a wall with a rounded tub inside. A basin is a box at a wall with an oval in its middle, which is no circle in
 a square, as of a washing machine. A sink is a box at a wall with two bowls side by side, or one at an end. A shower is
-a square at a wall with a drain in its middle or a corner, and nothing else than its diagonals. A bed is a box with
-pillows at its head, which is at a wall. Stairs are treads of one size in a row.
+a square at a wall with a drain in its middle or a corner, and nothing else than diagonals that end there. A bed is
+a box with pillows at its head, which is at a wall. Stairs are treads of one size in a row.
 """
 
 from __future__ import annotations
@@ -65,9 +65,10 @@ def _symbols(shapes: Sequence[Shape], given: Sequence[Symbol], check_time: Calla
     """Return the symbols that are given, and others among shapes."""
     tree = shapely.STRtree([shape.outline for shape in shapes])
     found = list(given)
-    found += [symbol for symbol in (*_stairs(shapes), *_toilets(shapes)) if not is_taken(symbol.outline, given)]
+    clear = (*_stairs(shapes), *_toilets(shapes), *_crossed_showers(shapes))
+    found += [symbol for symbol in clear if not is_taken(symbol.outline, given)]
     boxes = [shape for shape in shapes if shape.area >= _HOB_M[0][0] * _HOB_M[1][0] and shape.is_box]
-    for shape in sorted([*boxes, *_beds(boxes), *_crossed_boxes(shapes)], key=lambda shape: -shape.area):
+    for shape in sorted([*boxes, *_beds(boxes)], key=lambda shape: -shape.area):
         check_time()
         parts = [shapes[k] for k in tree.query(shape.outline, predicate="intersects") if shape.holds(shapes[k])]
         symbol = _symbol(shape, parts)
@@ -201,18 +202,25 @@ def _is_sink_bowl(bowl: Shape, sink: Shape) -> bool:
     return is_inset and is_share and depth >= 0.55 * sink.short_m and bowl.filled >= 0.8
 
 
-def _crossed_boxes(shapes: Sequence[Shape]) -> list[Shape]:
-    """Return the boxes that diagonals divide around a drain."""
-    tree, found = shapely.STRtree([shape.outline for shape in shapes]), []
-    for drain in shapes:
-        if not _is_drain(drain):
+def _crossed_showers(shapes: Sequence[Shape]) -> list[Symbol]:
+    """Return the showers that diagonals divide into four triangles, which end at a drain."""
+    triangles = [shape for shape in shapes if 0.4 <= shape.filled <= 0.65 and _fits(shape, (_SHOWER_M[0], (0.0, 1.0)))]
+    tree, found = shapely.STRtree([triangle.outline for triangle in triangles]), []
+    for number, triangle in enumerate(triangles):
+        near = tree.query(triangle.outline, predicate="dwithin", distance=_SHOWER_DRAIN_M[1])
+        box = Shape.around([triangles[k] for k in near])
+        if len(near) != 4 or near.min() != number or not (box.is_box and _is_tray(box)):
             continue
-        near = tree.query(drain.outline, predicate="dwithin", distance=3.0 * drain.pixel_m)
-        triangles = [shapes[k] for k in near if shapes[k].area > drain.area and not shapes[k].holds(drain)]
-        box = Shape.around([drain, *triangles])
-        if len(triangles) == 4 and box.is_box and _fits(box, _SHOWER_M):
-            found.append(box)
+        radii = [float(shapely.distance(shapely.Point(box.centre), triangles[k].outline)) for k in near]
+        # Diagonals without a drain meet; such boxes are shafts as well.
+        if min(radii) >= max(0.5 * _SHOWER_DRAIN_M[0], 2.5 * box.pixel_m) and max(radii) <= 0.5 * _SHOWER_DRAIN_M[1]:
+            tray = shapely.Polygon(box.box)
+            found.append(Symbol("shower", tray, tray))
     return found
+
+
+def _is_tray(shape: Shape) -> bool:
+    return _fits(shape, _SHOWER_M) and shape.long_m <= _SQUARE * shape.short_m
 
 
 def _is_drain(part: Shape) -> bool:
@@ -221,14 +229,12 @@ def _is_drain(part: Shape) -> bool:
 
 def _is_shower(shape: Shape, parts: Sequence[Shape]) -> bool:
     drains = _outermost([part for part in parts if _is_drain(part)])
-    if not _fits(shape, _SHOWER_M) or shape.long_m > _SQUARE * shape.short_m or len(drains) != 1:
+    if not _is_tray(shape) or len(drains) != 1:
         return False
     (drain,) = drains
     reach = np.abs((drain.centre - shape.centre) @ shape.frame) / np.array([shape.long_m, shape.short_m])
     is_placed = bool(np.all(reach < _LEFT_OUT) or np.all(reach > 0.5 - 2.0 * _LEFT_OUT))
-    # Diagonals leave triangles.
-    others = [part for part in parts if part is not drain and not drain.holds(part)]
-    return is_placed and all(part.filled < 0.65 for part in others)
+    return is_placed and all(part is drain or drain.holds(part) for part in parts)
 
 
 def _outermost(parts: Sequence[Shape]) -> list[Shape]:

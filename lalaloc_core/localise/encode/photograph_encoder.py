@@ -122,7 +122,7 @@ class PhotographEncoder(LayoutEncoder):
         return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
 
     def _patches(self, turned: Sequence[tuple[Photograph, float]]) -> list[tuple[Patch, float]]:
-        """Return the patches of photographs of one spot, which are joined, and the standard deviations of their tilt."""
+        """Return the patches of photographs of one spot, several joined, and the standard deviations of their tilt."""
         if len(turned) == 1:
             ((view, _),) = turned
             return [(patch, view.tilt_sd(patch.azimuth_rad)) for patch in view.patches]
