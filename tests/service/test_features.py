@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import math
 import os
@@ -20,7 +21,7 @@ import httpx
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.bundle import OBJECTS_ONNX, VIEW_ONNX, Bundle, default_bundle
 from lalaloc_core.localise.encode.features import DEVICE_FILES, MAX_BYTES, FeatureEncoder, read_features
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.query import CameraHeight
@@ -349,6 +350,25 @@ def test_range_of_a_file_of_the_model_resumes_it(client: httpx.Client) -> None:
     assert_problem(beyond, 416, "range-not-satisfiable")
     assert beyond.headers["content-range"] == f"bytes */{size}"
     assert ranged("bytes=-0").status_code == 416
+
+
+def test_packed_networks_of_a_phone_are_small(client: httpx.Client) -> None:
+    runtime = client.get("/web/onnxruntime.wasm.gz").content
+    loaded_bytes = len(runtime)
+    for name in (VIEW_ONNX, OBJECTS_ONNX):
+        url = f"/model/{name}.planes.gz"
+        packed = client.get(url)
+        planes = gzip.decompress(packed.content)
+        content, even = bytearray(len(planes)), -(-len(planes) // 2)
+        content[::2], content[1::2] = planes[:even], planes[even:]
+        whole = client.get(f"/model/{name}")
+        assert content == whole.content
+        assert packed.headers["etag"] != whole.headers["etag"]
+        assert client.get(url, headers={"If-None-Match": packed.headers["etag"]}).status_code == 304
+        loaded_bytes += len(packed.content)
+    assert loaded_bytes < 20e6
+    for name in ("manifest.json", "head.onnx"):
+        assert client.get(f"/model/{name}.planes.gz").status_code == 404
 
 
 def test_file_of_the_model_that_changed_is_a_503(start_app: StartApp, tmp_path: Path, own_bundle: Path) -> None:

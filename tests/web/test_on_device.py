@@ -270,7 +270,7 @@ def test_runtime_is_loaded_only_if_it_is_needed(desktop: Visit) -> None:
     expect(desktop.page.get_by_label(BOX)).to_be_checked()
     find(desktop)
     names = {url.rpartition("/")[2] for url in urls}
-    assert {"on_device.js", "onnxruntime.js", "onnxruntime.wasm.gz", "image_encoder.onnx"} <= names
+    assert {"on_device.js", "onnxruntime.js", "onnxruntime.wasm.gz", "image_encoder.onnx.planes.gz"} <= names
     assert {url for url in urls if not url.startswith((str(desktop.client.base_url), "blob:"))} == set()
 
 

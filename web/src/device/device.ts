@@ -164,7 +164,7 @@ class Device {
     this.state.textContent = !this.isOn
       ? ""
       : (progress ??
-        `${locked}Only features are sent: the room’s shape, doors, windows and type, objects that tell the type, and the camera’s lens and tilt. The first photograph loads 12 to 22 MB.`);
+        `${locked}Only features are sent: the room’s shape, doors, windows and type, objects that tell the type, and the camera’s lens and tilt. The first photograph loads 11 to 19 MB.`);
   }
 }
 

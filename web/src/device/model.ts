@@ -30,6 +30,8 @@ const RUNTIME = "/web/onnxruntime.wasm.gz",
 const SPHERES = "image_encoder.onnx",
   VIEWS = "view_encoder.onnx",
   OBJECTS = "objects.onnx";
+// The service packs networks: gzip of the even bytes and then the odd ones.
+const PACKED = ".planes.gz";
 // As in lalaloc_core: camera heights (m) of the rings, the height of all other outputs, and the patches read at once.
 const HEIGHTS_M = [0.5, 1, 1.5, 2, 3],
   HEIGHT_M = 1,
@@ -153,8 +155,9 @@ export class Model {
   private async session(file: string): Promise<ort.InferenceSession> {
     const entry = this.manifest.files[file];
     if (entry === undefined) throw new InputError(`The service’s model “${this.manifest.name}” has no ${file}.`);
-    const [content] = await Promise.all([this.load(file), startRuntime()]);
-    const digest = bytesToHex(sha256(new Uint8Array(content)));
+    const [packed] = await Promise.all([this.load(file + PACKED), startRuntime()]);
+    const content = await unpacked(packed),
+      digest = bytesToHex(sha256(content));
     if (digest !== entry.sha256) {
       throw new InputError(
         `The service sent ${file} with the SHA-256 ${digest.slice(0, 12)}…; its model states ${entry.sha256.slice(0, 12)}…. Load the page again.`,
@@ -174,16 +177,28 @@ function mean(outputs: Float32Array, columns: number): Float32Array {
   });
 }
 
+/** Return a file that the service has packed. */
+async function unpacked(packed: ArrayBuffer): Promise<Uint8Array<ArrayBuffer>> {
+  const planes = new Uint8Array(await unzipped(new Blob([packed]).stream())),
+    content = new Uint8Array(planes.length),
+    even = Math.ceil(planes.length / 2);
+  for (let index = 0; index < even; index++) content[2 * index] = planes[index]!;
+  for (let index = even; index < planes.length; index++) content[2 * (index - even) + 1] = planes[index]!;
+  return content;
+}
+
+/** Unzip here, because not every proxy passes compressed files on. */
+const unzipped = (stream: ReadableStream<Uint8Array<ArrayBuffer>>): Promise<ArrayBuffer> =>
+  new Response(stream.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+
 let runtime: Promise<void> | null = null;
 
-/** Load the runtime once. It is unpacked here, because not every proxy passes compressed files on. */
+/** Load the runtime once. */
 function startRuntime(): Promise<void> {
   return (runtime ??= (async () => {
     const answer = await fetch(RUNTIME);
     if (!answer.ok) throw new Error(`the service answered ${answer.status} for ${RUNTIME}`);
-    ort.env.wasm.wasmBinary = await new Response(
-      answer.body!.pipeThrough(new DecompressionStream("gzip")),
-    ).arrayBuffer();
+    ort.env.wasm.wasmBinary = await unzipped(answer.body!);
     ort.env.wasm.wasmPaths = { mjs: RUNTIME_SCRIPT };
     // Threads need cross-origin isolation.
     ort.env.wasm.numThreads = 1;
