@@ -194,11 +194,17 @@ def _in_torch_package(module: str) -> bool:
     return any(_is_in(module, package) for package in TORCH_PACKAGES)
 
 
-def _reaches_torch(module: str, seen: set[str]) -> bool:
-    seen.add(module)
+@cache
+def _loaded(module: str) -> frozenset[str]:
+    """Return the names of the modules that importing a module loads."""
     loaded = _imported(module, _at_import_time(_tree(module)))
     # Importing a module imports the packages around it.
-    loaded |= {name.rpartition(".")[0] for name in loaded | {module}}
+    return frozenset(loaded | {name.rpartition(".")[0] for name in loaded | {module}})
+
+
+def _reaches_torch(module: str, seen: set[str]) -> bool:
+    seen.add(module)
+    loaded = _loaded(module)
     if any(name == "torch" or name.startswith("torch.") for name in loaded):
         return True
     return any(_reaches_torch(name, seen) for name in sorted(loaded) if name in MODULES and name not in seen)

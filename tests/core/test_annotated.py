@@ -471,6 +471,7 @@ class TestEvaluating:
         assert np.abs(annotated[290] - colours["window"]).max() < 30
         assert np.abs(predicted[290] - colours["window"]).max() < 30
 
+    @pytest.mark.slow
     def test_command_prints_measures_and_draws(
         self, root: Path, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

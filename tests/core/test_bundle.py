@@ -148,6 +148,7 @@ class TestExport:
             exported_bundle(tmp_path / "bundle", TINY)
         assert not (tmp_path / "bundle").exists()
 
+    @pytest.mark.slow
     def test_paper_architecture_is_exported(self, tmp_path: Path) -> None:
         config = small_paper()
         # A file that a bundle of another architecture left behind is not listed.

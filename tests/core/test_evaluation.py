@@ -185,6 +185,7 @@ class TestCommandLine:
         assert not folder.path.exists()
 
 
+@pytest.mark.slow
 def test_scene_is_solved_as_one_album(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, run = tmp_path / "data" / "flat", tmp_path / "run"
     scene.mkdir(parents=True)

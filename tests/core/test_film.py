@@ -53,6 +53,7 @@ def test_film_of_any_codec_gives_angles(tmp_path: Path, name: str, options: tupl
     check_turn(read_film(encode(turn(), tmp_path / name, *options), stated=FIELD))
 
 
+@pytest.mark.slow
 def test_unknown_field_of_view_is_found(h264: bytes) -> None:
     film = read_film(h264)
     check_turn(film)
@@ -90,6 +91,7 @@ def test_frames_at_the_rate_of_samples_are_all_used(tmp_path: Path) -> None:
     assert "between samples" not in film.dropped
 
 
+@pytest.mark.slow
 def test_plain_wall_is_passed_at_the_usual_speed(tmp_path: Path) -> None:
     blank = np.full_like(turn()[0], 128)
     frames = [*turn()[:31], *[blank] * 12, *turn()[43:61]]
@@ -151,6 +153,7 @@ def test_camera_that_stands_still_or_walks_is_named(tmp_path: Path) -> None:
     assert any("the camera walks" in warning for warning in walk.warnings)
 
 
+@pytest.mark.slow
 def test_camera_that_shakes_is_named(tmp_path: Path) -> None:
     shaken = [np.roll(frame, 40 * (index % 2), axis=0) for index, frame in enumerate(turn())]
     film = read_film(encode(shaken, tmp_path / "shaken.mp4"), stated=FIELD)

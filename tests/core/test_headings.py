@@ -123,6 +123,7 @@ class TestPerfectEncoder:
         np.testing.assert_allclose(query.latents[nearest], layout[0], atol=2e-3)
         np.testing.assert_allclose(np.exp(present(query.profile).log_m[nearest]), profile_m[0], atol=2e-4)
 
+    @pytest.mark.slow
     @given(heading=headings, share=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
     @settings(max_examples=30)
     def test_inexact_heading_is_searched_within_its_tolerance(

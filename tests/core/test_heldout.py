@@ -126,6 +126,7 @@ class TestTruth:
                 # Leaves, frames and the lamp stand before walls, and openings let through.
                 assert np.mean(np.abs(seen - truth) < 0.02) > 0.7
 
+    @pytest.mark.slow
     def test_camera_stands_in_its_room_clear_of_obstacles(self) -> None:
         scenes = HeldoutScenes(homes=3, shots_per_home=4)
         for name in scenes.scenes("validation"):

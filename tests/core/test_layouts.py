@@ -178,7 +178,7 @@ def ordinary(panorama: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[n
         yield panorama[top : top + height, left : left + width], True
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])])
 def test_ordinary_photographs_are_left_alone(name: str) -> None:
     words = ("sphere", "cube map", "fisheye", "VR180")
     for pixels, is_crop in ((small(name), False), *ordinary(small(name), np.random.default_rng(0))):

@@ -108,6 +108,7 @@ def changed(bundle: Bundle, **changes: Any) -> Bundle:
 
 
 class TestConvergence:
+    @pytest.mark.slow
     @pytest.mark.parametrize("heading_known", [True, False])
     @given(polygon=convex_polygons(), seed=seeds())
     @settings(max_examples=20)
@@ -150,6 +151,7 @@ class TestConvergence:
         assert errors_m(result, scene).max() < 1e-4
         assert result.converged.all()
 
+    @pytest.mark.slow
     @given(seeds())
     @settings(max_examples=10)
     def test_precision_is_independent_of_the_origin(self, seed: int) -> None:

@@ -215,6 +215,7 @@ def folder(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 class TestRuns:
     def test_run_is_validated_resumed_and_served(self, folder: Path) -> None:
         checkpoint = Checkpoint.load(folder / "image.pt", stage="image")

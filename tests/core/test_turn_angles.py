@@ -56,6 +56,7 @@ def test_overlapping_photographs_give_their_angles() -> None:
     assert pitches_deg == pytest.approx([4.0, -6.0, 1.0] * 5, abs=0.8)
 
 
+@pytest.mark.slow
 def test_closed_turn_fixes_the_field_of_view() -> None:
     taken = photographs(ONCE_AROUND)
     views = turn_views(taken)

@@ -39,6 +39,7 @@ def test_folder_of_photographs_is_one_turn(tmp_path: Path, capsys: pytest.Captur
     assert (tmp_path / "answer.svg").read_text().startswith("<svg")
 
 
+@pytest.mark.slow
 @needs_ffmpeg
 def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "turn.mp4"

@@ -352,6 +352,7 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototype
     assert found.argmax() == 1
 
 
+@pytest.mark.slow
 def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) -> None:
     index, rng = PlanIndex.from_prototypes(prototype_sets, shipped_cells()), np.random.default_rng(5)
     pairs = sum(map(len, prototype_sets)) * 16

@@ -68,6 +68,7 @@ def moved(**changes: Any) -> Callable[[dict[str, Any]], None]:
 
 
 class TestRoundTrip:
+    @pytest.mark.slow
     @settings(max_examples=25)
     @given(plans(), seeds())
     def test_plan_and_pose_round_trip(

@@ -312,8 +312,8 @@ def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.Monke
     assert sum(compared) < 5 * 200
 
 
-# Pictures, and pages that are drawn, take seconds whatever they show.
-_DRAWN = {"picture", "pdf"}
+# Pictures, and pages that are drawn, take seconds whatever they show; so do some others.
+_DRAWN, _LONG = {"picture", "pdf"}, ("mega", "noise", "a lattice of thick", "one way in many")
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ _DRAWN = {"picture", "pdf"}
         pytest.param(
             plan,
             id=f"{plan.format}, {plan.title}",
-            marks=[pytest.mark.slow] if plan.format in _DRAWN or "mega" in plan.title or "noise" in plan.title else [],
+            marks=[pytest.mark.slow] if plan.format in _DRAWN or any(words in plan.title for words in _LONG) else [],
         )
         for plan in HOSTILE_PLANS
     ],

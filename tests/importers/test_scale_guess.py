@@ -105,6 +105,7 @@ def test_false_scale_is_corrected_by_the_factor_of_the_report():
     assert "option multiply" in second.scale_source
 
 
+@pytest.mark.slow
 def test_texts_that_are_not_believed_are_listed():
     page = PrintedPlan()
     page._text((1.5, 1.0), "7.77")

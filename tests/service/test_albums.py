@@ -180,6 +180,7 @@ def test_pins_as_geojson_csv_and_svg(client: httpx.Client, solved: str, plan_id:
     assert client.get(f"/albums/{bare}/photographs", headers={"Accept": "text/csv"}).text.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_pins_of_a_plan_without_an_anchor_have_no_geojson(client: httpx.Client, pictures: list[bytes]) -> None:
     album_id = create(client, upload(client, HOME))
     add(client, album_id, pictures[:1])
@@ -461,6 +462,7 @@ def test_events_follow_an_album_until_it_is_solved(client: httpx.Client, plan_id
     assert (last["status"], last["photographs"]) == ("solved", 2)
 
 
+@pytest.mark.slow
 def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
     upper = upload(client, {**HOME, "name": "Upper"})
     plans = [{"floorplan_id": plan_id, "level": 0}, {"floorplan_id": upper, "level": 1}]

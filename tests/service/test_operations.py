@@ -218,6 +218,7 @@ def test_postgresql_dump_restores_everything(
         assert stored(client, panorama) == before
 
 
+@pytest.mark.slow
 def test_postgresql_dump_restores_albums(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     dump = str(tmp_path / "backup.dump")
     shipped: dict[str, Any] = {"database_url": own_database(postgres), "bundle": default_bundle()}

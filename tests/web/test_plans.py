@@ -377,6 +377,22 @@ def test_link_holds_an_answer_that_the_service_does_not_keep(
             expect(page.locator("#plan-error")).to_contain_text("damaged or incomplete")
 
 
+def test_search_waits_for_the_plan_that_is_loading(desktop: Visit) -> None:
+    page, held = desktop.open(), list[Route]()
+    rooms = page.get_by_role("button", name="Photographed rooms")
+    page.get_by_text("Plans", exact=True).click()
+    rooms.click()
+    expect(page.locator("#plan-name")).to_have_text("Six photographed rooms")
+    expect(page.locator("#photo-strip button.thumb", has_text="lythwood_room")).to_have_count(1)
+    page.route("**/web/example-rooms.json", lambda route: held.append(route))
+    page.get_by_text("Plans", exact=True).click()
+    rooms.click()
+    page.locator("#find").click()
+    expect(page.locator("#find")).to_have_attribute("aria-busy", "true")
+    held[0].continue_()
+    expect(page.locator("#answer-body")).to_contain_text("Possible places", timeout=60_000)
+
+
 def test_photographed_rooms_are_an_example(desktop: Visit) -> None:
     page = desktop.open()
     for _ in range(2):

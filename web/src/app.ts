@@ -169,7 +169,6 @@ class Page {
 
   private onPlan(plan: Plan | null): void {
     const before = this.scene.plan;
-    if (plan === null) this.answers.cancelQuery();
     const isOther = plan !== null && plan.revision !== before?.revision;
     if (isOther && !this.editor.isOpen) clearErrors();
     this.scene.setPlan(plan);
@@ -209,7 +208,9 @@ class Page {
   }
 
   /** Return the venue or plan to search. */
+  /** Return what to search: what the user chose last, also if it is still loading. */
   private async place(signal?: AbortSignal): Promise<Place> {
+    await this.plans.settled();
     return this.venues.current ?? this.scene.plan ?? this.storeExample(signal);
   }
 

@@ -59,6 +59,8 @@ export class Plans {
   private following: AbortController | null = null;
   /** Number of requests to show a plan; only the latest one counts. */
   private requests = 0;
+  /** The user's latest choice of a plan. */
+  private pending: Promise<unknown> = Promise.resolve();
 
   constructor(private readonly actions: PlanActions) {
     let waiting: number | undefined;
@@ -70,8 +72,8 @@ export class Plans {
       }, SEARCH_AFTER_MS);
     });
     this.connectMenu();
-    byId("example-flat").addEventListener("click", () => void this.pickExample(FLAT));
-    byId("example-rooms").addEventListener("click", () => void this.pickExample(ROOMS));
+    byId("example-flat").addEventListener("click", () => (this.pending = this.pickExample(FLAT)));
+    byId("example-rooms").addEventListener("click", () => (this.pending = this.pickExample(ROOMS)));
     const input = byId<HTMLInputElement>("plan-file");
     input.addEventListener("change", () => {
       const file = input.files?.[0];
@@ -111,7 +113,20 @@ export class Plans {
   }
 
   /** Choose a plan by its id. */
-  async choose(id: string, revision?: string): Promise<Plan | null> {
+  choose(id: string, revision?: string): Promise<Plan | null> {
+    const chosen = this.open(id, revision);
+    this.pending = chosen;
+    return chosen;
+  }
+
+  /** Wait until the plan that was chosen last is shown, or cannot be. */
+  async settled(): Promise<void> {
+    let last: Promise<unknown>;
+    do await (last = this.pending).catch(() => undefined);
+    while (last !== this.pending);
+  }
+
+  private async open(id: string, revision?: string): Promise<Plan | null> {
     clearError(this.error, this.importing.fields);
     this.importing.close();
     const request = this.discardPending();
@@ -134,13 +149,19 @@ export class Plans {
     if (request !== this.requests) return;
     const known = stored.find(({ name }) => name === plan.name);
     if (known === undefined) this.take(null);
-    else await this.choose(known.id);
+    else await this.open(known.id);
     this.actions.example(known === undefined ? plan : null, photos);
   }
 
   /** Ignore the results of earlier requests to show a plan. */
   discardPending(): number {
     return ++this.requests;
+  }
+
+  /** Show no plan, as it was deleted. */
+  private showNone(): void {
+    this.actions.started();
+    this.take(null);
   }
 
   /** Show a plan. */
@@ -232,7 +253,7 @@ export class Plans {
         (event) => {
           if (this.current?.id !== plan.id) return;
           if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
-          else if (event.status === "deleted") this.take(null);
+          else if (event.status === "deleted") this.showNone();
           else void this.renew(plan.id);
         },
         own.signal,
@@ -267,7 +288,7 @@ export class Plans {
     try {
       await api.deletePlan(plan.id);
       say(`“${plan.name}” is deleted.`);
-      if (this.current?.id === plan.id) this.take(null);
+      if (this.current?.id === plan.id) this.showNone();
       await this.load();
     } catch (error) {
       showError(this.error, error);
