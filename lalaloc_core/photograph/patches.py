@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lalaloc_core.conventions import TWO_PI, unit_rays, wrap_angle
+from lalaloc_core.conventions import TWO_PI, unit_rays
 from lalaloc_core.photograph.cameras import Camera, camera_axes
 
 # Colour of pixels that the photograph does not show.
@@ -22,8 +22,9 @@ FINER = 1.4
 _SLACK = 1.03
 # Least overlap of neighbouring patches, as a share of their width.
 _OVERLAP = 0.2
-# Joined patches are no further apart (radians), so that each wall is also read with much of the room on both sides.
-_JOINED_APART = math.radians(45.0)
+# Joined patches once around: so many that each wall is also read with much of the room on both sides. Share of the
+# horizon that photographs show together which go around.
+_JOINED, _AROUND = 8, 0.97
 # Seen azimuths: samples of the left and right border, and the largest elevation that counts.
 _SAMPLES, _MAX_ELEVATION = 33, math.radians(45.0)
 # Thumbnails have about so many pixels, and sides that are multiples of the step.
@@ -117,7 +118,7 @@ def patch_azimuths(hfov: float, size: PatchSize) -> list[float]:
 
 
 def joined_patches(placed: Sequence[tuple[Patch, float]], size: PatchSize) -> list[Patch]:
-    """Return patches of what photographs of one spot show together, which is more than each patch of theirs.
+    """Return patches of what photographs show together once around; none if they leave a part of the horizon unseen.
 
     Args:
         placed: patches of the photographs, with the azimuths (radians) of their centres relative to the first
@@ -130,45 +131,25 @@ def joined_patches(placed: Sequence[tuple[Patch, float]], size: PatchSize) -> li
     distance = np.abs(np.arange(size.width) - 0.5 * (size.width - 1)).astype(np.float32)
     for patch, azimuth in placed:
         rows, own = np.nonzero(patch.seen)
-        place = _ring_columns(azimuth, columns, size)[own]
+        place = _ring_columns(azimuth, size)[own]
         nearer = distance[own] < nearest[rows, place]
         rows, own, place = rows[nearer], own[nearer], place[nearer]
         ring[rows, place], nearest[rows, place] = patch.pixels[rows, own], distance[own]
-    seen, joined = np.isfinite(nearest), []
-    for shown in _arcs(seen.any(axis=0)):
-        for azimuth in _joined_azimuths(shown, size):
-            place = _ring_columns(azimuth, columns, size)
-            part = seen[:, place] & np.isin(place, shown % columns)
-            pixels = np.where(part[..., None], ring[:, place], np.uint8(UNSEEN))
-            joined.append(Patch(pixels=pixels, seen=part, azimuth_rad=azimuth))
-    return joined
+    seen = np.isfinite(nearest)
+    if seen.any(axis=0).mean() < _AROUND:
+        return []
+    azimuths = np.arange(_JOINED) * (TWO_PI / _JOINED)
+    return [
+        Patch(pixels=ring[:, place], seen=seen[:, place], azimuth_rad=float(azimuth))
+        for azimuth in azimuths
+        for place in [_ring_columns(float(azimuth), size)]
+    ]
 
 
-def _ring_columns(azimuth: float, columns: int, size: PatchSize) -> Int[np.ndarray, "w"]:
+def _ring_columns(azimuth: float, size: PatchSize) -> Int[np.ndarray, "w"]:
     """Return the columns of a ring, whose first is at the azimuth 0, of a patch's columns."""
-    return (round(azimuth * size.resolution) + np.arange(size.width) - size.width // 2) % columns
-
-
-def _arcs(seen: Bool[np.ndarray, "n"]) -> Iterator[Int[np.ndarray, "k"]]:
-    """Yield the runs of columns of a ring that are seen; those of one that crosses its end go on beyond n."""
-    count, gaps = len(seen), np.flatnonzero(~seen)
-    if not len(gaps):
-        yield np.arange(count)
-    for gap, following in zip(gaps, np.append(gaps[1:], gaps[:1] + count), strict=True):
-        if following - gap > 1:
-            yield np.arange(gap + 1, following)
-
-
-def _joined_azimuths(shown: Int[np.ndarray, "k"], size: PatchSize) -> list[float]:
-    """Return the azimuths of the patches that cover an arc of a ring's columns."""
-    width, step = len(shown) / size.resolution, math.radians(size.step_deg)
-    if width > TWO_PI - 0.5 * size.hfov:
-        azimuths = np.arange(round(TWO_PI / _JOINED_APART)) * _JOINED_APART
-    else:
-        beyond = max(width - size.hfov, 0.0)
-        offsets = np.linspace(-0.5, 0.5, 1 + math.ceil(beyond / _JOINED_APART)) if beyond else np.zeros(1)
-        azimuths = float(shown.mean() + 0.5) / size.resolution + offsets * beyond
-    return [float(wrap_angle(azimuth)) for azimuth in np.round(azimuths / step) * step]
+    first = round(azimuth * size.resolution) - size.width // 2
+    return (first + np.arange(size.width)) % round(TWO_PI * size.resolution)
 
 
 def _patch(picture: np.ndarray, camera: Camera, axes: np.ndarray, azimuth: float, size: PatchSize) -> Patch:

@@ -122,14 +122,18 @@ class PhotographEncoder(LayoutEncoder):
         return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
 
     def _patches(self, turned: Sequence[tuple[Photograph, float]]) -> list[tuple[Patch, float]]:
-        """Return the patches of photographs of one spot, several joined, and the standard deviations of their tilt."""
-        if len(turned) == 1:
-            ((view, _),) = turned
-            return [(patch, view.tilt_sd(patch.azimuth_rad)) for patch in view.patches]
+        """Return the patches of photographs of one spot, and the standard deviations (radians) of their tilt.
+
+        Photographs once around are joined: the encoder reads a wall better with the room beside it in sight.
+        """
         placed = [(patch, patch.azimuth_rad + turn) for view, turn in turned for patch in view.patches]
-        joined = joined_patches(placed, patch_size(self.manifest))
-        tilts = [_tilt_sd(turned, patch.azimuth_rad) for patch in joined]
-        return list(zip(joined, tilts, strict=True))
+        joined = joined_patches(placed, patch_size(self.manifest)) if len(turned) > 1 else []
+        if joined:
+            return [(patch, _tilt_sd(turned, patch.azimuth_rad)) for patch in joined]
+        tilts = [view.tilt_sd(patch.azimuth_rad) for view, _ in turned for patch in view.patches]
+        return [
+            (replace(patch, azimuth_rad=azimuth), tilt) for (patch, azimuth), tilt in zip(placed, tilts, strict=True)
+        ]
 
     def _seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
         """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
