@@ -27,6 +27,8 @@ _SAME, _EDGE, _MIN_STILL, _MIN_EDGES, _UNIFORM = 1, 40, 0.75, 0.035, (0.3, 0.7)
 # between both, which photographs of pale rooms have more of than of dark ones.
 _MIN_FLAT_OF_SCANS, _MIN_PAPER_OF_SCANS, _MAX_STEP, _MIN_INK, _MAX_BETWEEN = 0.85, 140.0, 16.0, 0.025, 1.2
 _STROKE, _PAPER = 0.6, 0.88
+# Lines have many edges for their area, unlike dark furniture before a pale wall.
+_MIN_EDGES_OF_STROKES = 0.3
 # Step of the sample of a photograph; the smallest share of its most frequent tone in drawings, and in scans of tones
 # near the median.
 _SAMPLE, _MIN_SAMPLED, _NEAR, _MIN_NEAR = 4, 0.3, 45, 0.75
@@ -118,6 +120,7 @@ class Tones:
             and self.step <= _MAX_STEP
             and _MIN_INK <= self.strokes <= _INK_SHARES[1]
             and self.between <= _MAX_BETWEEN * self.strokes
+            and self.edges >= _MIN_EDGES_OF_STROKES * self.strokes
         )
         return (is_coloured and _UNIFORM[0] <= self.uniform <= _UNIFORM[1]) or is_white or is_scanned
 
