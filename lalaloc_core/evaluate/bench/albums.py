@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.evaluate.methods.lalaloc import found_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
@@ -50,13 +52,15 @@ def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: P
     """Measure albums of 20 photographs, with unknown field of view, camera height and heading.
 
     Rows: in the order of a walk, without order, each alone, and as spheres; with `annotated`, a folder of annotated
-    photographs, two views of each in albums of ten rooms, without doors or order.
+    photographs, two views of each in albums of ten rooms, without doors or order. Photographs that are refused, as
+    overexposed walls can be taken for paper, are counted and in no other figure.
     """
-    model = LocalModel(bundle)
+    model, refused = LocalModel(bundle), 0
     scores: dict[str, list[_Score]] = {}
     clicks, seconds, again_s = list[int](), list[float](), list[float]()
     for index in range(homes):
         case = _home(model, index, textures, spheres=False)
+        refused += _PHOTOGRAPHS - len(case.photographs)
         memory, begin = AlbumMemory(), time.perf_counter()
         _add(scores, "walk", _solved(model, case, memory))
         seconds.append(time.perf_counter() - begin)
@@ -71,6 +75,7 @@ def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: P
         _add(scores, "annotated", _solved(model, case, AlbumMemory()))
         _add(scores, "annotated_each_alone", _alone(model, case))
     figures: dict[str, Any] = {row: _summary(found) for row, found in scores.items()}
+    figures["refused_photographs"] = refused
     figures["clicks_per_album"] = float(np.mean(clicks))
     figures["median_solve_s"], figures["median_again_s"] = float(np.median(seconds)), float(np.median(again_s))
     return figures
@@ -78,11 +83,12 @@ def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: P
 
 def _home(model: LocalModel, index: int, textures: Path | None, *, spheres: bool) -> AlbumCase:
     album = taken_album("test", index, _PHOTOGRAPHS, spheres=spheres, textures=textures)
-    photographs = [
-        _entry(model, number, each.pixels, "equirectangular" if spheres else "perspective", each.taken_s)
-        for number, each in enumerate(album.photographs)
-    ]
-    truth = [Pose.at(each.position_m, each.room_index, each.heading) for each in album.photographs]
+    projection = "equirectangular" if spheres else "perspective"
+    photographs, truth = list[AlbumPhotograph](), list[Pose]()
+    for number, each in enumerate(album.photographs):
+        with suppress(InvalidPhotographError):
+            photographs.append(_entry(model, number, each.pixels, projection, each.taken_s))
+            truth.append(Pose.at(each.position_m, each.room_index, each.heading))
     return AlbumCase.of(model, album.plan, photographs, truth)
 
 
