@@ -37,6 +37,8 @@ _SYNONYMS = {
     "bedroom": ("nursery",),
 }
 _TYPES = {word: kind for kind, words in _SYNONYMS.items() for word in words} | {name: name for name in ROOM_TYPES}
+# Words that tell a room's type.
+ROOM_WORDS = tuple(word for word in _TYPES if word != ROOM_TYPES[0])
 
 
 def frozen(array: np.ndarray) -> np.ndarray:

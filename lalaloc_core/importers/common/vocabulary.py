@@ -9,14 +9,18 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
+from functools import lru_cache
 from typing import Literal
 
-from lalaloc_core.floorplan.rooms import room_type_from_label
+from lalaloc_core.floorplan.rooms import ROOM_WORDS, room_type_from_label
 
 Role = Literal["door", "window", "passage", "obstacle", "wall", "room", "text", "ignored"]
 
 # Shorter words have no plurals but those with s.
 _SHORTEST_PLURAL = 5
+# Words that can be misread: the shortest, and the least share of letters that are right (`difflib`'s ratio).
+_SHORTEST_READING, _MIN_ALIKE = 5, 0.84
 # The first match wins: "A-WALL-DOOR" is a door layer, "window dimensions" is ignored.
 _ROLES: tuple[tuple[Role, str], ...] = (
     (
@@ -227,6 +231,18 @@ def room_type_from_name(label: str | None) -> str | None:
                 return found
     text = unicodedata.normalize("NFKC", label)
     return next((kind for word, kind in _JAPANESE if word in text), None)
+
+
+@lru_cache(maxsize=1024)
+def room_type_from_reading(text: str | None) -> str | None:
+    """Return the room type for a text in a picture, of whose letters one or two may be misread ("lving", "corrid")."""
+    found = room_type_from_name(text)
+    if found is not None or not text:
+        return found
+    words = [word for word in split_words(text) if len(word) >= _SHORTEST_READING]
+    known = (*ROOM_WORDS, *_ENGLISH)
+    likely = (get_close_matches(word, known, n=1, cutoff=_MIN_ALIKE) for word in words)
+    return next((room_type_from_name(word) for found_words in likely for word in found_words), None)
 
 
 def _singulars(word: str) -> Iterator[str]:

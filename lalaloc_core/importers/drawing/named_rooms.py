@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.common.vocabulary import room_type_from_reading
 from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Gap, find_gaps
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 
@@ -39,7 +39,7 @@ def split_named_rooms(
     Returns:
         The rooms in the order given, parts beside each other, and the gaps that divide them.
     """
-    places = [shapely.Point(text.position) for text in letterings if room_type_from_name(text.text) is not None]
+    places = [shapely.Point(text.position) for text in letterings if room_type_from_reading(text.text) is not None]
     names = shapely.STRtree(places)
     if all(len(names.query(room, predicate="contains")) < 2 for room in rooms):
         return list(rooms), []
@@ -50,18 +50,27 @@ def split_named_rooms(
     for room in rooms:
         near = sorted((gap for gap in gaps if gap.shape.intersects(room)), key=lambda gap: gap.width)[:_MOST_GAPS]
         pieces = [room]
-        # One passage, or two beside a wall that stands free.
-        for group in (*combinations(near, 1), *combinations(near, 2)):
-            check_time()
-            if any(gap in dividing for gap in group):
-                continue
-            cut = shapely.union_all([gap.shape for gap in group])
-            for index, piece in enumerate(pieces):
-                sides = polygons_from_geometry(piece.difference(cut))
-                named = [side for side in sides if len(names.query(side, predicate="contains"))]
-                if len(named) == len(sides) == 2 and all(side.area >= _SMALLEST_M2 for side in sides):
-                    pieces[index : index + 1] = sides
-                    dividing += group
-                    break
+        # Each division can leave a passage as the only one between two of the pieces.
+        while (found := _division(pieces, near, names, check_time)) is not None:
+            index, sides, group = found
+            pieces[index : index + 1] = sides
+            dividing += group
+            near = [gap for gap in near if gap not in group]
         parts += pieces
     return parts, dividing
+
+
+def _division(
+    pieces: Sequence[shapely.Polygon], gaps: Sequence[Gap], names: shapely.STRtree, check_time: Callable[[], None]
+) -> tuple[int, list[shapely.Polygon], tuple[Gap, ...]] | None:
+    """Return the number of a piece with its two sides and the gaps between them; None if no gaps divide names."""
+    # One passage, or two beside a wall that stands free.
+    for group in (*combinations(gaps, 1), *combinations(gaps, 2)):
+        check_time()
+        cut = shapely.union_all([gap.shape for gap in group])
+        for index, piece in enumerate(pieces):
+            sides = polygons_from_geometry(piece.difference(cut))
+            named = [side for side in sides if len(names.query(side, predicate="contains"))]
+            if len(named) == len(sides) == 2 and all(side.area >= _SMALLEST_M2 for side in sides):
+                return index, sides, group
+    return None

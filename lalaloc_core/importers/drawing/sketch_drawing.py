@@ -20,7 +20,7 @@ from lalaloc_core.importers.common.geometry import opening_line, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
+from lalaloc_core.importers.common.vocabulary import Role, room_type_from_reading
 from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
     drawn_leaves,
@@ -205,16 +205,16 @@ def name_rooms(
             texts.setdefault(int(smallest), []).append(lettering.text)
         elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
             lost.append(_without_size(lettering.text))
-    if named := [f"'{text}'" for text in dict.fromkeys(lost) if _is_name(text) and room_type_from_name(text)]:
+    if named := [f"'{text}'" for text in dict.fromkeys(lost) if _is_name(text) and room_type_from_reading(text)]:
         builder.warnings.append(
             f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
         )
     rooms = []
     for index, area in enumerate(shapes):
         words = [text for raw in texts.get(index, []) if _is_name(text := _without_size(raw))]
-        known = [text for text in words if room_type_from_name(text) is not None]
+        known = [text for text in words if room_type_from_reading(text) is not None]
         name = area.name or next(iter(known or words), None)
-        rooms.append(SketchedRoom(area.shape, name, room_type_from_name(area.kind) or room_type_from_name(name)))
+        rooms.append(SketchedRoom(area.shape, name, room_type_from_reading(area.kind) or room_type_from_reading(name)))
         if others := [text for text in dict.fromkeys(known) if text != name]:
             names = " and ".join(f"'{text}'" for text in (name, *others[:_MAX_OTHERS]))
             builder.warnings.append(

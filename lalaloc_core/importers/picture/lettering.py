@@ -36,9 +36,9 @@ _SHARE_OF_TIME, _BATCH = 0.5, 6
 _MIN_SCORE, _MAX_LENGTH, _MAX_TEXTS = 0.7, 200, 400
 # Assumed length (m) of the longer side, for the thresholds of `read_ink`; texts are read before the scale is known.
 _ASSUMED_M = 25.0
-# Characters that are read for others: quotes in feet and inches, wide forms.
-_ALIKE = str.maketrans({"’": "'", "‘": "'", "`": "'", "”": '"', "“": '"', "㎡": "m²", "，": ",", "：": ":", "（": "(",
-                        "）": ")", "×": "x"})  # fmt: skip
+# Characters that are read for others: a letter, quotes in feet and inches, wide forms.
+_ALIKE = str.maketrans({"$": "s", "’": "'", "‘": "'", "`": "'", "”": '"', "“": '"', "㎡": "m²", "，": ",", "：": ":",
+                        "（": "(", "）": ")", "×": "x"})  # fmt: skip
 # Lines of dimensions: shortest length and largest width as shares of the longer side, and reach of marks across them.
 _SHORTEST, _WIDEST, _MARK_PX = 0.02, 0.006, 4
 _MAX_LINES, _MAX_MARKS = 1500, 40
