@@ -45,6 +45,7 @@ class WallConfig:
         nib: smallest length of a wall that forms a jamb alone; shorter walls need a jamb that faces them.
         snap: ends of lines nearer than this to another line are joined to it.
         smallest_room_m2: smallest area of a room; smaller areas are ducts.
+        blunt: largest depth of corners that pixels cut off the ends of walls.
     """
 
     thickest: float = 0.55
@@ -54,6 +55,7 @@ class WallConfig:
     nib: float = 0.28
     snap: float = 0.06
     smallest_room_m2: float = 0.6
+    blunt: float = 0.0
 
 
 DEFAULT_WALLS = WallConfig()
@@ -167,6 +169,8 @@ def find_gaps(
         oriented = shapely.geometry.polygon.orient(part)
         for ring in (oriented.exterior, *oriented.interiors):
             ends += _ends(np.asarray(ring.coords), config)
+            if config.blunt:
+                ends += _ends(np.asarray(ring.simplify(config.blunt).coords), config)
     usual = float(np.median([wall.thickness for wall in ends])) if ends else 0.0
     found: list[Gap] = []
     for wall in ends:

@@ -27,7 +27,7 @@ from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark
 from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
-_CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04)
+_CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.05)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 # Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
