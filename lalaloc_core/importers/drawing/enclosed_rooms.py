@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -164,20 +164,22 @@ def find_gaps(
         [simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))]
     )
     ends: list[_End] = []
+    blunt: list[_End] = []
     for part in areas.parts:
         check_time()
         oriented = shapely.geometry.polygon.orient(part)
         for ring in (oriented.exterior, *oriented.interiors):
             ends += _ends(np.asarray(ring.coords), config)
             if config.blunt:
-                ends += _ends(np.asarray(ring.simplify(config.blunt).coords), config)
+                blunt += _ends(np.asarray(ring.simplify(config.blunt).coords), config)
     usual = float(np.median([wall.thickness for wall in ends])) if ends else 0.0
     found: list[Gap] = []
-    for wall in ends:
+    for index, wall in enumerate((*ends, *blunt)):
         check_time()
         gap = _gap_before(wall, areas, config)
         if gap is not None and (gap.is_between_ends or not wall.is_pier(usual)):
-            found.append(gap)
+            # The direction of a blunt end is inexact, so its gap needs a symbol.
+            found.append(gap if index < len(ends) else replace(gap, is_sure=False))
     ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
     gaps = [gap for _, _, gap in sorted(ranked, key=lambda item: item[:2])]
     tree, is_kept = shapely.STRtree([gap.shape for gap in gaps]), np.zeros(len(gaps), bool)
