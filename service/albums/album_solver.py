@@ -30,8 +30,8 @@ _HEARTBEATS = 8.0
 # Unfinished attempts, by any replicas, before an album counts as failed.
 _MAX_ATTEMPTS = 5
 # Pause (s) after an attempt that can succeed later, and limit of the pause after a solve, which is as long as the
-# solve, so that an album that grows does not keep a core busy.
-_RETRY_S, _MAX_REST_S = 2.0, 3.0
+# solve, so that an album that grows does not keep a core busy; a correction, which somebody looks at, waits less.
+_RETRY_S, _MAX_REST_S, _MAX_REST_BEFORE_CORRECTION_S = 2.0, 3.0, 0.2
 # Solutions of albums that cannot succeed until something changes.
 _FINAL = (errors.PlanFailedError, errors.VenueUnsearchableError, InvalidInputError)
 # Errors that pass.
@@ -83,11 +83,17 @@ class AlbumSolver:
         self._changed = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._running: dict[str, asyncio.Task[None]] = {}
+        self._corrected: dict[str, asyncio.Event] = {}
 
-    def wake(self) -> None:
-        """Look for albums to solve now, from any thread; those that other replicas changed are found at intervals."""
+    def wake(self, corrected: str | None = None) -> None:
+        """Look for albums to solve now, from any thread; those that other replicas changed are found at intervals.
+
+        `corrected` is the tenant of an album with a new correction.
+        """
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self._changed.set)
+            if corrected is not None and (running := self._corrected.get(corrected)) is not None:
+                self._loop.call_soon_threadsafe(running.set)
 
     async def run(self) -> None:
         """Solve albums until the task is cancelled."""
@@ -117,11 +123,13 @@ class AlbumSolver:
 
     def _end(self, tenant: str) -> None:
         self._running.pop(tenant, None)
+        self._corrected.pop(tenant, None)
         self._changed.set()
 
     async def _solve(self, tenant: str, album_id: str) -> None:
         """Solve an album, if its lease is free, and rest."""
-        begin = monotonic()
+        begin, corrected = monotonic(), asyncio.Event()
+        self._corrected[tenant] = corrected
         try:
             job = await self._call(
                 tenant, lambda: self._store.album_jobs.claim(album_id, self._owner, self._settings.grids.grid_lease_s)
@@ -133,7 +141,11 @@ class AlbumSolver:
         except Exception:
             logging.getLogger(LOGGER_NAME).exception("solving an album failed", extra={"fields": {"album": album_id}})
             await asyncio.sleep(_RETRY_S)
-        await asyncio.sleep(min(monotonic() - begin, _MAX_REST_S))
+        rest_s = min(monotonic() - begin, _MAX_REST_S)
+        await asyncio.sleep(min(rest_s, _MAX_REST_BEFORE_CORRECTION_S))
+        with suppress(TimeoutError):
+            async with asyncio.timeout(rest_s - _MAX_REST_BEFORE_CORRECTION_S):
+                await corrected.wait()
 
     async def _attempt(self, job: AlbumJob) -> None:
         """Solve a claimed album; its lease ends in any case, at the latest by itself."""

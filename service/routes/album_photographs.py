@@ -324,7 +324,7 @@ async def correct_album_photograph(album_id: str, photograph_id: str, call: Call
         return call.change_answer(content, etag, path, created=False)
 
     answer = await call.upload(store)
-    call.runtime.albums.wake()
+    call.runtime.albums.wake(corrected=call.tenant)
     return answer
 
 
