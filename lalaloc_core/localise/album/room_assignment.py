@@ -110,12 +110,18 @@ class _Chains:
     def _prior(self, counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c r"]:
         return -self._stiffness * np.square(counts - self._expected)
 
+    def _prior_of_more(
+        self, counts: Float[np.ndarray, "c r"], more: float | Int[np.ndarray, "c 1"]
+    ) -> Float[np.ndarray, "c r"]:
+        """Return how the log prior changes with more photographs in a room."""
+        return -self._stiffness * more * (2.0 * (counts - self._expected) + more)
+
     def _move_one(self, number: int, heat: float) -> Float[np.ndarray, "r"]:
         """Draw the room of one photograph; return its conditional probabilities, summed over chains."""
         room, before = self._room, self._room[:, number].copy()
         others = self._counts.copy()
         others[self._each, before] -= 1.0
-        log = self._alone[number] + self._linked[:, number] + self._prior(others + 1.0) - self._prior(others)
+        log = self._alone[number] + self._linked[:, number] + self._prior_of_more(others, 1.0)
         if number > 0:
             log = log + self._walk[room[:, number - 1]]
         if number + 1 < room.shape[1]:
@@ -151,7 +157,7 @@ class _Chains:
         log = mask @ self._alone + (mask[:, None, :] @ self._linked)[:, 0]
         # Pairs within the set stay pairs wherever it goes.
         log[self._each, own] -= ((mask @ self._pairs) * mask).sum(axis=1)
-        log += self._prior(others + size[:, None]) - self._prior(others)
+        log += self._prior_of_more(others, size[:, None])
         first, second = mask[:, :-1], mask[:, 1:]
         log += (first & second).sum(axis=1)[:, None] * np.diag(self._walk)
         # The ends of the set, whose neighbours are of other rooms or not of the set.
@@ -171,18 +177,22 @@ class _Chains:
         one = room[self._each, self._rng.integers(room.shape[1], size=_CHAINS)]
         other = self._rng.integers(self._rooms, size=_CHAINS)
         swapped = np.where(room == one[:, None], other[:, None], np.where(room == other[:, None], one[:, None], room))
-        gain = self._energy(swapped) - self._energy(room)
+        counts = self._counts.copy()
+        counts[self._each, one] = self._counts[self._each, other]
+        counts[self._each, other] = self._counts[self._each, one]
+        gain = self._energy(swapped, counts) - self._energy(room, self._counts)
         accepted = np.log(self._rng.random(_CHAINS)) < gain / heat
+        if not accepted.any():
+            return
         mask = (room == one[:, None]) & accepted[:, None]
         back = (room == other[:, None]) & accepted[:, None]
         self._relabel(mask, other)
         self._relabel(back, one)
 
-    def _energy(self, room: Int[np.ndarray, "c n"]) -> Float[np.ndarray, "c"]:
-        """Return the log probability without the pairs."""
+    def _energy(self, room: Int[np.ndarray, "c n"], counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c"]:
+        """Return the log probability without the pairs; `counts` are the photographs by room."""
         total = self._alone[np.arange(room.shape[1]), room].sum(axis=1)
         total += self._walk[room[:, :-1], room[:, 1:]].sum(axis=1)
-        counts = np.stack([np.bincount(row, minlength=self._rooms) for row in room]).astype(float)
         return total + self._prior(counts).sum(axis=1)
 
     def _drawn(self, log: Float[np.ndarray, "c r"], heat: float) -> Int[np.ndarray, "c"]:
@@ -190,12 +200,11 @@ class _Chains:
 
     def _relabel(self, mask: Bool[np.ndarray, "c n"], after: Int[np.ndarray, "c"]) -> None:
         """Give the photographs of a mask a room, the same in each chain."""
-        chain, number = np.nonzero(mask)
+        chain, number = np.nonzero(mask & (self._room != after[:, None]))
         before, new = self._room[chain, number], after[chain]
         np.add.at(self._counts, (chain, before), -1.0)
         np.add.at(self._counts, (chain, new), 1.0)
         for c, t, a, b in zip(chain.tolist(), number.tolist(), before.tolist(), new.tolist(), strict=True):
-            if a != b:
-                self._linked[c, :, a] -= self._pairs[t]
-                self._linked[c, :, b] += self._pairs[t]
+            self._linked[c, :, a] -= self._pairs[t]
+            self._linked[c, :, b] += self._pairs[t]
         self._room[chain, number] = new
