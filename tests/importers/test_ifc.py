@@ -159,7 +159,10 @@ def test_spaces_of_no_storey_belong_to_the_one_at_their_height():
     model.prism("IfcSpace", _box(0, 0, 4000, 3000), 3000, 2600, LongName="Bad")
     model.prism("IfcSpace", _box(0, 0, 4000, 3000), -9000, 2600, LongName="Keller")
     plans = import_plans(model.content())
-    assert [(plan.level.name, plan.document["rooms"][0]["name"]) for plan in plans] == [("EG", "Küche"), ("OG", "Bad")]
+    assert [(plan.level and plan.level.name, plan.document["rooms"][0]["name"]) for plan in plans] == [
+        ("EG", "Küche"),
+        ("OG", "Bad"),
+    ]
     assert any(use.layer == "IfcSpace" and "ignored" in use.used_as for use in plans[0].report.layers)
 
 
@@ -169,6 +172,7 @@ def test_building_without_storeys_is_one_level():
     model.file.create_entity("IfcBuilding", ifcopenshell.guid.new(), Name="Haus")
     _loose_space(model)
     plan = import_plan(model.content())
+    assert plan.level is not None
     assert plan.level.name == "Haus"
     assert [room["name"] for room in plan.document["rooms"]] == ["Küche"]
 
