@@ -35,13 +35,13 @@ serve: $(SERVING) ## run the service at http://127.0.0.1:8000 (or PORT=...) with
 		$(BIN)/lalaloc-service serve --example --port $(PORT)
 
 # Three processes with one thread each keep two cores busy, as many tests wait; a process without tests takes over those
-# of others. Browsers need much of a machine, so their tests are last, two files at a time; they run even if others fail.
+# of others. Browsers need an otherwise idle machine, so their tests are last and alone; they run even if others fail.
 ALONE := tests/web
 test: $(STAMP) ## lint, build the site, run the tests
 	$(MAKE) --no-print-directory -j 2 lint site
 	@status=0; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal $(ALONE:%=--ignore=%) || status=1; \
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(ALONE) || status=1; \
+	$(BIN)/python -m pytest $(ALONE) || status=1; \
 	exit $$status
 
 # A new cluster per file, so that files do not share state.
