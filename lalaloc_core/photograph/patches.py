@@ -138,12 +138,11 @@ def joined_patches(placed: Sequence[tuple[Patch, float]], size: PatchSize) -> li
     seen = np.isfinite(nearest)
     if seen.any(axis=0).mean() < _AROUND:
         return []
-    azimuths = np.arange(_JOINED) * (TWO_PI / _JOINED)
-    return [
-        Patch(pixels=ring[:, place], seen=seen[:, place], azimuth_rad=float(azimuth))
-        for azimuth in azimuths
-        for place in [_ring_columns(float(azimuth), size)]
-    ]
+    joined = []
+    for azimuth in (np.arange(_JOINED) * (TWO_PI / _JOINED)).tolist():
+        place = _ring_columns(azimuth, size)
+        joined.append(Patch(pixels=ring[:, place], seen=seen[:, place], azimuth_rad=azimuth))
+    return joined
 
 
 def _ring_columns(azimuth: float, size: PatchSize) -> Int[np.ndarray, "w"]:

@@ -62,7 +62,7 @@ async def get_model_file(file: str, call: Call) -> Response:
         return answer
     if file != name:
         async with call.reading():
-            packed = await run_in_threadpool(_packed, bundle.folder / name, entry.bytes)
+            packed = await run_in_threadpool(_packed, bundle.folder / name, entry.bytes, entry.sha256)
         return tagged_answer([packed], _BINARY, etag)
     wanted = byte_range(call.request, etag, entry.bytes)
     async with call.reading():
@@ -93,14 +93,16 @@ def _open(path: Path, size_bytes: int) -> BinaryIO:
 
 
 @lru_cache(maxsize=3)
-def _packed(path: Path, size_bytes: int) -> bytes:
-    """Return a file of the model as it is packed for browsers.
+def _packed(path: Path, size_bytes: int, digest: str) -> bytes:
+    """Return a file of the model as it is packed for browsers; it is kept, so it must be undamaged.
 
     Raises:
-        ChangedModelFileError: see `_open`.
+        ChangedModelFileError: see `_open`; or the file has another digest.
     """
     with _open(path, size_bytes) as opened:
         content = opened.read()
+    if sha256(content).hexdigest() != digest:
+        raise ChangedModelFileError(path.name)
     return gzip.compress(content[::2] + content[1::2], mtime=0)
 
 

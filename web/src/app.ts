@@ -207,7 +207,6 @@ class Page {
     }
   }
 
-  /** Return the venue or plan to search. */
   /** Return what to search: what the user chose last, also if it is still loading. */
   private async place(signal?: AbortSignal): Promise<Place> {
     await this.plans.settled();

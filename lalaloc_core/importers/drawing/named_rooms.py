@@ -10,7 +10,6 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.vocabulary import room_type_from_reading
 from lalaloc_core.importers.drawing.enclosed_rooms import DEFAULT_WALLS, Gap, find_gaps
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 
@@ -39,7 +38,7 @@ def split_named_rooms(
     Returns:
         The rooms in the order given, parts beside each other, and the gaps that divide them.
     """
-    places = [shapely.Point(text.position) for text in letterings if room_type_from_reading(text.text) is not None]
+    places = [shapely.Point(text.position) for text in letterings if text.room_type is not None]
     names = shapely.STRtree(places)
     if all(len(names.query(room, predicate="contains")) < 2 for room in rooms):
         return list(rooms), []

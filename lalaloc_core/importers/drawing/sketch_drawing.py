@@ -20,7 +20,7 @@ from lalaloc_core.importers.common.geometry import opening_line, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import Role, room_type_from_reading
+from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
 from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
     drawn_leaves,
@@ -196,40 +196,44 @@ def name_rooms(
     Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
     """
     tree = shapely.STRtree([area.shape for area in shapes])
-    texts: dict[int, list[str]] = {}
-    lost: list[str] = []
+    texts: dict[int, list[Lettering]] = {}
+    lost: list[Lettering] = []
     for lettering in letterings:
         inside = tree.query(shapely.Point(lettering.position), predicate="within")
         if len(inside):
             smallest = min(inside, key=lambda index: shapes[index].shape.area)
-            texts.setdefault(int(smallest), []).append(lettering.text)
+            texts.setdefault(int(smallest), []).append(lettering)
         elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
-            lost.append(_without_size(lettering.text))
-    if named := [f"'{text}'" for text in dict.fromkeys(lost) if _is_name(text) and room_type_from_reading(text)]:
+            lost.append(lettering)
+    if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_type)):
         builder.warnings.append(
             f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
         )
     rooms = []
     for index, area in enumerate(shapes):
-        words = [text for raw in texts.get(index, []) if _is_name(text := _without_size(raw))]
-        known = [text for text in words if room_type_from_reading(text) is not None]
-        name = area.name or next(iter(known or words), None)
-        rooms.append(SketchedRoom(area.shape, name, room_type_from_reading(area.kind) or room_type_from_reading(name)))
-        if others := [text for text in dict.fromkeys(known) if text != name]:
+        words = _names(texts.get(index, []))
+        types = {found.text: kind for found in words if (kind := found.room_type) is not None}
+        known = list(types)
+        name = area.name or next(iter(known or [found.text for found in words]), None)
+        kind = room_type_from_name(area.kind) or types.get(name or "") or room_type_from_name(name)
+        rooms.append(SketchedRoom(area.shape, name, kind))
+        if others := [text for text in known if text != name]:
             names = " and ".join(f"'{text}'" for text in (name, *others[:_MAX_OTHERS]))
             builder.warnings.append(
                 f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
                 "between them"
             )
-    check_areas(rooms, [texts.get(index, []) for index in range(len(rooms))], builder)
+    check_areas(rooms, [[raw.text for raw in texts.get(index, [])] for index in range(len(rooms))], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:
         builder.notes.append(f"{unnamed} rooms have no name in the file")
     return rooms
 
 
-def _without_size(text: str) -> str:
-    return _SIZE.sub("", text).strip(" ,;:-\n\t")
+def _names(letterings: Sequence[Lettering]) -> list[Lettering]:
+    """Return the texts that are names, without the sizes beside them."""
+    texts = (replace(lettering, text=_SIZE.sub("", lettering.text).strip(" ,;:-\n\t")) for lettering in letterings)
+    return [lettering for lettering in texts if _is_name(lettering.text)]
 
 
 def _is_name(text: str) -> bool:

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.importers.common.geometry import point_xy
 from lalaloc_core.importers.common.sketch import SketchedFixture
-from lalaloc_core.importers.common.vocabulary import Role
+from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name, room_type_from_reading
 
 # Fills of lower luminance (of 255) can be walls.
 _DARK = 110.0
@@ -88,12 +88,21 @@ class Swing:
 
 @dataclass(frozen=True)
 class Lettering:
-    """Text, its position (its middle or its start), and its height if that is known."""
+    """Text, its position (its middle or its start), and its height if that is known.
+
+    Letters of a text that `is_ocr` was read from pixels can be wrong.
+    """
 
     text: str
     position: tuple[float, float]
     layer: str = ""
     height: float = 0.0
+    is_ocr: bool = False
+
+    @property
+    def room_type(self) -> str | None:
+        """Type of room that the text names; None if it names none."""
+        return (room_type_from_reading if self.is_ocr else room_type_from_name)(self.text)
 
 
 @dataclass

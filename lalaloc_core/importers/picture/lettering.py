@@ -111,7 +111,9 @@ def read_texts(
 
     for text, box in boxes:
         x, y = from_middle(box.mean(axis=0, keepdims=True))[0]
-        found.drawing.letterings.append(Lettering(text, (float(x), float(y)), height=_height(box) / factor))
+        found.drawing.letterings.append(
+            Lettering(text, (float(x), float(y)), height=_height(box) / factor, is_ocr=True)
+        )
         found.outlines.append(from_middle(box))
     if boxes:
         lines = _thin_lines(ink, [box for _, box in boxes])
