@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 _CHAINS, _HOTTEST = 12, 4.0
 # Sweeps over all photographs: while cooling, and those that are counted. Large albums have fewer, to bound the time.
-_COOLING, _COUNTED, _MAX_UPDATES = 40, 60, 6000
+_COOLING, _COUNTED, _MAX_UPDATES = 40, 60, 3000
 _FEWEST = 12
 # Most successive photographs that move together.
 _LONGEST = 6
