@@ -103,6 +103,8 @@ def view_document(view: Photograph) -> dict[str, Any]:
         return {"value_deg": math.degrees(assumed.value), "std_deg": math.degrees(assumed.sd), "source": assumed.source}
 
     angles = {name: angle(getattr(view, name)) for name in ("hfov", "pitch", "roll")}
+    if view.wall_direction is not None:
+        angles["wall_direction"] = angle(view.wall_direction)
     return {"projection": view.projection, "projection_source": view.projection_source, **angles}
 
 

@@ -41,6 +41,8 @@ from lalaloc_core.floorplan.values import check_keys, json_kind, read_name, read
 
 # Plans with more rooms use a spatial index to find the room of a position.
 _FEW_ROOMS = 32
+# Directions of walls, one for each degree of a quarter turn.
+_DIRECTIONS = 90
 _PLAN_KEYS = {
     "name",
     "rooms",
@@ -272,6 +274,19 @@ class FloorPlan:
     def ceiling_heights_m(self) -> Float[np.ndarray, "rooms"]:
         """Ceiling height of every room."""
         return frozen(np.array([room.ceiling_height_m for room in self.rooms]))
+
+    @cached_property
+    def wall_directions(self) -> Float[np.ndarray, "rooms 90"]:
+        """Share of the length of each room's walls by direction: azimuths in degrees, modulo 90."""
+        walls_m, count = self.geometry.walls_m, self.geometry.wall_count
+        along_m = walls_m[..., 2:] - walls_m[..., :2]
+        # Rows beyond the count are padding.
+        length_m = np.hypot(*np.moveaxis(along_m, -1, 0)) * (np.arange(walls_m.shape[1]) < count[:, None])
+        azimuth = np.arctan2(along_m[..., 0], along_m[..., 1])
+        degree = np.rint(np.degrees(azimuth)).astype(np.intp) % _DIRECTIONS
+        shares = np.zeros((len(self.rooms), _DIRECTIONS), np.float32)
+        np.add.at(shares, (np.arange(len(shares))[:, None], degree), length_m)
+        return frozen(shares / shares.sum(axis=1, keepdims=True))
 
     @cached_property
     def fixtures_by_kind(self) -> Mapping[str, FixturePlaces]:

@@ -82,6 +82,8 @@ class Photograph:
         hfov: horizontal field of view.
         pitch: elevation of the centre of the picture.
         roll: clockwise rotation of the camera about its optical axis.
+        wall_direction: azimuth of walls relative to the photograph's centre, up to quarter turns, by straight lines;
+            None without lines, and for a full sphere.
         azimuths: first and last azimuth (radians) that the photograph shows, relative to its centre, clockwise.
         patches: level patches that cover the photograph; empty for a full sphere.
         sphere: (h, w, 3) pixels of the level full sphere; None for other photographs.
@@ -100,6 +102,7 @@ class Photograph:
     pitch: Assumed
     roll: Assumed
     azimuths: tuple[float, float]
+    wall_direction: Assumed | None = None
     patches: tuple[Patch, ...] = ()
     sphere: UInt8[np.ndarray, "h w 3"] | None = None
     thumbnail: UInt8[np.ndarray, "h w 3"] | None = None
@@ -329,8 +332,7 @@ def photograph_of_picture(
 ) -> Photograph:
     """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
-    needs_lines = overview > 0 or lens.camera is None or stated.pitch_deg is None or stated.roll_deg is None
-    segments = find_segments(picture) if needs_lines else np.zeros((0, 4))
+    segments = find_segments(picture)
     warnings = lens.warnings
     if lens.camera is None:
         found = estimate_calibration(segments, width=columns, height=rows)
@@ -357,6 +359,7 @@ def photograph_of_picture(
         small = camera.scaled(columns, rows)
     hfov = Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source)
     # Strips are not turned by the tilt that others tell.
+    walls = Assumed(value=attitude.yaw, sd=attitude.yaw_sd, source="estimated")
     is_of_turn = overview == TURN_SIDE and not isinstance(camera, Around)
     overlapping = None
     if overview:
@@ -373,6 +376,7 @@ def photograph_of_picture(
         pitch=pitch,
         roll=roll,
         azimuths=seen_azimuths(small, tilt, roll.value),
+        wall_direction=walls if math.isfinite(walls.sd) else None,
         patches=() if is_of_turn else cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
         thumbnail=thumbnail_of(picture),
         camera=camera,

@@ -93,6 +93,7 @@ def read_view(spot: Spot) -> ReadView:
         hfov=_angle(photograph.hfov),
         pitch=_angle(photograph.pitch),
         roll=_angle(photograph.roll),
+        wall_direction=None if photograph.wall_direction is None else _angle(photograph.wall_direction),
         camera=_camera(photograph),
         seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
         warnings=list(photograph.warnings),

@@ -128,6 +128,11 @@ class ReadView(ResponseModel):
     hfov: AssumedAngle = Field(description="Horizontal field of view.")
     pitch: AssumedAngle = Field(description="Elevation of the photograph's centre above the horizon.")
     roll: AssumedAngle = Field(description="Clockwise rotation of the camera about its optical axis.")
+    wall_direction: AssumedAngle | None = Field(
+        default=None,
+        description="Azimuth of walls relative to the photograph's centre, up to quarter turns, by its straight lines; "
+        "null without lines and for full spheres.",
+    )
     camera: CameraAnswer | None = Field(
         description="Camera model, with which the plan's walls can be drawn over the photograph; null for full spheres "
         "and strips."

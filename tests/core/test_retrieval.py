@@ -450,7 +450,7 @@ def test_pair_costs_equal_the_full_matrix(building: Building, grid: PoseGrid, qu
 @pytest.mark.parametrize(
     "limits", [{"at_most": 6000, "at_least": 200, "window": 0.5}, {"at_most": 300, "at_least": 300, "window": 0.0}]
 )
-@pytest.mark.parametrize("told", [None, "hints", "fixtures"])
+@pytest.mark.parametrize("told", [None, "hints", "fixtures", "directions"])
 @pytest.mark.parametrize("chunk", [64, 1024])
 @pytest.mark.parametrize("azimuths", [SPHERE_AZIMUTHS, VIEW_AZIMUTHS])
 def test_likeliest_pairs_equal_a_complete_coarse_pass(
@@ -471,7 +471,11 @@ def test_likeliest_pairs_equal_a_complete_coarse_pass(
         hint = np.where(rng.random(poses) < 0.5, np.inf, 0.1) if told == "hints" else np.zeros(poses)
         fixtures = rng.random((8 if told == "fixtures" else 1, HYPOTHESES)).astype(np.float32) * 0.2
         row = rng.integers(0, len(fixtures), poses)
-        penalty = None if told is None else PlaceCost(hint, row, fixtures)
+        # Directions of walls have a cost for each room and heading.
+        rooms = len(building.plan.rooms)
+        directions = rng.random((rooms if told == "directions" else 1, HYPOTHESES)).astype(np.float32) * 0.2
+        room = grid.poses.room_index if told == "directions" else np.zeros(poses, np.intp)
+        penalty = None if told is None else PlaceCost(hint, row, fixtures, room, directions)
         matching_cost = matching_cost_of(building, query if azimuths == SPHERE_AZIMUTHS else view_of(query))
         binned, room_index = grid.binned(building.plan, azimuths), grid.poses.room_index
         every = coarse_costs(binned, matching_cost, room_index)

@@ -82,6 +82,7 @@ class _Header:
     Attributes:
         model: SHA-256 of the model's bundle.
         projection, projection_source, hfov, pitch, roll: what was assumed about the photograph, as in `Photograph`.
+        wall_direction: as in `Photograph`; files of earlier versions have none.
         seen_deg: first and last azimuth that the photograph shows, relative to its centre.
         patches: azimuth of each patch relative to the photograph's centre, in columns; empty for a full sphere.
         compass_deg: compass heading of the centre.
@@ -96,6 +97,7 @@ class _Header:
     pitch: _Angle
     roll: _Angle
     seen_deg: tuple[float, float]
+    wall_direction: _Angle | None = None
     patches: list[int] = field(default_factory=list)
     compass_deg: float | None = None
     camera: _CameraModel | None = None
@@ -293,6 +295,7 @@ def _header_of(photograph: Photograph, bundle: Bundle) -> _Header:
         hfov=angle(photograph.hfov),
         pitch=angle(photograph.pitch),
         roll=angle(photograph.roll),
+        wall_direction=None if photograph.wall_direction is None else angle(photograph.wall_direction),
         seen_deg=(math.degrees(photograph.azimuths[0]), math.degrees(photograph.azimuths[1])),
         patches=[round(azimuth / column) for azimuth in photograph.patch_azimuths],
         compass_deg=None if photograph.compass_heading is None else math.degrees(photograph.compass_heading),
@@ -328,11 +331,14 @@ def _camera_of(model: _CameraModel, projection: Projection) -> Camera:
 def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
     """Return the photograph of a header, without outputs."""
     half = manifest.profile_columns // 2
-    first_deg, last_deg = header.seen_deg
+    walls, (first_deg, last_deg) = header.wall_direction, header.seen_deg
     faults = {
         "hfov": not 0.0 < header.hfov.value_deg <= 360.0,
         "pitch and roll": max(abs(header.pitch.value_deg), abs(header.roll.value_deg)) > 180.0,
-        "std_deg": not all(0.0 <= angle.std_deg <= 180.0 for angle in (header.hfov, header.pitch, header.roll)),
+        "wall_direction": walls is not None and abs(walls.value_deg) > 360.0,
+        "std_deg": not all(
+            0.0 <= angle.std_deg <= 180.0 for angle in (header.hfov, header.pitch, header.roll, walls or header.hfov)
+        ),
         "seen_deg": not (-360.0 <= first_deg < last_deg <= 360.0 and last_deg - first_deg <= 360.0),
         "compass_deg": header.compass_deg is not None and abs(header.compass_deg) > 360.0,
         "patches": len(header.patches) > _MAX_PATCHES or any(abs(place) > half for place in header.patches),
@@ -363,6 +369,7 @@ def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
         pitch=assumed(header.pitch),
         roll=assumed(header.roll),
         azimuths=(math.radians(first_deg), math.radians(last_deg)),
+        wall_direction=None if walls is None else assumed(walls),
         camera=camera,
         compass_heading=None if header.compass_deg is None else math.radians(header.compass_deg),
         warnings=tuple(header.warnings),

@@ -17,7 +17,7 @@ from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEncoder, seen_objects
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
 from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, ViewEncoder
-from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects
+from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
 from lalaloc_core.photograph.patches import joined_patches
 
@@ -98,7 +98,12 @@ class PhotographEncoder(LayoutEncoder):
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
         objects = self._seen_objects(turned) if beside is None else beside.result()
-        several = {"objects": objects, "is_turn": bool(others)}
+        directions = tuple(
+            WallDirection(view.wall_direction.value + turn, view.wall_direction.sd)
+            for view, turn in turned
+            if view.wall_direction is not None
+        )
+        several = {"objects": objects, "wall_directions": directions, "is_turn": bool(others)}
         searched = None if query.searched is None else replace(query.searched, **several)
         return replace(query, **several, searched=searched)
 

@@ -1,4 +1,4 @@
-"""Cost of a pose that does not come from what the network reads of the room: hints, and fixtures that the plan draws.
+"""Cost of a pose by evidence that is not about the room's outline: hints, drawn fixtures, and directions of walls.
 
 **Fixtures.** An object of the kind of a fixture, present with the probability p and seen at the azimuth α, agrees with
 a pose from which the plan shows such a fixture there, at the azimuth φ:
@@ -10,6 +10,15 @@ The fixture is not drawn, or stands in another room, with the probability m. N i
 deviation σ, of the object's azimuth and the fixture's width, and F the usual field of view, within which an object of
 unknown place would be anywhere. In rooms without such a fixture g is 0; rooms with many tell no direction, g is 1.
 Kinds that the plan draws nowhere are left out.
+
+**Directions.** Lines of a photograph tell the directions of the walls relative to its centre, up to quarter turns
+(`photograph.levelling`). Under a hypothesis of the heading they have the azimuth α in the plan, whose density is
+
+    f(α) = (1 - o) sum_i l_i N(α - φ_i; σ) + o / 90°
+
+with the shares l of the walls' length in the room by their direction φ, modulo 90°. o is the probability that the lines
+are of something else, and σ has the deviation of the estimate, of walls that are not quite straight, and of headings
+between two hypotheses. Photographs of one spot see the same walls, so the mean of their costs counts.
 """
 
 from __future__ import annotations
@@ -22,7 +31,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FixturePlaces, FloorPlan
-from lalaloc_core.localise.query import Hints, Query, SeenObject
+from lalaloc_core.localise.query import Hints, Query, SeenObject, WallDirection
 
 # Names of recognised objects that are fixtures; the others tell the type of the room alone.
 _FIXTURES = {
@@ -48,6 +57,9 @@ _MAX_FIXTURES = 12
 # More fixtures of the kinds that are seen, or rooms with them of a larger area (m²), tell nothing, which bounds work
 # and memory of a query.
 _MAX_SEEN, _MAX_AREA_M2 = 500, 5000.0
+# o and the deviation (degrees) of directions beside that of the estimate; estimates with a larger one tell nothing.
+_OTHER_LINES, _DIRECTION_SD, _MAX_DIRECTION_SD = 0.2, 1.5, 15.0
+_QUARTER = 90.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +70,15 @@ class PlaceCost:
         hint: (n,) cost of the hints; infinite where strict ones exclude a pose.
         row: (n,) numbers of the poses' rows in `fixtures`.
         fixtures: (f, k) cost of the fixtures, or (f, 1) where it does not depend on the heading.
+        room: (n,) numbers of the poses' rows in `directions`.
+        directions: (r, k) cost of the directions of the walls, or (r, 1) as well.
     """
 
     hint: Float[np.ndarray, "n"]
     row: Int[np.ndarray, "n"]
     fixtures: Float[np.ndarray, "f #k"]
+    room: Int[np.ndarray, "n"]
+    directions: Float[np.ndarray, "r #k"]
 
     @classmethod
     def of(
@@ -74,29 +90,35 @@ class PlaceCost:
         position_m: Float[np.ndarray, "n 2"],
         room_index: Int[np.ndarray, "n"],
     ) -> PlaceCost | None:
-        """Return the cost of some poses; None if neither hints nor fixtures tell anything."""
+        """Return the cost of some poses; None if none of the evidence tells anything."""
         seen = [] if query.objects is None else _seen_fixtures(plan, query.objects.objects)
-        if hints.are_none and not seen:
+        told = [each for each in query.wall_directions if math.degrees(each.sd) < _MAX_DIRECTION_SD]
+        if hints.are_none and not seen and not told:
             return None
         hint = np.zeros(len(position_m))
         if not hints.are_none:
             hint = hints.penalty(plan, position_m, room_index) / temperature
         row, fixtures = _fixture_costs(plan, query, seen, position_m, room_index)
-        return cls(hint, row, fixtures / temperature)
+        room, directions = np.zeros(len(position_m), np.intp), np.zeros((1, 1), np.float32)
+        if told:
+            room, directions = room_index, _direction_costs(plan, query, told)
+        return cls(hint, row, fixtures / temperature, room, directions / temperature)
 
     @property
     def lowest(self) -> Float[np.ndarray, "n"]:
-        """Lowest cost of each pose under any hypothesis."""
-        return self.hint + self.fixtures.min(axis=1)[self.row]
+        """A lower bound of the cost of each pose under any hypothesis."""
+        return self.hint + self.fixtures.min(axis=1)[self.row] + self.directions.min(axis=1)[self.room]
 
     def of_poses(self, pose: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m #k"]:
         """Return the cost of some poses under every hypothesis, (m, 1) where it does not depend on that."""
-        return self.hint[pose, None] + self.fixtures[self.row[pose]]
+        return self.hint[pose, None] + self.fixtures[self.row[pose]] + self.directions[self.room[pose]]
 
     def of_pairs(self, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
         """Return the cost of some pairs of a pose and a hypothesis."""
-        column = hypothesis if self.fixtures.shape[1] > 1 else np.zeros_like(hypothesis)
-        return self.hint[pose] + self.fixtures[self.row[pose], column]
+        parts = ((self.fixtures, self.row[pose]), (self.directions, self.room[pose]))
+        return self.hint[pose] + sum(
+            cost[row, hypothesis if cost.shape[1] > 1 else np.zeros_like(hypothesis)] for cost, row in parts
+        )
 
 
 def _seen_fixtures(plan: FloorPlan, objects: tuple[SeenObject, ...]) -> list[SeenObject]:
@@ -169,3 +191,19 @@ def _agreement(
         off = wrap_angle(azimuth - np.arctan2(away_m[:, 0], away_m[:, 1])[:, None]) / deviation
         found[rows] += _FIELD / count * np.exp(-0.5 * np.square(off)) / (math.sqrt(2.0 * math.pi) * deviation)
     return found
+
+
+def _direction_costs(plan: FloorPlan, query: Query, told: list[WallDirection]) -> Float[np.ndarray, "r k"]:
+    """Return the negative log likelihood (nats, at least 0) of the directions of walls in every room."""
+    cost = np.zeros((len(plan.rooms), len(query.roll)), np.float32)
+    between = math.degrees(query.sector) / math.sqrt(12.0)
+    for each in told:
+        deviation = math.hypot(math.degrees(each.sd), _DIRECTION_SD, between)
+        azimuth = np.degrees(query.roll + query.frame_heading + each.azimuth)
+        off = (azimuth[:, None] - np.arange(_QUARTER) + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
+        peak = (1.0 - _OTHER_LINES) / (math.sqrt(2.0 * math.pi) * deviation)
+        kernel = (peak * np.exp(-0.5 * np.square(off / deviation))).astype(np.float32)
+        # At least 0, by the highest density there is, as for fixtures.
+        other = _OTHER_LINES / _QUARTER
+        cost += math.log(peak + other) - np.log(plan.wall_directions @ kernel.T + other)
+    return cost / len(told)

@@ -22,6 +22,7 @@ from lalaloc_core.localise.query.predictions import (
     RivalWall,
     SeenObject,
     SeenObjects,
+    WallDirection,
     rolled,
 )
 from lalaloc_core.localise.query.query import Candidate, Query

@@ -131,6 +131,14 @@ class SeenObject:
     azimuth: float
 
 
+@dataclass(frozen=True)
+class WallDirection:
+    """Azimuth of walls relative to the photograph's centre, known up to quarter turns, and its deviation (radians)."""
+
+    azimuth: float
+    sd: float
+
+
 @dataclass(frozen=True, eq=False)
 class SeenObjects:
     """Objects that a photograph, or several of one spot, show, and the type of room that they suggest.

@@ -13,6 +13,7 @@ from lalaloc_core.localise.query.predictions import (
     PredictedProfile,
     PredictedRoomType,
     SeenObjects,
+    WallDirection,
 )
 from lalaloc_core.localise.query.stated_pose import CameraHeight
 
@@ -34,6 +35,7 @@ class Query:
         profile: predicted wall profile; None if the image encoder predicts none.
         openings, ceiling, room_type: other predictions; None if the image encoder does not make them.
         objects: recognised objects, whose room type replaces `room_type`; None if the model recognises none.
+        wall_directions: directions of walls that the lines of each photograph tell.
         searched: the same photograph with an unknown heading, to doubt a given one; None if the heading is unknown.
         is_view: whether the encoder of views read it, which has matching weights and confidence of its own.
         is_turn: whether it is several views from one spot, which have a confidence of their own.
@@ -49,6 +51,7 @@ class Query:
     ceiling: PredictedCeiling | None = None
     room_type: PredictedRoomType | None = None
     objects: SeenObjects | None = None
+    wall_directions: tuple[WallDirection, ...] = ()
     searched: Query | None = None
     is_view: bool = False
     is_turn: bool = False
@@ -78,7 +81,8 @@ class Candidate:
         cost: matching cost; the latent distance if the model predicts no wall profile.
         latent_distance: distance of the layout's latent to the query's; NaN until computed, as it is for answers.
         height_offset: log of true over stated camera height that fits best.
-        place_cost: cost of hints and fixtures at the pose, in units of the cost; see `localise.match.place_cost`.
+        place_cost: cost of hints, fixtures and directions of walls at the pose, in units of the cost; see
+            `localise.match.place_cost`.
         terms: terms of the matching cost by name; empty if poses are compared by latents.
         information: (p, p) curvature of the cost by x, y (m) and, if it was searched, the heading (radians), from pose
             refinement. Its inverse is the covariance up to a factor.

@@ -10,6 +10,10 @@ export interface Attitude {
   roll: number;
   pitchSd: number;
   rollSd: number;
+  /** Azimuth of one of the two horizontal directions relative to the optical axis; repeats by a quarter turn. */
+  yaw: number;
+  /** Its standard deviation; infinite without lines. */
+  yawSd: number;
 }
 
 const SIGMA = radians(0.6),
@@ -17,8 +21,9 @@ const SIGMA = radians(0.6),
   COARSE_SIGMA = radians(2);
 const SHARES = [0.3, 0.2, 0.2] as const,
   OUTLIERS = 0.3 / Math.PI;
-const PRIOR = [radians(12), radians(4)] as const,
-  FLOOR = [radians(0.5), radians(0.4)] as const;
+const PRIOR = [radians(12), radians(4), Infinity] as const,
+  FLOOR = [radians(0.5), radians(0.4), radians(0.4)] as const,
+  QUARTER = Math.PI / 2;
 /** Tilts with a larger standard deviation are assumed rather than estimated. */
 export const MAX_ESTIMATED_SD = radians(4);
 const STARTS = 16,
@@ -41,11 +46,11 @@ interface Line {
 interface Mode {
   angles: Angles;
   score: number;
-  /** Variances of pitch and roll. */
-  variance: [number, number];
+  /** Variances of the angles. */
+  variance: Angles;
 }
 
-const NO_LINES: Mode = { angles: [0, 0, 0], score: 0, variance: [PRIOR[0] ** 2, PRIOR[1] ** 2] };
+const NO_LINES: Mode = { angles: [0, 0, 0], score: 0, variance: [PRIOR[0] ** 2, PRIOR[1] ** 2, Infinity] };
 // Fields of view of the longer side, if unknown: values to try, and the prior of log focal length of phones.
 const LONG_FOVS = [44, 48, 52, 57, 62, 67, 73, 79, 86, 93, 100, 108, 116].map(radians),
   USUAL_FOV = radians(72),
@@ -100,15 +105,17 @@ export function estimateCalibration(segments: Segment[], { width, height }: Size
 function attitudeOf(modes: Mode[]): Attitude {
   const best = modes.reduce((a, b) => (b.score > a.score ? b : a));
   const weights = modes.map(({ score }) => Math.exp(score - best.score)),
-    sum = weights.reduce((a, b) => a + b);
-  const [pitchSd, rollSd] = ([0, 1] as const).map((axis) => {
-    const spread = modes.reduce(
-      (total, mode, index) => total + (weights[index]! * (mode.angles[axis] - best.angles[axis]) ** 2) / sum,
-      0,
-    );
+    sum = weights.reduce((a, b) => a + b),
+    fold = (angle: number): number => angle - QUARTER * Math.round(angle / QUARTER);
+  const [pitchSd, rollSd, yawSd] = ([0, 1, 2] as const).map((axis) => {
+    const spread = modes.reduce((total, mode, index) => {
+      const apart = mode.angles[axis] - best.angles[axis];
+      return total + (weights[index]! * (axis === 2 ? fold(apart) : apart) ** 2) / sum;
+    }, 0);
     return Math.min(Math.sqrt(best.variance[axis] + FLOOR[axis] ** 2 + spread), PRIOR[axis]);
-  }) as [number, number];
-  return { pitch: best.angles[0], roll: best.angles[1], pitchSd, rollSd };
+  }) as Angles;
+  const [pitch, roll, yaw] = best.angles;
+  return { pitch, roll, yaw, pitchSd, rollSd, yawSd };
 }
 
 /** Return the segments as planes through the camera. */
@@ -254,7 +261,7 @@ function refined(lines: Line[], start: Angles): Mode {
   const inverse = inverted(information);
   const score =
     total(lines, angles, least) - 0.5 * prior.reduce((sum, value, axis) => sum + value * angles[axis]! ** 2, 0);
-  return { angles, score, variance: [inverse[0]![0]!, inverse[1]![1]!] };
+  return { angles, score, variance: [inverse[0]![0]!, inverse[1]![1]!, inverse[2]![2]!] };
 }
 
 /** Return the inverse of a symmetric 3 x 3 matrix. */

@@ -11,6 +11,7 @@ export interface Header {
   hfov: Angle;
   pitch: Angle;
   roll: Angle;
+  wall_direction: Angle | null;
   seen_deg: [number, number];
   patches: number[];
   compass_deg: number | null;

@@ -115,6 +115,7 @@ async function sphere(
     hfov: { value_deg: 360, std_deg: 0, source: lens.hfovSource },
     pitch,
     roll,
+    wall_direction: null,
     seen_deg: [-180, 180],
     patches: [],
     compass_deg: poseAngle(metadata, "PoseHeadingDegrees", 0, 360),
@@ -127,7 +128,7 @@ async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Mod
   const { width, height } = bitmap,
     size = encoder.patchSize,
     entered = [statedPitch(stated), statedRoll(stated)] as const;
-  const { lens, tilt } = withLines(bitmap, known, entered.includes(null)),
+  const { lens, lined } = withLines(bitmap, known),
     { projection, hfov } = lens;
   const isPerspective = projection === "perspective",
     focal = isPerspective ? (0.5 * width) / Math.tan(0.5 * hfov) : width / hfov;
@@ -143,8 +144,8 @@ async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Mod
       std_deg: degrees(lens.focalSd * (isPerspective ? Math.sin(hfov) : hfov)),
       source: lens.hfovSource,
     },
-    pitch: entered[0] ?? tilt?.pitch ?? level(PITCH_SD_DEG),
-    roll: entered[1] ?? tilt?.roll ?? level(ROLL_SD_DEG),
+    pitch: entered[0] ?? lined?.pitch ?? level(PITCH_SD_DEG),
+    roll: entered[1] ?? lined?.roll ?? level(ROLL_SD_DEG),
   };
   const wanted = (FINER * size.width) / size.hfov / focal,
     share = wanted > SMALLEST_REDUCTION ? 1 : wanted;
@@ -161,6 +162,7 @@ async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Mod
     hfov: view.hfov,
     pitch: view.pitch,
     roll: view.roll,
+    wall_direction: lined?.wall_direction ?? null,
     seen_deg: seenDeg(view),
     patches: steps,
     compass_deg: null,
@@ -173,19 +175,17 @@ async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Mod
   return featuresFile(header, arrays);
 }
 
-/** Return the lens of a photograph, and the tilt of an ordinary one, estimated from its straight lines where they are not known. */
-function withLines(
-  bitmap: ImageBitmap,
-  lens: Lens,
-  needsTilt: boolean,
-): { lens: Lens & { hfov: number }; tilt: Pick<CameraView, "pitch" | "roll"> | null } {
+/** What the straight lines of a photograph tell. */
+type Lined = Pick<Header, "pitch" | "roll" | "wall_direction">;
+
+/** Return the lens of a photograph, estimated if it is not known, and what the straight lines of an ordinary one tell. */
+function withLines(bitmap: ImageBitmap, lens: Lens): { lens: Lens & { hfov: number }; lined: Lined | null } {
   const { hfov } = lens;
-  if (hfov !== null && (lens.projection !== "perspective" || !needsTilt))
-    return { lens: { ...lens, hfov }, tilt: null };
+  if (hfov !== null && lens.projection !== "perspective") return { lens: { ...lens, hfov }, lined: null };
   const share = Math.min(1, LINES_SIDE / Math.max(bitmap.width, bitmap.height));
   const picture = scaled(bitmap, Math.round(share * bitmap.width), Math.round(share * bitmap.height)),
     segments = findSegments(picture);
-  if (hfov !== null) return { lens: { ...lens, hfov }, tilt: anglesOf(estimateAttitude(segments, picture, hfov)) };
+  if (hfov !== null) return { lens: { ...lens, hfov }, lined: linedBy(estimateAttitude(segments, picture, hfov)) };
   const found = estimateCalibration(segments, picture),
     spread = 2 * found.focalSd * Math.sin(found.hfov);
   const warning =
@@ -193,17 +193,18 @@ function withLines(
     `${segments.length > 0 ? "was estimated from straight lines" : "is only usual"}; send hfov_deg or the camera's original file`;
   return {
     lens: { ...lens, hfov: found.hfov, focalSd: found.focalSd, warnings: [...lens.warnings, warning] },
-    tilt: anglesOf(found.attitude),
+    lined: linedBy(found.attitude),
   };
 }
 
-function anglesOf({ pitch, roll, pitchSd, rollSd }: Attitude): Pick<CameraView, "pitch" | "roll"> {
+function linedBy({ pitch, roll, yaw, pitchSd, rollSd, yawSd }: Attitude): Lined {
   const angle = (value: number, sd: number): Angle => ({
     value_deg: degrees(value),
     std_deg: degrees(sd),
     source: sd < MAX_ESTIMATED_SD ? "estimated" : "assumed",
   });
-  return { pitch: angle(pitch, pitchSd), roll: angle(roll, rollSd) };
+  const walls: Angle = { value_deg: degrees(yaw), std_deg: degrees(yawSd), source: "estimated" };
+  return { pitch: angle(pitch, pitchSd), roll: angle(roll, rollSd), wall_direction: yawSd < Math.PI ? walls : null };
 }
 
 const common = (
