@@ -421,7 +421,8 @@ class TestEvaluating:
 
         monkeypatch.setattr(ViewEncoder, "outputs", outputs)
         read = read_photographs(encoders, [hall])
-        by_reader = read_views(encoders, read, 80.0, 4)
+        reading = read_views(encoders, read, 80.0, 4)
+        by_reader = reading.by_reader
         view, constant = by_reader["view"], by_reader["constant"]
         assert view.n == constant.n == by_reader["sphere"].n == 4
         assert view.median_error == pytest.approx(-np.log(0.9), abs=0.03)
@@ -430,10 +431,12 @@ class TestEvaluating:
         assert constant.classes is None
         # At the azimuths of all four views, the reading of the sphere is that of the whole photograph.
         assert by_reader["sphere"].median_error == pytest.approx(read[0].measures.median_error, rel=0.5)
-        results = PhotographResults(read=read, answers={}, read_views={"80": by_reader})
+        results = PhotographResults(read=read, answers={}, read_views={"80": reading})
         shape = f"{view.shape_error:.3f} (constant distance {constant.shape_error:.3f}, whole sphere "
         assert f"| views of 80°: median error of the walls' shape | {shape}" in results.markdown()
-        assert results.figures()["read_views"]["80"]["view"]["shape_error"] == view.shape_error
+        assert results.figures()["read_views"]["80"]["by_reader"]["view"]["shape_error"] == view.shape_error
+        within = f"{percent(reading.walls_within['2'])} within 2°"
+        assert f"| … direction of the walls by lines | {within}" in results.markdown()
 
     def test_shape_error_ignores_scale(self) -> None:
         true_m, errors = np.linspace(1.0, 3.0, 9), np.array([0.1, -0.2, 0.0, 0.3, -0.1, 0.2, 0.0, 0.1, -0.3])

@@ -36,7 +36,7 @@ from lalaloc_core.evaluate.runs.galleries import (
     foreign_plans,
     score_galleries,
 )
-from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs, read_views
+from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, ReadViews, read_photographs, read_views
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
@@ -114,14 +114,14 @@ class PhotographResults:
     """Results of a model on annotated photographs.
 
     `read` are predictions of walls and openings; `answers` are by heading, "known" or "unknown", and `views` by field
-    of view (degrees) and heading. `read_views` are by field of view and what reads them, as of the function of that
-    name. `foreign` are confidences in plans of other buildings, by heading.
+    of view (degrees) and heading. `read_views` are by field of view. `foreign` are confidences in plans of other
+    buildings, by heading.
     """
 
     read: Sequence[ReadPhotograph]
     answers: Mapping[str, Sequence[GalleryAnswer]]
     views: Mapping[str, Mapping[str, Sequence[GalleryAnswer]]] = dataclasses.field(default_factory=dict)
-    read_views: Mapping[str, Mapping[str, AzimuthSummary]] = dataclasses.field(default_factory=dict)
+    read_views: Mapping[str, ReadViews] = dataclasses.field(default_factory=dict)
     foreign: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
 
     def figures(self) -> dict[str, Any]:
@@ -134,10 +134,7 @@ class PhotographResults:
         return without_infinity(
             {
                 "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
-                "read_views": {
-                    field_deg: {reader: dataclasses.asdict(summary) for reader, summary in by_reader.items()}
-                    for field_deg, by_reader in self.read_views.items()
-                },
+                "read_views": {field_deg: dataclasses.asdict(read) for field_deg, read in self.read_views.items()},
                 "galleries": scores,
                 "views": dict(zip(self.views, views, strict=True)),
                 "read_as": None if (shares := self._read_as()) is None else shares.tolist(),
@@ -193,8 +190,8 @@ class PhotographResults:
             ("error relative to the predicted scale", _number(azimuths.scale_ratio)),
             ("openings, balanced accuracy", _classes(azimuths.classes)),
         ]
-        for field_deg, by_reader in self.read_views.items():
-            rows += _view_rows(f"views of {field_deg}°", by_reader)
+        for field_deg, reading in self.read_views.items():
+            rows += _view_rows(f"views of {field_deg}°", reading)
         for what, answers in (
             ("galleries", self.answers),
             *((f"views of {deg}°", of) for deg, of in self.views.items()),
@@ -290,9 +287,10 @@ def evaluate_photographs(
     return results
 
 
-def _view_rows(what: str, by_reader: Mapping[str, AzimuthSummary]) -> list[tuple[str, str]]:
+def _view_rows(what: str, read: ReadViews) -> list[tuple[str, str]]:
     """Return figures of the encoder of views; in brackets those of the readers that bound it."""
-    view, sphere, constant = (by_reader[reader] for reader in ("view", "sphere", "constant"))
+    view, sphere, constant = (read.by_reader[reader] for reader in ("view", "sphere", "constant"))
+    within = ", ".join(f"{percent(share)} within {limit}°" for limit, share in read.walls_within.items())
 
     def openings(summary: AzimuthSummary) -> str:
         return "–" if summary.classes is None else percent(summary.classes.balanced_accuracy)
@@ -309,6 +307,7 @@ def _view_rows(what: str, by_reader: Mapping[str, AzimuthSummary]) -> list[tuple
             f"whole sphere {_number(sphere.median_error)})",
         ),
         ("… openings, balanced accuracy", f"{openings(view)} (whole sphere {openings(sphere)})"),
+        ("… direction of the walls by lines", within),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,10 +12,15 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data.drawn_rooms import DrawnRoom
 from lalaloc_core.learn.data.views import CachedSphere, ViewPhotograph
 from lalaloc_core.learn.metrics import AzimuthMeasures, AzimuthSummary, measure_azimuths, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.photograph import Photograph
+
+# Errors (degrees) of the direction of walls within which views are counted.
+_DIRECTION_LIMITS_DEG = (2.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,6 +34,21 @@ class ReadPhotograph:
     profile_m: Float[np.ndarray, "w"]
     class_scores: Float[np.ndarray, "w c"] | None
     measures: AzimuthMeasures
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadViews:
+    """Errors of views of one field, cut from photographs.
+
+    Attributes:
+        by_reader: summaries over all views by what reads them: "view" is the encoder of views. The others bound it:
+            "sphere" is the encoder of spheres with the whole photograph in sight, "constant" the median annotated
+            distance everywhere.
+        walls_within: shares of the views whose lines tell the direction of the walls within some degrees.
+    """
+
+    by_reader: dict[str, AzimuthSummary]
+    walls_within: dict[str, float]
 
 
 def read_photographs(encoders: PhotographEncoder, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
@@ -57,12 +78,8 @@ def read_photographs(encoders: PhotographEncoder, photographs: Sequence[Annotate
 
 def read_views(
     encoders: PhotographEncoder, read: Sequence[ReadPhotograph], field_deg: float, per_photograph: int
-) -> dict[str, AzimuthSummary]:
+) -> ReadViews:
     """Compare level views of photographs, cut at equal angles, with their annotations, at the azimuths they show.
-
-    Returns:
-        summaries over all views by what reads them: "view" is the encoder of views. The others bound it: "sphere" is
-        the encoder of spheres with the whole photograph in sight, "constant" the median annotated distance everywhere.
 
     Raises:
         BundleError: the model predicts no wall profile.
@@ -73,6 +90,7 @@ def read_views(
     annotated_m = [item.photograph.profile_m(0, len(item.profile_m)) for item in read]
     constant = np.log(np.median(np.concatenate(annotated_m)))
     measures: dict[str, list[AzimuthMeasures]] = {"view": [], "sphere": [], "constant": []}
+    misaligned_deg: list[float] = []
     for item in read:
         photograph, sphere = item.photograph, CachedSphere(item.photograph.photograph)
         width = len(item.profile_m)
@@ -84,7 +102,9 @@ def read_views(
                 sphere=sphere, azimuth=azimuth, field_deg=field_deg, pitch=0.0, roll=0.0, stated="tilt"
             )
             # With its azimuth as heading, a view is read in the frame of its sphere.
-            query = encoders.query(view.open(size), azimuth, CameraHeight(CAMERA_HEIGHT_M, 0.0))
+            opened = view.open(size)
+            query = encoders.query(opened, azimuth, CameraHeight(CAMERA_HEIGHT_M, 0.0))
+            misaligned_deg.append(_misaligned_deg(opened, azimuth, photograph.outlines[0]))
             log_m, log_scale, scores = _azimuths(query, encoders.manifest.name)
             seen = np.isfinite(log_scale)
             readings = {
@@ -96,7 +116,9 @@ def read_views(
                 true_m = [profile_m[seen] for profile_m in profiles_m]
                 kinds = None if kinds is None else kinds[seen]
                 measures[reader].append(measure_azimuths(true_m, walls[seen], scale[seen], classes[seen], kinds))
-    return {reader: summarise_azimuths(of, OPENING_CLASSES) for reader, of in measures.items()}
+    within = {f"{limit:g}": float(np.mean(np.array(misaligned_deg) < limit)) for limit in _DIRECTION_LIMITS_DEG}
+    summaries = {reader: summarise_azimuths(of, OPENING_CLASSES) for reader, of in measures.items()}
+    return ReadViews(by_reader=summaries, walls_within=within)
 
 
 def read_azimuths(
@@ -111,6 +133,18 @@ def read_azimuths(
         BundleError: the model predicts no wall profile.
     """
     return _azimuths(encoders.spheres.query(image, 0.0, CameraHeight(camera_height_m, 0.0)), encoders.manifest.name)
+
+
+def _misaligned_deg(view: Photograph, azimuth: float, room: DrawnRoom) -> float:
+    """Return the error of the direction that lines tell, against that of most walls; infinite if they tell none."""
+    if view.wall_direction is None:
+        return math.inf
+    along_m = room.walls_m[:, 2:] - room.walls_m[:, :2]
+    along = np.arctan2(along_m[:, 0], along_m[:, 1])
+    # Four times an angle that repeats by a quarter turn is an angle again.
+    true = (np.hypot(*along_m.T) * np.exp(4j * along)).sum()
+    error = np.exp(4j * (view.wall_direction.value + azimuth)) / true
+    return abs(math.degrees(np.angle(error))) / 4.0
 
 
 def _azimuths(

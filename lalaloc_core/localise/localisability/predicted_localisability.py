@@ -2,7 +2,8 @@
 
 For each of some places the predictions of a model are drawn (`prediction_errors.py`) from the layout that the plan
 shows there, and searched for with the matching cost and the coarse pass of real queries. The share of draws whose
-answer is within 1 m is the probability. Of openings that the plan draws in part (`FloorPlan.opening_trust`), some are
+answer is within 1 m is the probability. Lines of views tell the directions of walls as often as they are presumed to.
+Of openings that the plan draws in part (`FloorPlan.opening_trust`), some are
 moved: they exist elsewhere. Ceilings and room types, which weigh little, are left out, and so is pose
 refinement; `PredictionErrors.spread` is fitted to make up for both. Poses that fit equally well share the answer.
 
@@ -26,8 +27,8 @@ from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, GridCosts
-from lalaloc_core.localise.match import MatchingConfig, PoseGrid, layouts_at
-from lalaloc_core.localise.query import CameraHeight, PredictedOpenings, PredictedProfile, Query, rolled
+from lalaloc_core.localise.match import OTHER_LINES, MatchingConfig, PoseGrid, layouts_at
+from lalaloc_core.localise.query import CameraHeight, PredictedOpenings, PredictedProfile, Query, WallDirection, rolled
 from lalaloc_core.localise.search.retrieval import grid_costs
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid, random_poses
 
@@ -39,6 +40,8 @@ _PLACES, _MIN_PLACES, _DRAWS = 40, 12, 2
 _FULL_POSES = 2_500
 # Grid step (m); those of larger plans are multiples of 0.1 m.
 STEP_M, _STEPS_PER_M = 0.5, 10
+# Deviation of the azimuth of walls that lines tell: the median of views of 80° of real rooms.
+_LINES_SD = math.radians(1.0)
 # Poses whose likelihoods differ by less than this factor fit equally well: copies of a room differ by rounding.
 _EQUAL = math.log(1.01)
 # Pairs of rooms that are listed, and the smallest share of confused photographs.
@@ -202,6 +205,7 @@ class Searches:
         log_probability = errors.openings(kind, rng)
         prior = np.array(manifest.opening_prior if not views or manifest.view is None else manifest.view.opening_prior)
         height = CameraHeight(self._plan.camera_height_m)
+        directions = _directions(self._plan, places, between, rng)
         for row in range(len(places)):
             unseen = ~_seen(columns, views, int(rng.integers(columns)))
             scale, probability = log_scale[row].astype(np.float32), log_probability[row]
@@ -215,8 +219,20 @@ class Searches:
                 height,
                 profile=profile.moved(shifts),
                 openings=PredictedOpenings(rolled(probability, shifts), prior),
+                wall_directions=(directions[row],) if views else (),
                 is_view=views > 0,
             )
+
+
+def _directions(
+    plan: FloorPlan, places: PoseSet, heading: Float[np.ndarray, "n"], rng: np.random.Generator
+) -> list[WallDirection]:
+    """Return the directions of walls that lines tell at each place, some of which are of something else."""
+    walls = np.radians(plan.wall_directions[places.room_index].argmax(axis=1)) - heading
+    walls += rng.normal(0.0, _LINES_SD, len(places))
+    is_other = rng.random(len(places)) < OTHER_LINES
+    walls[is_other] = rng.uniform(0.0, 0.25 * TWO_PI, is_other.sum())
+    return [WallDirection(float(azimuth), _LINES_SD) for azimuth in walls]
 
 
 def _as_built(

@@ -57,8 +57,9 @@ _MAX_FIXTURES = 12
 # More fixtures of the kinds that are seen, or rooms with them of a larger area (m²), tell nothing, which bounds work
 # and memory of a query.
 _MAX_SEEN, _MAX_AREA_M2 = 500, 5000.0
-# o and the deviation (degrees) of directions beside that of the estimate; estimates with a larger one tell nothing.
-_OTHER_LINES, _DIRECTION_SD, _MAX_DIRECTION_SD = 0.2, 1.5, 15.0
+# o, and the deviation (degrees) of directions beside that of the estimate; estimates with a larger one tell nothing.
+OTHER_LINES = 0.2
+_DIRECTION_SD, _MAX_DIRECTION_SD = 1.5, 15.0
 _QUARTER = 90.0
 
 
@@ -201,9 +202,9 @@ def _direction_costs(plan: FloorPlan, query: Query, told: list[WallDirection]) -
         deviation = math.hypot(math.degrees(each.sd), _DIRECTION_SD, between)
         azimuth = np.degrees(query.roll + query.frame_heading + each.azimuth)
         off = (azimuth[:, None] - np.arange(_QUARTER) + 0.5 * _QUARTER) % _QUARTER - 0.5 * _QUARTER
-        peak = (1.0 - _OTHER_LINES) / (math.sqrt(2.0 * math.pi) * deviation)
+        peak = (1.0 - OTHER_LINES) / (math.sqrt(2.0 * math.pi) * deviation)
         kernel = (peak * np.exp(-0.5 * np.square(off / deviation))).astype(np.float32)
         # At least 0, by the highest density there is, as for fixtures.
-        other = _OTHER_LINES / _QUARTER
+        other = OTHER_LINES / _QUARTER
         cost += math.log(peak + other) - np.log(plan.wall_directions @ kernel.T + other)
     return cost / len(told)
