@@ -18,4 +18,4 @@ Begin with `localise/search/pipeline.py`, the path of a query. Importing this pa
 onnxruntime.
 """
 
-__version__ = "0.10.0"
+__version__ = "0.11.0"

@@ -56,8 +56,8 @@ class CalibrationConfig:
         seed: of the homes.
         textures: folder of material pictures; None makes all materials procedural.
         views: calibrate the encoder of views instead of that of spheres.
-        keep_evidence: keep the bundle's matching weights, except for a given `tail` or `openings_weight`, and fit the
-            confidence.
+        keep_evidence: keep the bundle's matching weights and fit the confidence; with a given `tail` or
+            `openings_weight`, keep the others, and fit the doubt of headings.
         openings_weight: weight of openings relative to walls; None fits it.
         tail: scale of the errors of walls over the predicted one; None keeps the bundle's.
         out: folder of the predictions, from which an interrupted calibration continues; None keeps none.
@@ -104,7 +104,7 @@ def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
     bundle = store_matching_weights(bundle, weights, views=views)
     _LOG.info("matching weights: %s", asdict(weights))
     known, searched = queries.answers(known=True), queries.answers(known=False)
-    if not config.keep_evidence:
+    if not (config.keep_evidence and config.openings_weight is None and config.tail is None):
         bundle = store_matching_weights(bundle, with_heading_doubt(weights, known, searched), views=views)
     description = (
         f"{len(known.own)} {'views' if views else 'panoramas'} of {config.homes} generated validation homes, all "
