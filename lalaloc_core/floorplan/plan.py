@@ -278,14 +278,11 @@ class FloorPlan:
     @cached_property
     def wall_directions(self) -> Float[np.ndarray, "rooms 90"]:
         """Share of the length of each room's walls by direction: azimuths in degrees, modulo 90."""
-        walls_m, count = self.geometry.walls_m, self.geometry.wall_count
-        along_m = walls_m[..., 2:] - walls_m[..., :2]
-        # Rows beyond the count are padding.
-        length_m = np.hypot(*np.moveaxis(along_m, -1, 0)) * (np.arange(walls_m.shape[1]) < count[:, None])
-        azimuth = np.arctan2(along_m[..., 0], along_m[..., 1])
-        degree = np.rint(np.degrees(azimuth)).astype(np.intp) % _DIRECTIONS
-        shares = np.zeros((len(self.rooms), _DIRECTIONS), np.float32)
-        np.add.at(shares, (np.arange(len(shares))[:, None], degree), length_m)
+        walls, shares = self.wall_table, np.zeros((len(self.rooms), _DIRECTIONS), np.float32)
+        along_m = walls.end_m - walls.start_m
+        degree = np.rint(np.degrees(np.arctan2(along_m[:, 0], along_m[:, 1]))).astype(np.intp) % _DIRECTIONS
+        room = np.repeat(np.arange(len(shares)), np.diff(walls.first))
+        np.add.at(shares, (room, degree), np.hypot(*along_m.T))
         return frozen(shares / shares.sum(axis=1, keepdims=True))
 
     @cached_property
