@@ -100,8 +100,7 @@ def likeliest(
         best.offer(every, cost if place_cost is None else cost + place_cost.of_poses(every))
         return best.ranked()
     table = CoarseTable(binned, matching_cost)
-    bound = table.bounds(binned, room_index)
-    bound = bound if place_cost is None else bound + place_cost.lowest
+    bound = table.bounds(binned, room_index, place_cost)
     possible = np.flatnonzero(np.isfinite(bound))
     # Short integers sort fastest.
     order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]

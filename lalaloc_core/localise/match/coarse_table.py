@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.localise.match.binned_layouts import OPENING_ROWS, BinnedLayouts
 from lalaloc_core.localise.match.matching_cost import MatchingCost
+from lalaloc_core.localise.match.place_cost import PlaceCost
 
 # Neighbouring hypotheses that share a bound.
 _NEIGHBOURS = 2
@@ -84,8 +85,10 @@ class CoarseTable:
         for trust in np.unique(number).tolist():
             yield np.flatnonzero(number == trust), trust
 
-    def bounds(self, binned: BinnedLayouts, room_index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return a lower bound of the cost of every pose over all δ and hypotheses."""
+    def bounds(
+        self, binned: BinnedLayouts, room_index: Int[np.ndarray, "n"], place_cost: PlaceCost | None = None
+    ) -> Float[np.ndarray, "n"]:
+        """Return a lower bound of the cost of every pose over all δ and hypotheses, with its place cost."""
         least = [_least(sector.walls.min(axis=1)) for sector in self._sectors if sector.length]
         openings = None if self._openings is None else [_least(table) for table in self._openings]
         # Every azimuth has one row of walls, and at most one of openings.
@@ -101,7 +104,10 @@ class CoarseTable:
             part = total[rows]
             if openings is not None:
                 part = part + binned.openings[rows] @ _floored(openings[trust], scale)
-            bound[rows] = (part / np.float32(scale) + without[trust]).min(axis=1)
+            by_neighbours = part / np.float32(scale) + without[trust]
+            if place_cost is not None:
+                by_neighbours = by_neighbours + place_cost.lowest(np.arange(len(binned))[rows], _NEIGHBOURS)
+            bound[rows] = by_neighbours.min(axis=1)
         # The costs themselves are rounded to single precision.
         return bound + self._room_costs.min(axis=0)[room_index] - 1e-5
 

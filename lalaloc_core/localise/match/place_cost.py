@@ -102,13 +102,18 @@ class PlaceCost:
         row, fixtures = _fixture_costs(plan, query, seen, position_m, room_index)
         room, directions = np.zeros(len(position_m), np.intp), np.zeros((1, 1), np.float32)
         if told:
-            room, directions = room_index, _direction_costs(plan, query, told)
+            # Candidates are in few rooms of a plan that can have thousands.
+            rooms, room = np.unique(room_index, return_inverse=True)
+            directions = _direction_costs(plan.wall_directions[rooms], query, told)
         return cls(hint, row, fixtures / temperature, room, directions / temperature)
 
-    @property
-    def lowest(self) -> Float[np.ndarray, "n"]:
-        """A lower bound of the cost of each pose under any hypothesis."""
-        return self.hint + self.fixtures.min(axis=1)[self.row] + self.directions.min(axis=1)[self.room]
+    def lowest(self, pose: Int[np.ndarray, "m"], neighbours: int) -> Float[np.ndarray, "m #l"]:
+        """Return lower bounds of the cost of some poses under each so many neighbouring hypotheses."""
+        fixtures, directions = (
+            np.minimum.reduceat(cost, np.arange(0, cost.shape[1], neighbours), axis=1)
+            for cost in (self.fixtures, self.directions)
+        )
+        return self.hint[pose, None] + fixtures[self.row[pose]] + directions[self.room[pose]]
 
     def of_poses(self, pose: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m #k"]:
         """Return the cost of some poses under every hypothesis, (m, 1) where it does not depend on that."""
@@ -194,9 +199,11 @@ def _agreement(
     return found
 
 
-def _direction_costs(plan: FloorPlan, query: Query, told: list[WallDirection]) -> Float[np.ndarray, "r k"]:
-    """Return the negative log likelihood (nats, at least 0) of the directions of walls in every room."""
-    cost = np.zeros((len(plan.rooms), len(query.roll)), np.float32)
+def _direction_costs(
+    walls: Float[np.ndarray, "r 90"], query: Query, told: list[WallDirection]
+) -> Float[np.ndarray, "r k"]:
+    """Return the negative log likelihood (nats, at least 0) of directions in rooms, by their `wall_directions`."""
+    cost = np.zeros((len(walls), len(query.roll)), np.float32)
     between = math.degrees(query.sector) / math.sqrt(12.0)
     for each in told:
         deviation = math.hypot(math.degrees(each.sd), _DIRECTION_SD, between)
@@ -206,5 +213,5 @@ def _direction_costs(plan: FloorPlan, query: Query, told: list[WallDirection]) -
         kernel = (peak * np.exp(-0.5 * np.square(off / deviation))).astype(np.float32)
         # At least 0, by the highest density there is, as for fixtures.
         other = OTHER_LINES / _QUARTER
-        cost += math.log(peak + other) - np.log(plan.wall_directions @ kernel.T + other)
+        cost += math.log(peak + other) - np.log(walls @ kernel.T + other)
     return cost / len(told)
