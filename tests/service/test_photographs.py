@@ -55,6 +55,9 @@ def test_phone_photograph_is_localised(client: httpx.Client, flat: str) -> None:
     assert view["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
     assert view["pitch"]["source"] == view["roll"]["source"] == "estimated"
     assert abs(view["pitch"]["value_deg"]) < 3.0
+    # The walls of the flat run along the axes of the plan.
+    walls_deg = answer["heading_deg"] + view["wall_direction"]["value_deg"]
+    assert abs((walls_deg + 45.0) % 90.0 - 45.0) < 5.0
     (arc,) = view["seen"]
     assert arc["to_deg"] - arc["from_deg"] == pytest.approx(67.0, abs=4.0)
     focal = view["camera"]["fx"]
@@ -76,6 +79,7 @@ def test_sphere_is_read_as_before(client: httpx.Client, flat: str) -> None:
     view = usual.json()["view"]
     assert (view["projection"], view["hfov"]["value_deg"], view["camera"]) == ("equirectangular", 360.0, None)
     assert view["seen"] == [{"from_deg": -180.0, "to_deg": 180.0}]
+    assert view["wall_direction"] is None
     assert view["advice"] is None
     both = client.post("/localise", data=data, files=[("panorama", content), ("photo", content)])
     assert assert_problem(both, 422, "invalid-request")["errors"][0]["field"] == "photo"
