@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from lalaloc_client.errors import problem_from
@@ -137,6 +137,8 @@ class ReadView:
         camera: camera model; None for full spheres and strips.
         seen: azimuths that the photographs behind the answer show.
         warnings: metadata that were ignored, and estimates to check.
+        wall_direction: azimuth of walls relative to the photograph's centre, up to quarter turns; None without lines,
+            for full spheres, and for services without this field.
     """
 
     projection: str
@@ -147,6 +149,7 @@ class ReadView:
     camera: Camera | None
     seen: tuple[SeenArc, ...]
     warnings: tuple[str, ...]
+    wall_direction: AssumedAngle | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

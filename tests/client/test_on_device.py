@@ -54,6 +54,11 @@ def test_photographs_stay_on_the_device(service: Any, home: str, cache: Path) ->
     assert {path.name for path in folder.iterdir()} == set(DEVICE_FILES) - {MANIFEST_NAME}
     found = service.localise_sequence(home, [KITCHEN, PHONE.read_bytes()], on_device=True, hfov_deg=None, refine="none")
     assert len(found.poses) == 2
+    sphere, phone = (pose.view.wall_direction for pose in found.poses)
+    assert sphere is None
+    # The phone looks to 335°, the walls run along the axes of the plan.
+    assert phone is not None
+    assert (phone.value_deg + 335.0 + 45.0) % 90.0 - 45.0 == pytest.approx(0.0, abs=3.0)
     with pytest.raises(OnDeviceError, match="hfov_deg is 900"):
         service.localise(home, PHONE, on_device=True, hfov_deg=900.0)
 
