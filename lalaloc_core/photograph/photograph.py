@@ -358,8 +358,8 @@ def photograph_of_picture(
         camera, tilt = replace(camera, elevation=pitch.value), 0.0
         small = camera.scaled(columns, rows)
     hfov = Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source)
-    # Strips are not turned by the tilt that others tell.
     walls = Assumed(value=attitude.yaw, sd=attitude.yaw_sd, source="estimated")
+    # Strips are not turned by the tilt that others tell.
     is_of_turn = overview == TURN_SIDE and not isinstance(camera, Around)
     overlapping = None
     if overview:

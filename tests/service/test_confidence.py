@@ -279,7 +279,7 @@ def test_plain_corridor_is_uncertain_along_only(shipped: httpx.Client, given: bo
 
 
 def test_unsure_answer_has_a_next_step_and_a_sure_one_none(shipped: httpx.Client, home: str) -> None:
-    wall = jpeg(take(sphere("living_room"), Perspective.of_hfov(480, 640, np.radians(53.0)), heading_deg=70.0))
+    wall = jpeg(take(sphere("living_room"), Perspective.of_hfov(480, 640, np.radians(53.0)), heading_deg=220.0))
     unsure = ask(shipped, home, wall, None, hfov_deg=53.0)
     assert unsure["confidence"] < 0.5 < 1.0 - unsure["probability_elsewhere"]
     step = unsure["view"]["next_step"]

@@ -3,9 +3,9 @@
 For each of some places the predictions of a model are drawn (`prediction_errors.py`) from the layout that the plan
 shows there, and searched for with the matching cost and the coarse pass of real queries. The share of draws whose
 answer is within 1 m is the probability. Lines of views tell the directions of walls as often as they are presumed to.
-Of openings that the plan draws in part (`FloorPlan.opening_trust`), some are
-moved: they exist elsewhere. Ceilings and room types, which weigh little, are left out, and so is pose
-refinement; `PredictionErrors.spread` is fitted to make up for both. Poses that fit equally well share the answer.
+Of openings that the plan draws in part (`FloorPlan.opening_trust`), some are moved: they exist elsewhere. Ceilings and
+room types, which weigh little, are left out, and so is pose refinement; `PredictionErrors.spread` is fitted to make up
+for both. Poses that fit equally well share the answer.
 
 The pose grids of large plans are coarser, so that the work is bounded. An answer on a grid of step s is then right
 within s.
@@ -205,7 +205,7 @@ class Searches:
         log_probability = errors.openings(kind, rng)
         prior = np.array(manifest.opening_prior if not views or manifest.view is None else manifest.view.opening_prior)
         height = CameraHeight(self._plan.camera_height_m)
-        directions = _directions(self._plan, places, between, rng)
+        directions = _directions(self._plan, places, between, rng) if views else [()] * len(places)
         for row in range(len(places)):
             unseen = ~_seen(columns, views, int(rng.integers(columns)))
             scale, probability = log_scale[row].astype(np.float32), log_probability[row]
@@ -219,20 +219,20 @@ class Searches:
                 height,
                 profile=profile.moved(shifts),
                 openings=PredictedOpenings(rolled(probability, shifts), prior),
-                wall_directions=(directions[row],) if views else (),
+                wall_directions=directions[row],
                 is_view=views > 0,
             )
 
 
 def _directions(
     plan: FloorPlan, places: PoseSet, heading: Float[np.ndarray, "n"], rng: np.random.Generator
-) -> list[WallDirection]:
-    """Return the directions of walls that lines tell at each place, some of which are of something else."""
+) -> list[tuple[WallDirection, ...]]:
+    """Return the direction of walls that lines tell at each place, some of which are of something else."""
     walls = np.radians(plan.wall_directions[places.room_index].argmax(axis=1)) - heading
     walls += rng.normal(0.0, _LINES_SD, len(places))
     is_other = rng.random(len(places)) < OTHER_LINES
     walls[is_other] = rng.uniform(0.0, 0.25 * TWO_PI, is_other.sum())
-    return [WallDirection(float(azimuth), _LINES_SD) for azimuth in walls]
+    return [(WallDirection(float(azimuth), _LINES_SD),) for azimuth in walls]
 
 
 def _as_built(
