@@ -14,7 +14,7 @@ import httpx
 import pypdfium2
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from lalaloc_core.bundle import default_bundle
 from tests.service.conftest import StartApp, upload
@@ -204,6 +204,27 @@ def test_album_of_a_venue_shows_the_plan_of_each_pin(desktop: Visit) -> None:
     desktop.client.delete(f"/venues/{venue['id']}")
     for plan_id in (upper, lower):
         desktop.client.delete(f"/floorplans/{plan_id}")
+
+
+def test_venue_that_is_chosen_while_the_first_plan_loads_stays(desktop: Visit) -> None:
+    plan_id = upload(desktop.client, FLAT | {"name": "Slow"})
+    plans = [{"floorplan_id": plan_id, "level": 0}]
+    venue = desktop.client.post("/venues", json={"name": "House", "plans": plans}).json()
+    held = list[Route]()
+    # The page loads the newest plan at first.
+    desktop.page.route(f"**/floorplans/{plan_id}", lambda route: route.continue_() if held else held.append(route))
+    page = desktop.open("/pin")
+    page.locator("#plan-choice").select_option(f"venue:{venue['id']}")
+    expect(page.locator("#level-choice option")).to_have_count(1)
+    expect(page.locator("#level-choice")).to_be_visible()
+    (first,) = held
+    with page.expect_response(f"**/floorplans/{plan_id}"):
+        first.continue_()
+    expect(page.locator("#plan .room")).to_have_count(len(FLAT["rooms"]))
+    expect(page.locator("#level-choice")).to_be_visible()
+    desktop.page.unroute_all()
+    desktop.client.delete(f"/venues/{venue['id']}")
+    desktop.client.delete(f"/floorplans/{plan_id}")
 
 
 def test_photographs_stay_on_the_device(browser: Browser, service: httpx.Client) -> None:

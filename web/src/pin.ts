@@ -5,9 +5,9 @@ import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
 import { clearError, InputError, say, showError } from "./notices";
-import { type CardActions, cardOf, movedOf, sureOf } from "./pin_card";
+import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
-import { Floors, type Row } from "./pin_floors";
+import { choicesOf, Floors, type Row } from "./pin_floors";
 import { type PinActions, pinOf } from "./pin_map";
 import { added, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
@@ -45,6 +45,7 @@ class PinPage {
   private readonly cards = new Map<string, Drawn<HTMLElement>>();
   private readonly drawnPins = new Map<string, Drawn<SVGElement | null>>();
   private shown: string | null = null;
+  private requests = 0;
   private title = "";
   private reading = "";
   private waiting: File[] = [];
@@ -79,19 +80,7 @@ class PinPage {
   /** List plans and venues; show the album that the address names, or the newest plan. */
   private async begin(): Promise<void> {
     const [{ floorplans }, { venues }] = await Promise.all([api.plans(), api.venues()]);
-    const option = (kind: string, id: string, name: string) => h("option", { value: `${kind}:${id}` }, name);
-    const list = (label: string, options: HTMLElement[]) => options.length > 0 && h("optgroup", { label }, ...options);
-    show(
-      this.choice,
-      list(
-        "Plans",
-        floorplans.map((plan) => option("plan", plan.id, plan.name)),
-      ),
-      list(
-        "Venues",
-        venues.map((venue) => option("venue", venue.id, venue.name)),
-      ),
-    );
+    show(this.choice, choicesOf("Plans", "plan", floorplans), choicesOf("Venues", "venue", venues));
     const id = named("album");
     if (id !== null) {
       const album = await api.album(id);
@@ -100,7 +89,7 @@ class PinPage {
       this.choice.value = place;
       this.album = album;
       await this.follow();
-    } else if (floorplans.length > 0) await this.take(await api.plan(floorplans[0]!.id));
+    } else if (floorplans.length > 0) await this.choose(`plan:${floorplans[0]!.id}`);
   }
 
   private onFiles(id: string, act: (files: File[]) => Promise<void>): void {
@@ -121,30 +110,44 @@ class PinPage {
     }
   }
 
+  /** Begin a choice; the returned function says whether it is still the last one: answers can overtake each other. */
+  private request(): () => boolean {
+    const number = ++this.requests;
+    return () => number === this.requests;
+  }
+
   private async choose(value: string): Promise<void> {
-    const [kind, id] = value.split(":") as [string, string];
-    if (kind === "plan") return this.take(await api.plan(id));
-    const [venue, first] = await Promise.all([api.venue(id), this.floors.takeVenue(id)]);
+    const isLast = this.request(),
+      [kind, id] = value.split(":") as [string, string];
+    if (kind === "plan") return this.take(await api.plan(id), isLast);
+    const [venue, { plans }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
+    if (!isLast()) return;
+    const first = this.floors.takeVenue(id, plans);
     if (first === null) throw new InputError(`The venue ${venue.name} has no plans.`);
-    await this.reset(venue.name, first);
+    await this.reset(venue.name, first, isLast);
   }
 
   private async upload(file: File): Promise<void> {
-    const before = this.shown;
+    const before = this.shown,
+      isLast = this.request();
     this.shown = null; // Photographs that are chosen meanwhile wait for this plan.
     const plan = await api.uploadPlan(file).finally(() => (this.shown = before));
     this.choice.prepend(h("option", { value: `plan:${plan.id}` }, plan.name));
+    if (!isLast()) return;
     this.choice.selectedIndex = 0;
-    await this.take(plan);
+    await this.take(plan, isLast);
   }
 
-  private async take(plan: Plan): Promise<void> {
+  private async take(plan: Plan, isLast: () => boolean): Promise<void> {
+    if (!isLast()) return;
     await this.floors.takePlan(plan);
-    await this.reset(plan.name, plan.id);
+    await this.reset(plan.name, plan.id, isLast);
   }
 
-  /** Begin another album in a plan or venue. */
-  private async reset(title: string, planId: string): Promise<void> {
+  /** Begin another album in a plan or venue, unless another one was chosen meanwhile. */
+  private async reset(title: string, planId: string, isLast: () => boolean): Promise<void> {
+    await this.floors.load([planId]);
+    if (!isLast()) return;
     this.title = title;
     this.album = null;
     this.rows = [];
@@ -381,11 +384,7 @@ class PinPage {
   /** Show the plan of a photograph, and mark its pin and card. */
   private mark(row: Row): void {
     const planId = row.pin?.place?.floorplan_id;
-    const marked = (): void => {
-      for (const element of document.querySelectorAll(".current")) element.classList.remove("current");
-      for (const id of [`pin-${row.number}`, `card-${row.number}`])
-        document.getElementById(id)?.classList.add("current");
-    };
+    const marked = (): void => markCurrent(row.number);
     if (planId && planId !== this.shown && this.filter.value === "") void this.showPlan(planId).then(marked);
     else marked();
   }

@@ -146,3 +146,9 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
   card.addEventListener("focusin", () => act.show(row));
   return h("li", { class: pin?.state ?? "waiting" }, card);
 }
+
+/** Mark the pin and the card of a photograph, by its number, as the current ones. */
+export function markCurrent(number: number): void {
+  for (const element of document.querySelectorAll(".current")) element.classList.remove("current");
+  for (const id of [`pin-${number}`, `card-${number}`]) document.getElementById(id)?.classList.add("current");
+}

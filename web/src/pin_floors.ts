@@ -1,7 +1,7 @@
 /** Plans that pins lie in: that of the album, or those of its venue, which are loaded when they are needed. */
 
 import { api } from "./api";
-import { s } from "./dom";
+import { h, s } from "./dom";
 import { boxOf, path } from "./plan_drawing";
 import type { Layout, Plan, RoomLayout } from "./types";
 import { planLabel } from "./venues";
@@ -13,6 +13,12 @@ export type PinnedAt = Schemas["PinPlace"];
 export interface Floor {
   plan: Plan;
   layout: Layout;
+}
+
+/** Return a group of a list of plans and venues; false if it is empty. */
+export function choicesOf(label: string, kind: string, places: { id: string; name: string }[]): HTMLElement | false {
+  const options = places.map(({ id, name }) => h("option", { value: `${kind}:${id}` }, name));
+  return options.length > 0 && h("optgroup", { label }, ...options);
 }
 
 export class Floors {
@@ -29,9 +35,8 @@ export class Floors {
     await this.put(plan);
   }
 
-  /** Begin with a venue; return the id of its first plan. */
-  async takeVenue(id: string): Promise<string | null> {
-    const { plans } = await api.venuePlans(id);
+  /** Begin with a venue and its plans; return the id of the first one. */
+  takeVenue(id: string, plans: Schemas["VenuePlanList"]["plans"]): string | null {
     this.venue = id;
     this.levels = plans;
     this.loaded.clear();
