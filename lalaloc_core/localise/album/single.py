@@ -81,13 +81,14 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
     best = np.empty((len(searched.poses), len(query.roll)), np.float32)
     heights = np.full(len(OFFSETS), -np.inf)
     trusts = searched.plan.class_trusts[1][searched.poses.room_index]
+    pose = np.arange(len(best))
+    places = PlaceCost.of(searched.plan, query, NO_HINTS, 1.0, searched.poses.position_m, searched.poses.room_index)
     for part, log in compared.log_likelihoods(searched.binned, trusts):
         log -= ceilings[searched.poses.room_index[part], None, :]
         heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(OFFSETS))])
         best[part] = log.max(axis=2)
-    fixtures = PlaceCost.of(searched.plan, query, NO_HINTS, 1.0, searched.poses.position_m, searched.poses.room_index)
-    if fixtures is not None:
-        best -= fixtures.of_poses(np.arange(len(best)))
+        if places is not None:
+            best[part] -= places.of_poses(pose[part])
     kept = _kept(best, searched.poses.room_index, len(searched.plan.rooms))
     pose, hypothesis = np.divmod(kept, best.shape[1])
     return {

@@ -336,7 +336,7 @@ def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
     faults = {
         "hfov": not 0.0 < header.hfov.value_deg <= 360.0,
         "pitch and roll": max(abs(header.pitch.value_deg), abs(header.roll.value_deg)) > 180.0,
-        "wall_direction": walls is not None and abs(walls.value_deg) > 360.0,
+        "wall_direction": walls is not None and not (header.patches and abs(walls.value_deg) <= 360.0),
         "std_deg": any(not 0.0 <= angle.std_deg <= 180.0 for angle in angles if angle is not None),
         "seen_deg": not (-360.0 <= first_deg < last_deg <= 360.0 and last_deg - first_deg <= 360.0),
         "compass_deg": header.compass_deg is not None and abs(header.compass_deg) > 360.0,

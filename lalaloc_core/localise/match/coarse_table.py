@@ -19,6 +19,8 @@ from lalaloc_core.localise.match.place_cost import PlaceCost
 
 # Neighbouring hypotheses that share a bound.
 _NEIGHBOURS = 2
+# Poses whose bounds are computed at a time: those of the largest plans would take hundreds of megabytes.
+_BOUNDED = 2**15
 # Sums of bounds stay below this, close to the largest short integer.
 MAX_SUM = 30_000
 
@@ -100,14 +102,17 @@ class CoarseTable:
         for (rows, first), part in zip(told, least, strict=True):
             _add_around(total, rows @ _floored(part, scale), first // _NEIGHBOURS)
         bound, without = np.empty(len(binned), np.float32), _least(self._without_openings)
+        every = np.arange(len(binned))
         for rows, trust in self._by_trust(room_index):
-            part = total[rows]
+            part, pose = total[rows], every[rows]
             if openings is not None:
                 part = part + binned.openings[rows] @ _floored(openings[trust], scale)
-            by_neighbours = part / np.float32(scale) + without[trust]
-            if place_cost is not None:
-                by_neighbours = by_neighbours + place_cost.lowest(np.arange(len(binned))[rows], _NEIGHBOURS)
-            bound[rows] = by_neighbours.min(axis=1)
+            for first in range(0, len(pose), _BOUNDED):
+                some = slice(first, first + _BOUNDED)
+                by_neighbours = part[some] / np.float32(scale) + without[trust]
+                if place_cost is not None:
+                    by_neighbours = by_neighbours + place_cost.lowest(pose[some], _NEIGHBOURS)
+                bound[pose[some]] = by_neighbours.min(axis=1)
         # The costs themselves are rounded to single precision.
         return bound + self._room_costs.min(axis=0)[room_index] - 1e-5
 
