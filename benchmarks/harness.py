@@ -108,11 +108,7 @@ def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[tup
 
 
 def wait_until(is_true: Callable[[], bool], condition: str, timeout_s: float, pause_s: float = 0.05) -> None:
-    """Wait until a condition holds.
-
-    Raises:
-        TimeoutError: it does not within `timeout_s`.
-    """
+    """Wait until a condition holds."""
     deadline = time.monotonic() + timeout_s
     while not is_true():
         if time.monotonic() > deadline:

@@ -308,12 +308,7 @@ def _latency(durations_s: Sequence[float]) -> Latency:
 
 @contextmanager
 def _flood(url: str, template: Template, load: Load) -> Iterator[tuple[dict[str, int], Callable[[], bool]]]:
-    """Repeat a load in another process.
-
-    Yields:
-        The number of answers by status, filled when the block ends; and a function that tells whether there are any but
-        those for too many requests.
-    """
+    """Repeat a load in another process."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     # The work itself cannot be sent to a process, so its place in the table is.

@@ -99,11 +99,7 @@ def _localise_photograph(client: Client, plan_id: str, truth: TruePose) -> Panel
 
 
 def check_localisation(localisation: Localisation) -> None:
-    """Check that a localisation passed every stage and contains only finite numbers.
-
-    Raises:
-        StageMissingError: a stage, the candidates or a number is missing.
-    """
+    """Check that a localisation passed every stage and contains only finite numbers."""
     if localisation.stage != "lpo":
         raise StageMissingError(f"the localisation ends at stage '{localisation.stage}', not at 'lpo'")
     if not localisation.candidates:

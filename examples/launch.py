@@ -37,9 +37,6 @@ def running_service(port: int, environment: Mapping[str, str], checkout: Path = 
     """Run the service at 127.0.0.1 until the block ends, on `port`, 0 for a free one. It logs to standard error.
 
     `environment` adds to the variables of this process; the service runs in the folder `checkout`.
-
-    Raises:
-        ServiceFailedError: the service ended, or was not ready in time.
     """
     command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
     variables = {**os.environ, **environment}

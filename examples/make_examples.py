@@ -143,11 +143,7 @@ def example_home() -> Home:
 
 
 def openings_of(plan: FloorPlan, hole: Hole) -> list[Opening]:
-    """Return the hole as an opening of each room beside it.
-
-    Raises:
-        ValueError: no wall runs along the hole.
-    """
+    """Return the hole as an opening of each room beside it."""
     sides = list(_walls_beside(plan, hole))
     if not sides:
         raise ValueError(f"no wall runs along {hole}; the limit is {_WALL_REACH_M:g} m to a wall")

@@ -67,11 +67,7 @@ def _fill(part: re.Match[str]) -> str:
 
 
 def folder_map() -> str:
-    """Return a Markdown table of all packages, with summary and first file from their docstrings, and other folders.
-
-    Raises:
-        FileNotFoundError: the first file of a folder does not exist.
-    """
+    """Return a Markdown table of all packages, with summary and first file from their docstrings, and other folders."""
     rows = []
     for package in _PACKAGES:
         for path in sorted((ROOT / package).rglob("__init__.py"), key=lambda path: path.parent):

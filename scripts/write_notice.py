@@ -55,11 +55,7 @@ def licence_of(name: str) -> str | None:
 
 
 def notice_text() -> str:
-    """Return NOTICE as it should be.
-
-    Raises:
-        ValueError: a package is neither installed nor listed.
-    """
+    """Return NOTICE as it should be."""
     text = NOTICE.read_text(encoding="utf-8")
     before, _, rest = text.partition(_BEGIN)
     listed, _, after = rest.partition(_END)

@@ -108,10 +108,6 @@ def start_runtime(
         telemetry: metrics and tracing.
         cleanup: closes the components, also if the start fails.
         backends: builders of the components that can run in other processes.
-
-    Raises:
-        ConfigError: the data folder or the database cannot be used.
-        BundleError: the model bundle is missing or damaged.
     """
     cleanup.callback(sys.setswitchinterval, sys.getswitchinterval())
     sys.setswitchinterval(_SWITCH_INTERVAL_S)

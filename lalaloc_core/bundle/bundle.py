@@ -27,11 +27,7 @@ class Bundle:
 
     @classmethod
     def open(cls, folder: Path) -> Bundle:
-        """Read the manifest of a bundle; files are checked when they are read.
-
-        Raises:
-            BundleError: the manifest is missing or not valid.
-        """
+        """Read the manifest of a bundle; files are checked when they are read."""
         path = folder / MANIFEST_NAME
         try:
             text = path.read_text(encoding="utf-8")
@@ -45,11 +41,7 @@ class Bundle:
         return cls(folder, manifest, manifest.sha256)
 
     def check(self) -> None:
-        """Check size and digest of every file.
-
-        Raises:
-            BundleError: a file is missing or altered.
-        """
+        """Check size and digest of every file."""
         for name in self.manifest.files:
             self.read(name)
 

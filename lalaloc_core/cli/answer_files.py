@@ -32,11 +32,7 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_file_options(arguments: argparse.Namespace, plan: FloorPlan) -> None:
-    """Refuse files that could not be written, before the work begins.
-
-    Raises:
-        InvalidInputError: the map is neither PNG nor SVG, or the plan has no place on Earth.
-    """
+    """Refuse files that could not be written, before the work begins."""
     if arguments.map is not None:
         check_picture_name(arguments.map, "--map")
     if arguments.geojson is not None and plan.anchor is None:
@@ -59,9 +55,6 @@ def write_files(
         plan: the plan.
         answers: documents of the answers; one that failed has `photograph` and `error` alone.
         places: name and camera of the photographs that were found, for the map.
-
-    Raises:
-        InvalidInputError: a file cannot be written.
     """
     from lalaloc_core.draw.plan_overlays import draw_places
 

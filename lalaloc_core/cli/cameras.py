@@ -66,11 +66,7 @@ def _intrinsics(text: str) -> Intrinsics:
 
 
 def stated_camera(arguments: argparse.Namespace) -> StatedCamera:
-    """Return the statements of `add_camera_options`.
-
-    Raises:
-        InvalidPhotographError: a value is out of range, or two values exclude each other.
-    """
+    """Return the statements of `add_camera_options`."""
     from lalaloc_core.photograph import StatedCamera
 
     stated = StatedCamera(

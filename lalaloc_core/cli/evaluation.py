@@ -212,11 +212,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 
 def _check_options(arguments: argparse.Namespace) -> None:
-    """Check that the options of `evaluate` belong together.
-
-    Raises:
-        InvalidInputError: one is for other data, queries or methods.
-    """
+    """Check that the options of `evaluate` belong together."""
     method, kind = arguments.method, arguments.kind
     photographs = kind == "panorama" and method == "lalaloc"
     if arguments.data is None and arguments.dataset is not None:

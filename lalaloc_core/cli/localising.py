@@ -136,11 +136,7 @@ def _localise(arguments: argparse.Namespace) -> None:
 
 
 def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamera) -> Iterator[_Found]:
-    """Yield the answers in the order of the photographs, with a progress bar on a terminal.
-
-    Raises:
-        InvalidPhotographError: the only photograph is invalid; one of several becomes an answer with an error.
-    """
+    """Yield the answers in the order of the photographs, with a progress bar on a terminal."""
     from tqdm import tqdm
 
     from lalaloc_core.bundle import Bundle
@@ -178,11 +174,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamer
 
 
 def _opened(content: bytes, model: LocalModel, bundle: Bundle, stated: StatedCamera) -> Photograph:
-    """Return a photograph, or the one whose features a file has.
-
-    Raises:
-        InvalidPhotographError: it cannot be read, or options about the camera are given with features.
-    """
+    """Return a photograph, or the one whose features a file has."""
     from lalaloc_core.localise.encode.features import is_features, read_features
     from lalaloc_core.photograph import StatedCamera
 
@@ -225,11 +217,7 @@ def _model_document(bundle: Bundle) -> dict[str, str]:
 
 
 def _turn_answer(arguments: argparse.Namespace, plan: FloorPlan, stated: StatedCamera) -> _Found:
-    """Return the answer for a turn, with the angles of its photographs.
-
-    Raises:
-        InvalidInputError: the film or the photographs cannot be read, or options do not go with a turn.
-    """
+    """Return the answer for a turn, with the angles of its photographs."""
     from tqdm import tqdm
 
     from lalaloc_core.bundle import Bundle

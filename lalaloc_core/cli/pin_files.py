@@ -121,11 +121,7 @@ def _pose_fields(pose: PinPose | None) -> dict[str, Any]:
 
 
 def read_previous(path: Path) -> list[Pin]:
-    """Read the pins of an earlier run.
-
-    Raises:
-        InvalidInputError: the file cannot be read, or is not a `pins.json`.
-    """
+    """Read the pins of an earlier run."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         return [_pin_of(entry) for entry in document["photographs"] if entry["sha256"] is not None]

@@ -80,11 +80,7 @@ def _pin(arguments: argparse.Namespace) -> None:
 
 
 def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:
-    """Return the files of a folder that can be photographs, sorted by name, and notes on what is left out.
-
-    Raises:
-        InvalidInputError: there is no such folder, there are none in it, or more than the limit.
-    """
+    """Return the files of a folder that can be photographs, sorted by name, and notes on what is left out."""
     from lalaloc_core.localise.album.solve import MAX_PHOTOGRAPHS
 
     try:

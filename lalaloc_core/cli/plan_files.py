@@ -42,11 +42,7 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
 
 
 def read_plans(file: Path, arguments: argparse.Namespace, trace: Trace | None = None) -> tuple[ImportedPlan, ...]:
-    """Read the plans in a file, one for each level; `trace` receives what is read from a drawing.
-
-    Raises:
-        InvalidFloorPlanError: the file cannot be read or is not a plan.
-    """
+    """Read the plans in a file, one for each level; `trace` receives what is read from a drawing."""
     from lalaloc_core.importers import ImportOptions, building_name, import_plans
 
     values = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
@@ -87,11 +83,7 @@ def _content(file: Path) -> bytes:
 
 
 def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
-    """Read the only plan in a file.
-
-    Raises:
-        InvalidFloorPlanError: the file cannot be read, or has several levels.
-    """
+    """Read the only plan in a file."""
     plan, *others = read_plans(file, arguments)
     if others:
         raise InvalidFloorPlanError(f"the file has {1 + len(others)} levels; choose one with --level")
@@ -99,11 +91,7 @@ def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
 
 
 def write_picture(svg: str, out: Path, option: str = "--out") -> None:
-    """Write a drawing as SVG or PNG, by the file's suffix.
-
-    Raises:
-        InvalidInputError: another suffix, or the file cannot be written.
-    """
+    """Write a drawing as SVG or PNG, by the file's suffix."""
     from lalaloc_core.draw import rasterise
 
     check_picture_name(out, option)
@@ -114,11 +102,7 @@ def write_picture(svg: str, out: Path, option: str = "--out") -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, its line ends as they are.
-
-    Raises:
-        InvalidInputError: the file cannot be written.
-    """
+    """Write a text file, its line ends as they are."""
     try:
         path.write_text(text, encoding="utf-8", newline="")
     except OSError as error:
@@ -126,10 +110,6 @@ def write_text(path: Path, text: str) -> None:
 
 
 def check_picture_name(out: Path, option: str = "--out") -> None:
-    """Refuse a picture file with another suffix than .svg or .png.
-
-    Raises:
-        InvalidInputError: another suffix.
-    """
+    """Refuse a picture file with another suffix than .svg or .png."""
     if out.suffix.lower() not in (".svg", ".png"):
         raise InvalidInputError(f"the picture's file is '{out.name}'; it must end in .png or .svg ({option})")

@@ -121,11 +121,7 @@ def _track(arguments: argparse.Namespace) -> None:
 
 
 def _photographs(folder: Path) -> list[tuple[float, Path]]:
-    """Return times (s) and files of photographs, by rising time.
-
-    Raises:
-        InvalidInputError: there are none, or a name is no time.
-    """
+    """Return times (s) and files of photographs, by rising time."""
     try:
         files = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
     except OSError as error:

@@ -186,11 +186,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _check_train_options(arguments: argparse.Namespace) -> None:
-    """Check that the options of `train` belong together.
-
-    Raises:
-        InvalidInputError: one is for other data or stages.
-    """
+    """Check that the options of `train` belong together."""
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
     if arguments.data is None and arguments.skip_bad:

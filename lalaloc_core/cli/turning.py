@@ -44,11 +44,7 @@ class Turn:
 
 
 def read_turn(path: Path, manifest: Manifest, stated: StatedCamera) -> Turn:
-    """Read a film, or the photographs of a folder in the order of their names.
-
-    Raises:
-        InvalidInputError: the film or a photograph cannot be read, or the folder has too few or too many photographs.
-    """
+    """Read a film, or the photographs of a folder in the order of their names."""
     if not path.is_dir():
         try:
             film = read_film(content_of(path), stated=stated, patch_size=patch_size(manifest))

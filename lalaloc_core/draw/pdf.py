@@ -47,9 +47,6 @@ def write_pdf(pages: Iterable[str], path: Path, dpi: int) -> None:
         pages: the drawings; only one is rasterised at a time.
         path: the file.
         dpi: pixels of the drawings per inch.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     document = pypdfium2.PdfDocument.new()
     try:

@@ -30,9 +30,6 @@ def read_anchor(raw: Any, north_deg: float | None, rooms: Sequence[Room]) -> Anc
     """Read the anchor of a plan, None if it has none.
 
     `raw` is the value of the document's `anchor`, and `north_deg` the plan's own, None if it has none.
-
-    Raises:
-        InvalidFloorPlanError: an invalid value, control points that do not fit, or a plan far from its origin.
     """
     if raw is None:
         return None

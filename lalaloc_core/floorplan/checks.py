@@ -19,11 +19,7 @@ _MAX_WORK, _FEW = 100_000, 400
 
 
 def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
-    """Refuse a plan that is too large, such as one drawn in millimetres.
-
-    Raises:
-        InvalidFloorPlanError: extent, floor area or bounding boxes exceed the limits.
-    """
+    """Refuse a plan that is too large, such as one drawn in millimetres."""
     corners = np.concatenate([room.polygon_m for room in rooms])
     extent = float(np.ptp(corners, axis=0).max())
     if extent > limits.max_extent_m:

@@ -45,11 +45,7 @@ class FixturePlaces:
 
 
 def read_fixtures(raw: Any, limits: PlanLimits) -> tuple[Fixture, ...]:
-    """Read the fixtures of a plan.
-
-    Raises:
-        InvalidFloorPlanError: a fixture is invalid, or there are too many.
-    """
+    """Read the fixtures of a plan."""
     entries = read_list([] if raw is None else raw, "fixtures", limits.max_openings, "LALALOC_MAX_OPENINGS")
     vertices = 0
     fixtures = []

@@ -147,9 +147,6 @@ def place_openings(
 
     Returns:
         faces of the openings, and the indices of openings that lie on no wall.
-
-    Raises:
-        InvalidFloorPlanError: openings overlap, or a room or an opening has too many faces.
     """
     if not openings:
         return (), ()

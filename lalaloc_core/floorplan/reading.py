@@ -43,11 +43,7 @@ TOLERANCES_M = (0.01, 1.5)
 
 
 def read_rooms(raw_rooms: Any, default_ceiling_m: float | None, limits: PlanLimits) -> tuple[Room, ...]:
-    """Read all rooms of a plan and give ids to rooms without one.
-
-    Raises:
-        InvalidFloorPlanError: a room is invalid, or there are too many rooms or vertices.
-    """
+    """Read all rooms of a plan and give ids to rooms without one."""
     if not isinstance(raw_rooms, list) or not raw_rooms:
         raise InvalidFloorPlanError("'rooms' must be a list of at least one room")
     if len(raw_rooms) > limits.max_rooms:
@@ -207,11 +203,7 @@ def _unique_ids(rooms: Sequence[Room]) -> list[str]:
 
 
 def read_openings(raw: Any, rooms: Sequence[Room], limits: PlanLimits) -> tuple[Opening, ...]:
-    """Read the openings of a plan with these rooms.
-
-    Raises:
-        InvalidFloorPlanError: an opening is invalid, or there are too many.
-    """
+    """Read the openings of a plan with these rooms."""
     entries = read_list([] if raw is None else raw, "openings", limits.max_openings, "LALALOC_MAX_OPENINGS")
     ids = {room.id for room in rooms}
     return tuple(_read_opening(entry, f"opening {index}", ids, limits) for index, entry in enumerate(entries))
@@ -221,9 +213,6 @@ def read_opening_trust(document: Mapping[str, Any], openings: Sequence[Opening])
     """Read the positive trusts in a plan's kinds of openings.
 
     `opening_kinds` lists kinds with a trust of 1, by default those that occur and are not in `opening_trust`.
-
-    Raises:
-        InvalidFloorPlanError: a kind is unknown, or a trust is not a probability.
     """
     raw = document.get("opening_trust")
     if raw is not None and not isinstance(raw, Mapping):

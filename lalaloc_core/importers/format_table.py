@@ -65,12 +65,7 @@ class Format:
         return self._call("read", "reading", source, options, budget)
 
     def write(self, document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
-        """Return a plan as a file of this format.
-
-        Raises:
-            InvalidFloorPlanError: the plan lacks something that the format requires.
-            MissingExtraError: a library of the format is not installed.
-        """
+        """Return a plan as a file of this format."""
         return self._call("write", "writing", document, anchor)
 
     def _call(self, function: str, activity: str, *arguments: Any) -> Any:

@@ -127,7 +127,6 @@ def import_plan(
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
-        MissingExtraError: a library of its format is not installed.
         SeveralLevelsError: the file has several storeys and the option `level` is not set.
     """
     plans = import_plans(content, options, limits, building=building, on_step=on_step)
@@ -147,9 +146,6 @@ def import_if_native(
 
     `building` names the plan if the file does not. No library of another format is loaded, so a caller can leave the
     other formats to a worker process.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid JSON or an invalid plan.
     """
     if not is_json(content):
         return None
@@ -167,10 +163,6 @@ def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> b
     """Return a plan as a file. Equal plans give equal bytes, whenever and wherever they are written.
 
     `anchor` places the plan's origin on Earth for IMDF and GeoJSON; by default it is the plan's own.
-
-    Raises:
-        InvalidFloorPlanError: unknown format, or a missing anchor.
-        MissingExtraError: a library of the format is not installed.
     """
     if format not in EXPORT_FORMATS:
         raise InvalidFloorPlanError(f"format is '{format}'; set it to one of {', '.join(EXPORT_FORMATS)}")
@@ -178,11 +170,7 @@ def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> b
 
 
 def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) -> str:
-    """Return the name of a file's format, a key of `FORMATS`. Every zip archive counts as IMDF.
-
-    Raises:
-        InvalidFloorPlanError: the format is unknown or not supported.
-    """
+    """Return the name of a file's format, a key of `FORMATS`. Every zip archive counts as IMDF."""
     if is_json(content):
         return _json_format(read_json(content, limits.max_depth, limits.max_json_values)).name
     return _format_by_magic(content).name

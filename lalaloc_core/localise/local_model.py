@@ -54,11 +54,7 @@ class LocalModel:
     def open_turn(
         self, contents: Sequence[bytes], stated: StatedCamera | None = None
     ) -> tuple[list[Photograph], list[TurnAngles]]:
-        """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells.
-
-        Raises:
-            InvalidPhotographError: a photograph cannot be read, or is a sphere.
-        """
+        """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells."""
         manifest = self.bundle.manifest
         return open_turn(
             contents, stated or StatedCamera(), sphere_size=sphere_size(manifest), patch_size=patch_size(manifest)

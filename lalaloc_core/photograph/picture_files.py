@@ -103,9 +103,6 @@ def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Picture
     """Open a JPEG, PNG, WebP or HEIC file (the first picture of several) whose pixels are not decoded yet.
 
     Errors of decoding within the context are translated, too.
-
-    Raises:
-        InvalidPhotographError: empty, unsupported format, damaged, too large, too many segments or scans.
     """
     if not content:
         raise InvalidPhotographError("the photograph is empty; if it is still in a cloud, download it first")
@@ -173,9 +170,6 @@ def scaled(file: PictureFile, size: tuple[int, int], *, oversampling: int = 2) -
         file: file of `opened_picture`.
         size: width and height of the upright picture.
         oversampling: least ratio of the decoded to the requested size, for pictures that are large enough.
-
-    Raises:
-        InvalidPhotographError: most of the picture is missing.
     """
     image, stored_size = file.image, turned(size, file.orientation)
     # JPEGs can be decoded directly at a fraction of their size.

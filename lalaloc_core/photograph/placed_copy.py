@@ -65,9 +65,6 @@ def placed_copy(content: bytes, place: Place, limits: PhotographLimits | None = 
     """Return a copy of a picture file with a place.
 
     Positions and directions that the file states are replaced, keywords are added to its own.
-
-    Raises:
-        InvalidPhotographError: the file is no readable picture.
     """
     with opened_picture(content, limits or PhotographLimits()) as file:
         kind, exif = file.image.format, file.exif

@@ -100,9 +100,6 @@ def find_lens(
         looks_spherical: `is_sphere` of the picture; called only if nothing else decides.
         orientation: Exif orientation of the stored picture.
         closes: `is_closed` of the picture; called only for a strip whose metadata state 360°.
-
-    Raises:
-        InvalidPhotographError: a statement is invalid, or nothing says what the picture shows.
     """
     stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)

@@ -132,12 +132,7 @@ def camera_of_hfov(projection: Projection, width: int, height: int, hfov: float)
 def camera_of_intrinsics(
     projection: Literal["perspective", "fisheye"], width: int, height: int, intrinsics: Intrinsics
 ) -> Camera:
-    """Return the camera of checked intrinsics.
-
-    Raises:
-        InvalidPhotographError: the optical centre is outside of the picture, the field of view is out of range, or the
-            distortion folds the picture.
-    """
+    """Return the camera of checked intrinsics."""
     centre: list[float] = []
     for name, value, side in (("cx", intrinsics.cx, width), ("cy", intrinsics.cy, height)):
         position = 0.5 * side if value is None else value + _HALF_PIXEL

@@ -27,11 +27,7 @@ _LEAST_STD_DEG = 0.5
 def open_turn(
     contents: Sequence[bytes], stated: StatedCamera, *, sphere_size: tuple[int, int], patch_size: PatchSize | None
 ) -> tuple[list[Photograph], list[TurnAngles]]:
-    """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells.
-
-    Raises:
-        InvalidPhotographError: a photograph cannot be read, or is a sphere.
-    """
+    """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells."""
     read = partial(open_photograph, sphere_size=sphere_size, patch_size=patch_size)
     photographs = [read(content, stated=stated, overview=TURN_SIDE) for content in contents]
     if any(photograph.overview is None for photograph in photographs):

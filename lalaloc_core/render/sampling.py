@@ -43,9 +43,6 @@ def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = l
 
     A room too small or narrow for any lattice point gets one interior pose, so that no room is missing. `after_room` is
     called after each room; an exception that it raises ends the computation.
-
-    Raises:
-        InvalidInputError: `step_m` is not positive.
     """
     if not step_m > 0.0:
         raise InvalidInputError(f"the grid step is {step_m} m; it must be positive (step_m)")

@@ -24,10 +24,6 @@ def stored_correction(
         plan_id: plan of the room or position; None where it is unknown.
         plan: that plan.
         pin: the pin of the photograph; None before the first solution.
-
-    Raises:
-        InvalidRequestError: the plan is unknown or has no such room or place, or there is no pin to confirm.
-        InvalidCorrectionError: a number is out of range.
     """
     if document.elsewhere:
         return _text(Correction(kind="elsewhere"))

@@ -201,11 +201,7 @@ class AlbumSolver:
         await self._call(job.album.tenant, lambda: finish(job, self._owner, place_revision_id, **values))
 
     async def _place(self, tenant: str, document: AlbumDocument) -> PlanRecord | VenueRecord:
-        """Return the plan or venue of an album.
-
-        Raises:
-            UnknownFloorPlanError, UnknownVenueError: it was deleted, and the album with it.
-        """
+        """Return the plan or venue of an album."""
         if document.venue_id is not None:
             venue_id = document.venue_id
             venue = await self._call(tenant, lambda: self._store.venues.get(tenant, venue_id))

@@ -136,10 +136,6 @@ class Slots:
         Args:
             client: tenant or client address.
             deadline: end of the wait (`monotonic`).
-
-        Raises:
-            OverloadedError: the queue, or the client's share of it, is full, the client's other queries leave too
-                little time for one more, or no slot became free in time.
         """
         begin, others = monotonic(), self._others(client)
         if self._pace.exceeds_deadline(client, others):
@@ -167,11 +163,7 @@ class Slots:
             self._shares.take(client)
 
     def check(self, client: str) -> None:
-        """Check that a slot or a place in the queue is free for the client.
-
-        Raises:
-            OverloadedError: neither is free.
-        """
+        """Check that a slot or a place in the queue is free for the client."""
         if not self._shares.may_take(client) and not self._places.may_take(client):
             raise self._refusal(client)
 

@@ -31,12 +31,7 @@ class BytesInFlight(Shares):
         return min(self._limit_of(client), self.limit)
 
     def take(self, client: str, count: int = 1) -> None:
-        """Take some bytes for a client.
-
-        Raises:
-            UploadTooLargeError: they exceed the client's limit even if it holds nothing else.
-            BytesInFlightError: they exceed what the client can hold now.
-        """
+        """Take some bytes for a client."""
         held, limit = self.held_by(client), self.limit_of(client)
         if count > limit:
             raise UploadTooLargeError(TENANT_SETTING, limit, count)

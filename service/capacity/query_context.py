@@ -70,11 +70,7 @@ class QueryContext:
 
     @asynccontextmanager
     async def bounded(self) -> AsyncIterator[None]:
-        """End the block at the deadline.
-
-        Raises:
-            DeadlineExceededError: the deadline passed.
-        """
+        """End the block at the deadline."""
         try:
             async with asyncio.timeout(max(self.left_s, 0.0)):
                 yield

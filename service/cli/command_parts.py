@@ -44,11 +44,7 @@ def audit(store: Store, tenant: str, action: str, resource: str, **facts: object
 
 
 def duration(given: str) -> timedelta:
-    """Return a duration such as `90d`, `12h`, `30m` or `45s`.
-
-    Raises:
-        ArgumentTypeError: not a duration.
-    """
+    """Return a duration such as `90d`, `12h`, `30m` or `45s`."""
     found = _DURATION.fullmatch(given)
     if found is None:
         raise argparse.ArgumentTypeError("a whole number and a unit: 90d, 12h, 30m or 45s")
@@ -56,11 +52,7 @@ def duration(given: str) -> timedelta:
 
 
 def tenant_name(given: str) -> str:
-    """Return the name of a tenant.
-
-    Raises:
-        ArgumentTypeError: not a name of a tenant.
-    """
+    """Return the name of a tenant."""
     if not TENANT.fullmatch(given):
         raise argparse.ArgumentTypeError("1 to 64 letters, digits, '.', '_' and '-', beginning with a letter or digit")
     return given

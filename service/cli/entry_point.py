@@ -77,10 +77,6 @@ def _check_parts(settings: Settings, *, example: bool) -> None:
     """Check model, database and exporter before the start, so that errors are one line and not a log.
 
     With `example`, store the example plan in an empty database.
-
-    Raises:
-        BundleError: no usable model.
-        ConfigError, StoreUnavailableError: no usable database or exporter.
     """
     if settings.otlp_endpoint is not None:
         otlp_exporter(settings.otlp_endpoint).shutdown()

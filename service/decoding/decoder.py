@@ -116,10 +116,6 @@ class Decoder:
 
         Raises:
             InvalidPhotographError: see `open_photograph`; or the file stalled a worker, or crashed two.
-            OverloadedError: too many photographs wait already.
-            DeadlineExceededError: the deadline passed.
-            DecoderNotReadyError: no worker is running, nor will be by the deadline.
-            StoppingError: the service is shutting down.
         """
         if isinstance(content, Photograph):
             return content
@@ -130,23 +126,13 @@ class Decoder:
     async def decode_for_album(
         self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str = ""
     ) -> tuple[Photograph, Taken]:
-        """Decode an uploaded photograph of an album, with its overview; return when and by which camera it was taken.
-
-        Raises:
-            LaLaLocError: as `decode`.
-        """
+        """Decode a photograph of an album, with its overview, and return when and by which camera it was taken."""
         result = await self._run_job(AlbumJob(content, stated), deadline, client)
         assert isinstance(result, tuple)
         return result
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str) -> Film:
-        """Read a film of a turn; the first one starts the workers.
-
-        Raises:
-            InvalidFilmError: see `read_film`; or the film stalled a worker, or crashed two.
-            InvalidPhotographError: a statement is invalid.
-            OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
-        """
+        """Read a film of a turn; the first one starts the workers."""
         with self._lock:
             if not self._films_started:
                 self._films.start()
@@ -158,12 +144,7 @@ class Decoder:
     async def level_turn(
         self, photographs: Sequence[Photograph], deadline: float, client: str = ""
     ) -> tuple[list[Photograph], list[TurnAngles]]:
-        """Return photographs of one spot, decoded for a turn, with the angles that their overlap tells.
-
-        Raises:
-            InvalidPhotographError: the photographs stalled a worker, or crashed two.
-            OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
-        """
+        """Return photographs of one spot, decoded for a turn, with the angles that their overlap tells."""
         result = await self._run_job(TurnJob(photographs), deadline, client)
         assert isinstance(result, LevelledTurn)
         return result.photographs, result.angles
@@ -178,22 +159,13 @@ class Decoder:
         is_sphere: bool,
         max_size: tuple[int, int],
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """Decode a photograph to be shown: upright within `max_size` (width, height), a sphere level and of that size.
-
-        Raises:
-            LaLaLocError: as `decode`.
-        """
+        """Decode a photograph to show: upright within `max_size` (width, height), spheres level and of that size."""
         result = await self._run_job(ShowJob(content, stated, is_sphere, max_size), deadline, client)
         assert isinstance(result, np.ndarray)
         return result
 
     async def rasterise(self, svg: str, deadline: float, client: str = "") -> bytes:
-        """Return a drawing as a PNG file, by a deadline (`monotonic`).
-
-        Raises:
-            DrawingFailedError: the drawing crashed two workers, or could not be made.
-            OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
-        """
+        """Return a drawing as a PNG file, by a deadline (`monotonic`)."""
         result = await self._run_job(RasteriseJob(svg), deadline, client)
         assert isinstance(result, bytes)
         return result

@@ -115,11 +115,7 @@ def embed_small(
 
 
 def check_size(plan: FloorPlan, settings: Settings, level: str | None = None) -> None:
-    """Check the estimated number of poses of a plan; the error names its level.
-
-    Raises:
-        PlanTooLargeError: the estimate exceeds the limit.
-    """
+    """Check the estimated number of poses of a plan; the error names its level."""
     estimate = grid_size(plan, settings.grids.grid_step_m)
     if estimate > settings.grids.max_grid_poses:
         raise PlanTooLargeError(estimate, settings.grids.max_grid_poses, settings.grids.grid_step_m, level)

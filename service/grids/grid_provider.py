@@ -145,11 +145,7 @@ class GridProvider:
         ]
 
     def check_size(self, plan: FloorPlan, level: str | None = None) -> None:
-        """Check the estimated number of poses of a plan; the error names its level.
-
-        Raises:
-            PlanTooLargeError: the estimate exceeds the limit.
-        """
+        """Check the estimated number of poses of a plan; the error names its level."""
         check_size(plan, self._settings, level)
 
     def prepare(self, plan: FloorPlan, client: str) -> ComputedGrid | None:
@@ -267,10 +263,6 @@ class GridProvider:
         The future raises `UnknownFloorPlanError` if the plan is deleted, `PlanNotReadyError` if it gets a new revision,
         `StoppingError` if the service stops, and `StoreUnavailableError` if the database fails. It cannot be
         cancelled, because other queries can wait for it.
-
-        Raises:
-            OverloadedError: too many grids wait already.
-            StoppingError: the service stops.
         """
         key = self.key(record.revision_id, camera_height_m)
         on_demand = key.camera_height_mm != millimetres(record.plan.camera_height_m)

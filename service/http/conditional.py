@@ -59,11 +59,7 @@ def revision_etag(revision_id: str, *parts: object) -> str:
 
 
 def not_modified(request: Request, etag: str, headers: Mapping[str, str] | None = None) -> Response | None:
-    """Return 304 if the client has the representation with this tag already; otherwise None.
-
-    Raises:
-        InvalidRequestError: `If-None-Match` is not a list of entity tags.
-    """
+    """Return 304 if the client has the representation with this tag already; otherwise None."""
     none_match = _tags(request, "If-None-Match")
     if none_match is not None and (none_match.any or etag.strip('"') in none_match.all):
         return Response(status_code=304, headers={"ETag": etag, **_CACHED, **(headers or {})})
@@ -71,11 +67,7 @@ def not_modified(request: Request, etag: str, headers: Mapping[str, str] | None 
 
 
 def byte_range(request: Request, etag: str, size_bytes: int) -> range | None:
-    """Return the bytes that the client asks for; None for the whole representation, also if it asks for several ranges.
-
-    Raises:
-        RangeError: there are no such bytes.
-    """
+    """Return the bytes that the client asks for; None for the whole representation, or several ranges."""
     values = request.headers.getlist("Range")
     found = _RANGE.fullmatch(values[0]) if len(values) == 1 else None
     if found is None or not any(found.groups()) or request.headers.get("If-Range", etag) != etag:
@@ -115,10 +107,6 @@ def expected_revision(request: Request, resource_id: str, revision_id: str, *, w
 
     Returns:
         The revision that must still be current when the change is stored; None for any.
-
-    Raises:
-        RevisionMismatchError: `If-Match` does not name the revision, or `If-None-Match` does.
-        InvalidRequestError: a header is not a list of entity tags.
     """
     match, none_match = _tags(request, "If-Match"), _tags(request, "If-None-Match")
     if none_match is not None and (none_match.any or revision_id in _revisions(none_match.all)):

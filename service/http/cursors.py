@@ -30,11 +30,7 @@ def cursor_text(place: Cursor | VenuePlace) -> str:
 
 
 def parse_cursor(text: str) -> Cursor:
-    """Return the position of a cursor in a list.
-
-    Raises:
-        InvalidRequestError: not a cursor of `cursor_text`.
-    """
+    """Return the position of a cursor in a list."""
     moment, own_id = _unpack(_MOMENT, text)
     if moment > _LAST:
         raise _no_cursor(text)

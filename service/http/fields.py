@@ -69,12 +69,7 @@ _MAX_FAULTS = 20
 
 
 def parse_document(model: type[Model], content: bytes, max_values: int) -> Model:
-    """Parse a JSON text as a model; `max_values` as for `read_json`.
-
-    Raises:
-        InvalidRequestError: not JSON, a duplicate key, too many values, or faulty fields, of which the error names
-            the first twenty.
-    """
+    """Parse a JSON text as a model; `max_values` as for `read_json`."""
     try:
         value = read_json(content, _MAX_DEPTH, max_values)
     except InvalidFloorPlanError as error:
@@ -87,11 +82,7 @@ def parse_document(model: type[Model], content: bytes, max_values: int) -> Model
 
 
 async def check_parameters(request: Request) -> None:
-    """Refuse unknown query parameters; a dependency of every route.
-
-    Raises:
-        InvalidRequestError: unknown parameters, or a parameter given more than once.
-    """
+    """Refuse unknown query parameters; a dependency of every route."""
     counts = Counter(name for name, _ in request.query_params.multi_items())
     if not counts:
         return

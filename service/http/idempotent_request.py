@@ -55,9 +55,6 @@ class IdempotentRequest:
         claims: stored keys.
         request: the request.
         tenant: tenant of the request; keys of different tenants and paths are independent.
-
-    Raises:
-        InvalidRequestError: an invalid key.
     """
 
     def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str) -> None:

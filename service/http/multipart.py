@@ -90,9 +90,6 @@ async def read_parts(
 
     Raises:
         UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
-        MalformedRequestError: not valid multipart.
-        UnsupportedMediaError: a charset other than UTF-8.
-        InvalidRequestError: a part is missing, unknown, duplicate or of the wrong kind, or `check` found a fault.
     """
     stated = request.headers.get("content-type", "")
     options = parse_options_header(stated)[1]
@@ -196,12 +193,7 @@ class _Expected:
         return errors.MalformedRequestError(f"not valid {MULTIPART}: {message}")
 
     def sort(self, items: list[tuple[str, UploadedFile | str]], limits: UploadLimits, check: Check) -> Parts:
-        """Return the parts by kind.
-
-        Raises:
-            UploadTooLargeError: a file is too large.
-            InvalidRequestError: a part is missing, unknown, duplicate or of the wrong kind, or `check` found a fault.
-        """
+        """Return the parts by kind."""
         found, counts = Parts({}, {}), Counter[str]()
         added = [(part[:50], self._add(part, value, limits, found, counts)) for part, value in items]
         faults = [(label, fault) for label, fault in added if fault]
@@ -251,9 +243,6 @@ async def _within_parts(
     """Yield a multipart body whose boundary occurs a bounded number of times.
 
     A boundary costs the parser as much as hundreds of bytes, also if the next bytes show that it is none.
-
-    Raises:
-        MalformedRequestError: the boundary occurs in the content of the parts.
     """
     found = 0
     async for chunk in chunks:

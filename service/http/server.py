@@ -44,11 +44,7 @@ _MIN_CONNECTIONS = 16
 
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
-    """Return the server's configuration.
-
-    Raises:
-        ConfigError: the system allows too few file descriptors.
-    """
+    """Return the server's configuration."""
     config = uvicorn.Config(
         app,
         # Not uvloop, even if it is installed, as with the extra `ray`.
@@ -74,11 +70,7 @@ class ServedApp(FastAPI):
 
 
 def bound_uvicorn(app: FastAPI, settings: Settings) -> None:
-    """Bound connections of the server that starts the app, if it is `uvicorn service.app:app`.
-
-    Raises:
-        ConfigError: the system allows too few file descriptors.
-    """
+    """Bound connections of the server that starts the app, if it is `uvicorn service.app:app`."""
     config = getattr(app.state, "server", None)
     if isinstance(config, uvicorn.Config) and isinstance(config.http, str):
         # Uvicorn has loaded the classes that were named; it listens after the app has started.
@@ -165,9 +157,6 @@ def max_connections_of(wanted: int, settings: Settings) -> int:
     Args:
         wanted: desired number of connections.
         settings: settings of the service.
-
-    Raises:
-        ConfigError: the system allows too few descriptors.
     """
     reserved = _RESERVED_DESCRIPTORS + _PER_DATABASE_CONNECTION * settings.database.connections
     allowed = _raised_to(wanted + reserved)

@@ -65,12 +65,7 @@ class UploadLimits:
 
 
 def media_type(request: Request, accepted: tuple[str, ...]) -> str:
-    """Return the body's media type without parameters.
-
-    Raises:
-        UnsupportedMediaError: the type is not accepted.
-        UnsupportedEncodingError: the body is compressed.
-    """
+    """Return the body's media type without parameters."""
     for encoding in request.headers.getlist("content-encoding"):
         if encoding.strip().lower() not in ("", "identity"):
             raise errors.UnsupportedEncodingError(encoding)
@@ -82,12 +77,7 @@ def media_type(request: Request, accepted: tuple[str, ...]) -> str:
 
 
 async def read_body(request: Request, limits: UploadLimits) -> UploadedFile:
-    """Read the whole body.
-
-    Raises:
-        UploadTooLargeError, UploadTimeoutError, BytesInFlightError: a limit is exceeded.
-        StoreFullError: the body cannot be written to disk.
-    """
+    """Read the whole body."""
     # Closed by `kept_file`.
     body = UploadFile(SpooledTemporaryFile(memory_bytes_of(limits)), size=0)  # noqa: SIM115  # pyright: ignore[reportArgumentType]
     with spooling(limits):

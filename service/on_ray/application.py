@@ -51,10 +51,6 @@ def app(arguments: dict[str, str]) -> serve.Application:
 
     Args:
         arguments: arguments of `serve run`, see `RayOptions`.
-
-    Raises:
-        ConfigError: an invalid setting or argument.
-        BundleError: no usable model.
     """
     try:
         options = RayOptions.model_validate(arguments)
@@ -123,16 +119,7 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
 
 
 def _scaled(name: str, options: RayOptions, target: float) -> dict[str, Any]:
-    """Return the scaling options of a deployment.
-
-    Args:
-        name: name of the deployment.
-        options: numbers of replicas.
-        target: average number of ongoing requests per replica.
-
-    Raises:
-        ConfigError: the maximum is below the minimum.
-    """
+    """Return the scaling options of a deployment."""
     low, high = getattr(options, f"{name}_min"), getattr(options, f"{name}_max")
     if high < low:
         raise ConfigError(f"{name}_max is {high}, less than {name}_min, which is {low}")

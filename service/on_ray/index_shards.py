@@ -145,12 +145,7 @@ class RemoteShard:
         return held
 
     def _waited(self, begin: Callable[[], Any]) -> Any:
-        """Return the result of a call, which is begun again if the replica dies.
-
-        Raises:
-            LaLaLocError: raised by the shard.
-            DeadlineExceededError: no answer in time, or two replicas died.
-        """
+        """Return the result of a call, which is begun again if the replica dies."""
         for _ in range(_ATTEMPTS):
             response = begin()
             try:

@@ -80,7 +80,6 @@ class RemotePhotographEncoder(PhotographEncoder):
 
         Raises:
             InvalidPhotographError: see `PhotographEncoder.query`.
-            DeadlineExceededError: no answer in time, or two replicas died.
         """
         self.check(photograph)
         for _ in range(_ATTEMPTS):
@@ -186,13 +185,7 @@ class RemoteLocaliser:
         await self._call("check", where, context, form)
 
     async def _call(self, method: str, where: Where, context: QueryContext, *arguments: Any) -> Any:
-        """Call a method of the `Localiser` of a search replica.
-
-        Raises:
-            LaLaLocError: raised by the replica.
-            OverloadedError: the replica's queue is full.
-            DeadlineExceededError: no answer in time, or two replicas died.
-        """
+        """Call a method of the `Localiser` of a search replica."""
         about = (
             where if isinstance(where, Nearby) else StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
         )

@@ -124,11 +124,7 @@ class Converter:
         return result.plan() if isinstance(result, PackedPlan) else None
 
     def begin_rendition(self, job: RenditionJob, client: str) -> Future[ConversionResult]:
-        """Queue a file that is made from a stored plan. Blocks while the plan is copied.
-
-        Raises:
-            OverloadedError, ConverterNotReadyError, StoppingError: see `read`.
-        """
+        """Queue a file that is made from a stored plan. Blocks while the plan is copied."""
         try:
             if job.kind in PREDICTIONS:
                 return self._running_pool(predicts=True).submit(job, _PREDICTION_S, client)
@@ -137,14 +133,7 @@ class Converter:
             self._raise_lost(error)
 
     async def rendition(self, begun: Future[ConversionResult], kind: RenditionKind) -> Rendition:
-        """Wait for a file of `begin_rendition`; cancelling takes it out of the queue.
-
-        Raises:
-            InvalidFloorPlanError: the plan lacks something that the format requires.
-            DamagedDataError: the stored plan is damaged.
-            DeadlineExceededError: the file was not made in time.
-            MissingExtraError, ConverterNotReadyError, StoppingError: see `read`.
-        """
+        """Wait for a file of `begin_rendition`; cancelling takes it out of the queue."""
         predicts = kind in PREDICTIONS
         try:
             async with asyncio.timeout(None if predicts else self._settings.plans.import_deadline_s):
@@ -170,11 +159,7 @@ class Converter:
     def _run(
         self, job: ConversionJob, limit_s: float, client: str = "", on_step: OnStep | None = None
     ) -> ConversionResult:
-        """Run a job of the imports, and wait for it; `on_step` is called with its news.
-
-        Raises:
-            JobLostError: there is no result in time.
-        """
+        """Run a job of the imports, and wait for it; `on_step` is called with its news."""
         future = self._running_pool().submit(job, limit_s, client, on_step or (lambda _step: None))
         done, _ = wait([future], limit_s)
         if not done:

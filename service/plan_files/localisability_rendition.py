@@ -15,11 +15,7 @@ from service.stored_plan import RenditionJob
 
 
 def plan_localisability(plan: FloorPlan, job: RenditionJob, *, coarse: bool = False) -> bytes:
-    """Return the `LocalisabilityAnswer` of a plan as JSON.
-
-    Raises:
-        InvalidInputError: the model has no measured errors.
-    """
+    """Return the `LocalisabilityAnswer` of a plan as JSON."""
     assert job.bundle is not None, "the prediction needs the model"
     answer = LocalisabilityAnswer(
         floorplan_id=job.stored.id,

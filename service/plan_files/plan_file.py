@@ -101,11 +101,6 @@ class PlanReader:
 
         `building` is the name for plans that have none, and for those of several levels, unless the options have one.
         `on_step` is as for `Converter.read`.
-
-        Raises:
-            InvalidFloorPlanError: the file or a level is invalid, or exceeds a limit.
-            MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see
-                `read`.
         """
         if (native := self._read_native(content, options, building, client)) is not None:
             return [native]

@@ -21,7 +21,6 @@ def make_rendition(job: RenditionJob) -> Rendition:
     Raises:
         DamagedDataError: the stored document is damaged.
         InvalidFloorPlanError: the plan lacks something that an export requires.
-        InvalidInputError: localisability of a model without measured errors.
         MissingExtraError: a library of an export is not installed.
     """
     stored = job.stored

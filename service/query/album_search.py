@@ -83,13 +83,7 @@ class AlbumSearch:
             return await self._parts.executor.compute(context, encode)
 
     async def solve(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome:
-        """Pin the photographs of an album.
-
-        Raises:
-            PlanFailedError, VenueUnsearchableError: the plan or venue cannot be searched.
-            PlanNotReadyError, VenueNotReadyError: it is not ready.
-            LaLaLocError: see `Localiser.localise`.
-        """
+        """Pin the photographs of an album."""
         context, document = query.context, query.document
         # Not on the event loop: the entries of 500 photographs have megabytes.
         read = partial(self._read, query.photographs)

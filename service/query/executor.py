@@ -54,9 +54,6 @@ class Executor:
         """Run CPU work on a compute thread.
 
         After the query's deadline, waiting work is not started, and the result of running work is dropped.
-
-        Raises:
-            DeadlineExceededError: the deadline passed.
         """
         async with context.bounded():
             return await self._threads.run(context.client, work)

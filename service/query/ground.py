@@ -81,11 +81,7 @@ class Ground:
 
     @classmethod
     def of_venue(cls, loaded: LoadedPlans, stated: VenueHints, camera_height_m: float, gap_m: float) -> Ground:
-        """Return the ground of plans of a venue, `gap_m` apart, for a camera height (m).
-
-        Raises:
-            InvalidHintError: no searched plan has a room.
-        """
+        """Return the ground of plans of a venue, `gap_m` apart, for a camera height (m)."""
         plans = [record.plan for record in loaded.records]
         merged = MergedPlans.of(plans, loaded.grids, camera_height_m, gap_m)
         partly = loaded.log_mass is not None

@@ -77,11 +77,6 @@ class Grounds:
             heights_m: further stated camera heights (m).
             gap_m: distance between plans of a venue, which are laid side by side.
             max_poses: limit of the grid poses of a plan of a venue; None for no limit.
-
-        Raises:
-            InvalidPoseError: a stated height is impossible in the plan.
-            InvalidHintError: the hints do not match the plan, or the venue has no frame for a point.
-            NoPlanNearbyError: no plan is near the place.
         """
         if isinstance(where, PlanRecord):
             return PlanSite(self, where, form, hinted, heights_m)
@@ -96,9 +91,7 @@ class Grounds:
         """Check what a request states about a plan or a venue.
 
         Raises:
-            InvalidPoseError: the camera height is impossible in the plan.
             InvalidHintError: the hints do not match the plan or venue.
-            VenueUnsearchableError: the venue has no plans.
         """
         if isinstance(where, PlanRecord):
             stated_height(form, where)
@@ -112,11 +105,7 @@ class Grounds:
             VenueHints.from_form(form, where.anchor).check(members)
 
     async def members(self, where: VenueRecord | Nearby) -> PlanList:
-        """Return the current row of every plan of a venue or near a place.
-
-        Raises:
-            NoPlanNearbyError: no plan is near the place.
-        """
+        """Return the current row of every plan of a venue or near a place."""
         if isinstance(where, VenueRecord):
             return await self._plans.members(where.tenant, where.id)
         rows = await self._plans.near(where.tenant, where.place, where.within_m)
@@ -181,11 +170,7 @@ class PlanSite:
         self._hints = NO_HINTS if hinted is None else stated_hints(hinted, record.plan)
 
     async def wait(self, context: QueryContext) -> None:
-        """Check the hints.
-
-        Raises:
-            InvalidHintError: the hints do not match the plan, or exclude all of it.
-        """
+        """Check the hints."""
         if not self._hints.are_none:
             # On a compute thread, because checking many rooms is slow.
             await self._grounds.executor.compute(context, partial(self._hints.check, self._record.plan))
@@ -231,14 +216,7 @@ class VenueSite:
         return venue_height(self._form, self.ready)
 
     async def wait(self, context: QueryContext) -> None:
-        """Wait for a plan to be ready.
-
-        Raises:
-            InvalidHintError: a hint does not match the venue.
-            VenueUnsearchableError: no plan can be searched.
-            VenueNotReadyError: no plan was ready by the deadline.
-            NoPlanNearbyError: no plan is near the place.
-        """
+        """Wait for a plan to be ready."""
         read_plans = partial(self._grounds.members, self._where)
         with context.clock.stage("wait"):
             ready, warnings = await self._grounds.search.ready(self._where.id, read_plans, self._hints, context)

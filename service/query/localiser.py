@@ -42,33 +42,14 @@ class Localiser:
         return ModelAnswer.of(self._parts.bundle)
 
     async def localise(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
-        """Localise a photograph in a stored plan, or in plans of a venue or near a place.
-
-        Raises:
-            InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
-            InvalidPoseError: the camera height is impossible in the plan.
-            InvalidHintError: the hints do not match the plan, or exclude all of it.
-            PlanFailedError: the plan's pose grid could not be computed.
-            PlanNotReadyError: the pose grid was not ready by the deadline.
-            VenueUnsearchableError: the venue has no plans, or all of them failed.
-            VenueNotReadyError: no plan of the venue was ready by the deadline.
-            NoPlanNearbyError: no plan is near the place.
-            DeadlineExceededError: another step missed the deadline.
-            StoreUnavailableError: the pose grid is not in memory, and the database cannot be reached.
-            OverloadedError: too many queries are in progress, or too many pose grids are computed on demand.
-        """
+        """Localise a photograph in a stored plan, or in plans of a venue or near a place."""
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return await self._single.answer(where, query)
 
     async def localise_and_draw(
         self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
-        """Localise as `localise` does, and return the answer with its picture, a PNG or SVG file.
-
-        Raises:
-            DrawingFailedError: the picture could not be made.
-            LaLaLocError: see `localise`.
-        """
+        """Localise as `localise` does, and return the answer with its picture, a PNG or SVG file."""
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return await self._single.answer_and_draw(record, query, request)
 
@@ -78,12 +59,7 @@ class Localiser:
             return await self._sequences.answer(where, query)
 
     async def track(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
-        """Follow the camera of a session to its next photograph.
-
-        Raises:
-            SessionOutdatedError: the model, or a plan of the venue, has changed since the session began.
-            LaLaLocError: see `localise`.
-        """
+        """Follow the camera of a session to its next photograph."""
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
             return await self._sessions.answer(where, query)
 
@@ -93,20 +69,14 @@ class Localiser:
             return await self._albums.entry(query)
 
     async def solve_album(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome:
-        """Pin the photographs of an album; it holds a slot until its plans are loaded.
-
-        Raises:
-            LaLaLocError: see `localise`.
-        """
+        """Pin the photographs of an album; it holds a slot until its plans are loaded."""
         return await self._albums.solve(where, query)
 
     async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
         """Check what a request states about a plan or a venue.
 
         Raises:
-            InvalidPoseError: the camera height is impossible in the plan.
             InvalidHintError: the hints do not match the plan or venue.
-            VenueUnsearchableError: the venue has no plans.
         """
         await self._parts.grounds.check(where, form)
 

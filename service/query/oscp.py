@@ -35,11 +35,7 @@ _READING = "sensorReadings.cameraReadings.0"
 
 
 def decode_picture(request: OscpRequest) -> bytes:
-    """Return the picture file of a request.
-
-    Raises:
-        InvalidRequestError: the reading names no camera of the request, is a depth map, is not upright, or not Base64.
-    """
+    """Return the picture file of a request."""
     reading, faults = request.camera_reading, list[tuple[str, str]]()
     if not any(sensor.id == reading.sensor_id and sensor.type == "camera" for sensor in request.sensors):
         faults.append((f"{_READING}.sensorId", f"is '{reading.sensor_id[:50]}', sensors has no camera with this id"))
@@ -61,11 +57,7 @@ def decode_picture(request: OscpRequest) -> bytes:
 
 
 def camera_fields(request: OscpRequest) -> dict[str, object]:
-    """Return the camera of a request as fields of `LocaliseForm`.
-
-    Raises:
-        InvalidRequestError: the model is unknown, or has another number of parameters.
-    """
+    """Return the camera of a request as fields of `LocaliseForm`."""
     params = request.camera_reading.params
     model = "" if params is None else (params.model or "").upper()
     if model in _UNKNOWN:
@@ -123,9 +115,6 @@ def compose_oscp_answer(request: OscpRequest, found: LocaliseAnswer, warnings: l
         request: the request.
         found: the service's own answer.
         warnings: warnings besides those of the answer.
-
-    Raises:
-        UnanchoredPlanError: the answer has no geopose.
     """
     if found.geopose is None:
         raise UnanchoredPlanError(found.floorplan_id, found.venue_id)

@@ -76,9 +76,6 @@ class PhotographReader:
 
         Returns:
             the photographs, and their angles; None if they are features or a sphere is among them.
-
-        Raises:
-            InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
         """
         with context.clock.stage("decode"):
             photographs = await self._decode_all(contents, stated, context, overview=TURN_SIDE)
@@ -93,11 +90,7 @@ class PhotographReader:
             return await self._decoder.level_turn(photographs, context.deadline, context.client)
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, context: QueryContext) -> Film:
-        """Read a film of a turn.
-
-        Raises:
-            InvalidFilmError, DecoderNotReadyError, StoppingError: see `Decoder.film`.
-        """
+        """Read a film of a turn."""
         with context.clock.stage("decode"):
             return await self._decoder.film(content, stated, context.deadline, context.client)
 

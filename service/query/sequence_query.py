@@ -40,12 +40,7 @@ class SequenceSearch:
         self._parts = parts
 
     async def answer(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
-        """Localise photographs jointly.
-
-        Raises:
-            InvalidPoseError: a height per photograph is stated, and the model compares latents of one height.
-            LaLaLocError: see `Localiser.localise`.
-        """
+        """Localise photographs jointly."""
         form, context = query.form, query.context
         if form.camera_heights_m is not None and not self._parts.encoder.predicts_profile:
             raise InvalidPoseError(

@@ -62,12 +62,7 @@ class SessionSearch:
         self._graphs = BoundedCache[str, WalkGraph](_GRAPH_BYTES, lambda graph: graph.nbytes)
 
     async def answer(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
-        """Follow a camera to its next photograph.
-
-        Raises:
-            SessionOutdatedError: the model, or a plan of the venue, has changed since the session began.
-            LaLaLocError: see `Localiser.localise`.
-        """
+        """Follow a camera to its next photograph."""
         form, document, context = query.form, query.document, query.context
         (photograph,) = await self._parts.reader.decode([query.content], form.stated_camera, context)
         try:
@@ -191,9 +186,6 @@ def _favour_of(
     """Return a function of the log factors by which a session prefers plans.
 
     These are the plans of its belief (`by_plan`, by revision), and those one level from them.
-
-    Raises:
-        SessionOutdatedError: a plan with a share of the belief was replaced.
     """
     if not by_plan.keys() <= {row.revision_id for row in site.ready}:
         raise SessionOutdatedError(session_id, f"a floor plan of venue '{site.id}' was replaced")

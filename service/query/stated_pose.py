@@ -14,22 +14,14 @@ from service.storage.records import PlanRecord
 
 
 def stated_height(form: HeightFields, record: PlanRecord) -> CameraHeight:
-    """Return the camera height in the request, else the plan's, else an unknown one.
-
-    Raises:
-        InvalidPoseError: the requested height is impossible in the plan.
-    """
+    """Return the camera height in the request, else the plan's, else an unknown one."""
     if form.camera_height_m is not None:
         check_height_m(record, form.camera_height_m)
     return stated_pose.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
 
 
 def heights_of(form: SequenceForm, common: CameraHeight, photographs: int) -> list[CameraHeight]:
-    """Return the camera height of each photograph of a sequence, `common` where the request states none.
-
-    Raises:
-        InvalidPoseError: the common height is needed and unknown.
-    """
+    """Return the camera height of each photograph of a sequence, `common` where the request states none."""
     if form.camera_heights_m is None:
         return photographs * [common]
     if common.is_unknown:
@@ -45,11 +37,7 @@ def heights_of(form: SequenceForm, common: CameraHeight, photographs: int) -> li
 
 
 def stated_hints(form: HintFields | SessionDocument, plan: FloorPlan) -> Hints:
-    """Return the hints of a request, before `Hints.check`.
-
-    Raises:
-        InvalidHintError: unknown rooms, or a place on Earth for a plan without an anchor.
-    """
+    """Return the hints of a request, before `Hints.check`."""
     near = None
     if form.near is not None and form.radius_m is not None:
         near = _near_in_plan(form.near, form.radius_m, plan)

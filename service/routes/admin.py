@@ -217,11 +217,7 @@ def _audit_answer(entry: StoredAuditEntry) -> AuditEntryAnswer:
 
 
 def _check_year(field: str, moment: datetime | None) -> datetime | None:
-    """Return a time, unless databases cannot compare it.
-
-    Raises:
-        InvalidRequestError: the time is out of range.
-    """
+    """Return a time, unless databases cannot compare it."""
     if moment is not None and not 1970 <= moment.year < 9999:
         raise InvalidRequestError([(field, f"has the year {moment.year}; give one from 1970 to 9998")])
     return moment

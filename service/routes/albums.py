@@ -149,11 +149,7 @@ def delete_album(album_id: str, call: Call) -> None:
 
 
 def album_of(call: ApiCall, album_id: str) -> AlbumRecord:
-    """Return a stored album. Blocks.
-
-    Raises:
-        UnknownAlbumError: no such album, or it has expired.
-    """
+    """Return a stored album. Blocks."""
     if not is_id(album_id):
         raise errors.UnknownAlbumError(album_id)
     record = call.store.albums.get(call.tenant, album_id)

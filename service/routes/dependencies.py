@@ -77,21 +77,13 @@ class ApiCall:
 
         Args:
             media: media type of the answer.
-
-        Raises:
-            InvalidRequestError: an invalid key, or one for an answer that is not JSON.
         """
         if media != JSON and HEADER in self.request.headers:
             raise InvalidRequestError([(HEADER, "works for answers in application/json only")])
         return IdempotentRequest(self.store.idempotency_keys, self.request, self.tenant)
 
     async def read_json(self) -> UploadedFile:
-        """Read a body in JSON.
-
-        Raises:
-            UnsupportedMediaError: another media type.
-            UploadTooLargeError, UploadTimeoutError, BytesInFlightError: see `read_body`.
-        """
+        """Read a body in JSON."""
         media_type(self.request, (JSON,))
         return await read_body(self.request, UploadLimits.of(self.settings, "max_venue_bytes"))
 
@@ -124,9 +116,7 @@ class ApiCall:
         """Return a stored plan at one of its revisions, and True for an old one; None names the current one. Blocks.
 
         Raises:
-            UnknownFloorPlanError: no such plan.
             UnknownRevisionError: no such revision is kept.
-            StoreUnavailableError: the database is away.
         """
         current = self.plan(floorplan_id)
         if revision_id is None or revision_id == current.revision_id:
@@ -142,33 +132,19 @@ class ApiCall:
         return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
 
     def venue(self, venue_id: str) -> VenueRecord:
-        """Return a stored venue. Blocks.
-
-        Raises:
-            UnknownVenueError: no such venue.
-            StoreUnavailableError: the database is away.
-        """
+        """Return a stored venue. Blocks."""
         record = self.store.venues.get(self.tenant, venue_id) if is_id(venue_id) else None
         if record is None:
             raise UnknownVenueError(venue_id)
         return record
 
     def expected_revision(self, stored: PlanSummary | VenueRecord | AlbumRecord) -> str | None:
-        """Return the revision that a change needs, by the request's preconditions; see `expected_revision`.
-
-        Raises:
-            RevisionMismatchError: it has another one.
-        """
+        """Return the revision that a change needs, by the request's preconditions; see `expected_revision`."""
         what = {VenueRecord: "venue", AlbumRecord: "album"}.get(type(stored), "floor plan")
         return expected_revision(self.request, stored.id, stored.revision_id, what=what)
 
     async def place(self, floorplan_id: str | None, venue_id: str | None) -> PlanRecord | VenueRecord:
-        """Return the plan or venue of a query; a plan from memory while the database is away.
-
-        Raises:
-            UnknownFloorPlanError, UnknownVenueError: no such plan or venue.
-            StoreUnavailableError: the database is away and the plan is not in memory, or the database is busy.
-        """
+        """Return the plan or venue of a query; a plan from memory while the database is away."""
         if venue_id is not None:
             if not is_id(venue_id):
                 raise UnknownVenueError(venue_id)
@@ -214,16 +190,7 @@ class _Page:
         position_of: Callable[[Any], Any] = lambda row: Cursor(row.created_at, row.id),
         parse: Callable[[str], Any] = parse_cursor,
     ) -> tuple[list[T], str | None]:
-        """Return the items of the page, and the cursor of the next one; None on the last page.
-
-        Args:
-            find: returns at most `limit` items after the position `after`.
-            position_of: returns the position of an item.
-            parse: returns the position of a cursor.
-
-        Raises:
-            InvalidRequestError: an invalid cursor.
-        """
+        """Return the items of the page, and the cursor of the next one; None on the last page."""
         after = None if self._cursor is None else parse(self._cursor)
         # One extra item shows that there is another page.
         found = find(limit=self._limit + 1, after=after)

@@ -96,12 +96,7 @@ def _largest(call: ApiCall) -> Settable:
 
 
 def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCall) -> SequenceQuery:
-    """Return the query about the film or the photographs of a request.
-
-    Raises:
-        UploadTooLargeError: the film, or the photographs, are larger than allowed.
-        LaLaLocError: see `_photographs`.
-    """
+    """Return the query about the film or the photographs of a request."""
     limits = call.settings.photographs
     films = parts.named(FILM)
     if not films:
@@ -120,13 +115,7 @@ def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCal
 
 
 def _photographs(parts: Parts, form: SequenceForm, call: ApiCall) -> list[Content]:
-    """Return the photographs in order.
-
-    Raises:
-        UploadTooLargeError: a photograph is larger than allowed.
-        InvalidFeaturesError, ForeignFeaturesError: see `photographs_of`.
-        InvalidRequestError: fields that do not fit the number of photographs.
-    """
+    """Return the photographs in order."""
     limit = call.settings.photographs.max_photograph_bytes
     if (largest := max(map(len, parts.named(PHOTO)), default=0)) > limit:
         raise UploadTooLargeError("max_photograph_bytes", limit, largest)

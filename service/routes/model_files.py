@@ -77,11 +77,7 @@ async def get_model_file(file: str, call: Call) -> Response:
 
 
 def _open(path: Path, size_bytes: int) -> BinaryIO:
-    """Open a file of the model.
-
-    Raises:
-        ChangedModelFileError: it is missing, or has another size.
-    """
+    """Open a file of the model."""
     try:
         opened = path.open("rb")
     except OSError as error:
@@ -94,11 +90,7 @@ def _open(path: Path, size_bytes: int) -> BinaryIO:
 
 @lru_cache(maxsize=3)
 def _packed(path: Path, size_bytes: int, digest: str) -> bytes:
-    """Return a file of the model as it is packed for browsers; it is kept, so it must be undamaged.
-
-    Raises:
-        ChangedModelFileError: see `_open`; or the file has another digest.
-    """
+    """Return a file of the model as it is packed for browsers; it is kept, so it must be undamaged."""
     with _open(path, size_bytes) as opened:
         content = opened.read()
     if sha256(content).hexdigest() != digest:
@@ -107,11 +99,7 @@ def _packed(path: Path, size_bytes: int, digest: str) -> bytes:
 
 
 async def _chunks(opened: BinaryIO, wanted: range, call: ApiCall) -> AsyncIterator[bytes]:
-    """Yield bytes of a file until the client has gone. Clients check the digest, so an altered file is noticed there.
-
-    Raises:
-        ChangedModelFileError: the file ends too soon. The answer is then incomplete, and its connection is closed.
-    """
+    """Yield bytes of a file until the client has gone. Clients check the digest, so they notice altered files."""
     position = wanted.start
     while position < wanted.stop and not await call.request.is_disconnected():
         async with call.reading():

@@ -70,11 +70,7 @@ def icon(request: Request) -> Response:
 
 
 def _file(request: Request, name: str) -> Response:
-    """Return a built file.
-
-    Raises:
-        HTTPException: no such file.
-    """
+    """Return a built file."""
     if not _NAME.fullmatch(name):
         raise HTTPException(404)
     content, media, etag = _built(name)
@@ -84,11 +80,7 @@ def _file(request: Request, name: str) -> Response:
 
 @lru_cache(_MAX_FILES)
 def _built(name: str) -> tuple[bytes, str, str]:
-    """Return content, media type and entity tag of a built file, which never changes while the service runs.
-
-    Raises:
-        HTTPException: no such file.
-    """
+    """Return content, media type and entity tag of a built file, which never changes while the service runs."""
     path = files("service") / "web" / name
     if not path.is_file():
         raise HTTPException(404)

@@ -253,11 +253,7 @@ async def follow_floorplan(floorplan_id: str, call: Call) -> Response:
 
 
 async def _chunks(plan: PlanSummary, size_bytes: int, call: ApiCall) -> AsyncIterator[bytes]:
-    """Yield the uploaded file, until the client has gone.
-
-    Raises:
-        UnknownFloorPlanError: the revision was deleted meanwhile, so that the connection ends before the answer.
-    """
+    """Yield the uploaded file, until the client has gone."""
     sent_bytes = number = 0
     while sent_bytes < size_bytes and not await call.request.is_disconnected():
         async with call.reading():
@@ -281,11 +277,7 @@ async def _rendition(
 
 
 def _check_near(marker: Marker, bounds_m: Bounds) -> None:
-    """Refuse a camera that is too far from the plan to be drawn with it.
-
-    Raises:
-        InvalidRequestError: the camera is further away than the plan's larger side.
-    """
+    """Refuse a camera that is too far from the plan to be drawn with it."""
     x_min, y_min, x_max, y_max = bounds_m
     margin_m = max(x_max - x_min, y_max - y_min)
     ranges = (("x_m", marker.x_m, x_min, x_max), ("y_m", marker.y_m, y_min, y_max))
@@ -299,11 +291,7 @@ def _check_near(marker: Marker, bounds_m: Bounds) -> None:
 
 
 def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
-    """Return (xx, xy, yy).
-
-    Raises:
-        InvalidRequestError: not a covariance.
-    """
+    """Return (xx, xy, yy)."""
     if given is None:
         return None
     xx, xy, yy = given

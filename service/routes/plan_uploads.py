@@ -86,13 +86,7 @@ class PlanUpload:
 
 
 async def read_upload(call: ApiCall, form: type[BaseModel] = ImportForm) -> PlanUpload:
-    """Read the file in a request, with its options, the fields of a form.
-
-    Raises:
-        UnsupportedMediaError: the media type is not that of a plan file.
-        UploadTooLargeError, UploadTimeoutError, MalformedRequestError: see `read_body` and `read_parts`.
-        InvalidRequestError: a part or option is missing, unknown or invalid.
-    """
+    """Read the file in a request, with its options, the fields of a form."""
     limits = UploadLimits.of(call.settings, "max_plan_bytes")
     if media_type(call.request, (MULTIPART, *_FILES)) != MULTIPART:
         return PlanUpload(await read_body(call.request, limits), ImportOptions(), {})
@@ -121,10 +115,6 @@ def prepare_plan(uploaded: PlanUpload, call: ApiCall, on_step: OnStep | None = N
     """Return the plan in an uploaded file, with its pose grid if that is computed at once, and as it was read. Blocks.
 
     `on_step` is as for `Converter.read`.
-
-    Raises:
-        PlanTooLargeError: the plan needs too large a grid.
-        LaLaLocError: see `PlanReader.read`.
     """
     content, runtime = uploaded.file.read(), call.runtime
     name = building_name(uploaded.file.name)
@@ -138,11 +128,6 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnSt
     """Return a plan of every level of a file with rooms, with the pose grids that are computed at once. Blocks.
 
     `on_step` is as for `Converter.read`.
-
-    Raises:
-        InvalidRequestError: the file has more levels than a venue can have plans.
-        PlanTooLargeError: a level needs too large a grid.
-        LaLaLocError: see `PlanReader.read_levels`.
     """
     content, runtime = uploaded.file.read(), call.runtime
     files = _reader(call).read_levels(content, uploaded.options, name, call.client, on_step)

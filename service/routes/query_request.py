@@ -110,11 +110,6 @@ async def read_files(
 
     Returns:
         the form, all parts, and the context of the query.
-
-    Raises:
-        UploadTooLargeError, UploadTimeoutError, MalformedRequestError, UnsupportedMediaError: see `read_parts`.
-        InvalidRequestError: a part or field is missing, unknown or invalid.
-        FeaturesRequiredError: a photograph was sent to a service that takes features only.
     """
     media_type(call.request, (MULTIPART,))
     settings = call.settings
@@ -149,12 +144,7 @@ async def read_files(
 
 
 def photographs_of(parts: Parts, form: PhotographFields, call: ApiCall) -> list[Content]:
-    """Return the photographs of a query in order: their files, or what was read of their features.
-
-    Raises:
-        InvalidFeaturesError, ForeignFeaturesError: see `read_features`.
-        InvalidRequestError: features come with fields about the camera.
-    """
+    """Return the photographs of a query in order: their files, or what was read of their features."""
     features = parts.named(FEATURES)
     if not features:
         return [*parts.named(PHOTO)]
@@ -169,11 +159,7 @@ def photographs_of(parts: Parts, form: PhotographFields, call: ApiCall) -> list[
 
 
 def check_anchor(place: PlanRecord | VenueRecord, media: str) -> None:
-    """Check that the answer in a plan can be in latitude and longitude; that in a venue depends on the plan it finds.
-
-    Raises:
-        UnanchoredPlanError: the answer is GeoJSON or a GeoPose, and the plan has no anchor.
-    """
+    """Check that the answer in a plan can be in latitude and longitude; in a venue it depends on the plan."""
     if media in (GEOJSON, GEOPOSE) and isinstance(place, PlanRecord) and place.plan.anchor is None:
         raise errors.UnanchoredPlanError(place.id)
 
@@ -185,9 +171,6 @@ def answer_as(answer: Answer, media: str, on_earth: Mapping[str, Callable[[Answe
         answer: the answer.
         media: media type of the form.
         on_earth: by media type, functions that return an answer in latitude and longitude, None without an anchor.
-
-    Raises:
-        UnanchoredPlanError: a form on Earth is requested, and neither the plan nor the venue has an anchor.
     """
     if media == JSON:
         return Response(answer.model_dump_json(), headers=VARY, media_type=JSON)

@@ -92,12 +92,7 @@ async def _serve(socket: WebSocket, requests: SocketRequests, path: str, runtime
 
 
 async def _next_text(socket: WebSocket, admission: Admission, idle_s: float) -> str | None:
-    """Wait for the next text message; None if the connection was closed instead.
-
-    Raises:
-        SocketProtocolError: a binary message came.
-        SocketClosedError: the client has closed the connection.
-    """
+    """Wait for the next text message; None if the connection was closed instead."""
     until = monotonic() + idle_s
     waiting = asyncio.ensure_future(socket.receive())
     try:

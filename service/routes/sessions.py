@@ -182,11 +182,7 @@ async def add_photograph(session_id: str, call: Call) -> Response:
 
 
 def _check_size(record: PlanRecord, call: ApiCall) -> None:
-    """Check that the belief over a plan can be computed for every photograph.
-
-    Raises:
-        InvalidRequestError: the plan has too many poses.
-    """
+    """Check that the belief over a plan can be computed for every photograph."""
     poses = grid_size(record.plan, call.settings.grids.grid_step_m)
     if poses > MAX_POSES:
         raise errors.InvalidRequestError(
@@ -199,11 +195,7 @@ def _stored_pose(session: SessionRecord) -> StoredPose | None:
 
 
 def _limit_candidates(document: SessionDocument, call: ApiCall) -> SessionDocument:
-    """Return the request with at most as many candidates as the settings allow.
-
-    Raises:
-        InvalidRequestError: it states more.
-    """
+    """Return the request with at most as many candidates as the settings allow."""
     limit = call.settings.photographs.max_top_k
     if document.top_k > limit and "top_k" in document.model_fields_set:
         raise errors.InvalidRequestError([("top_k", f"is {document.top_k}; the limit is {limit} (max_top_k)")])
@@ -217,11 +209,7 @@ def _id(session_id: str) -> str:
 
 
 def _response(session: SessionRecord, media: str) -> Response:
-    """Return the answer about a session, or its pose on Earth alone.
-
-    Raises:
-        UnanchoredPlanError: the pose has no place on Earth: neither the venue nor the plan of the pose has an anchor.
-    """
+    """Return the answer about a session, or its pose on Earth alone."""
     if media == JSON:
         return Response(_answer(session), headers=VARY, media_type=JSON)
     stored = _stored_pose(session)

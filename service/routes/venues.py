@@ -283,11 +283,7 @@ def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
 
 
 def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
-    """Return the plans of a venue in a request.
-
-    Raises:
-        InvalidRequestError: too many plans, duplicates, or invalid ids.
-    """
+    """Return the plans of a venue in a request."""
     limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise InvalidRequestError(

@@ -123,11 +123,7 @@ class PhotographForm(PhotographFields):
 
     @property
     def odometry(self) -> Odometry | None:
-        """The motion for the core, in radians; None if it was not measured.
-
-        Raises:
-            InvalidMotionError: the motion is too long, or its covariance is none.
-        """
+        """The motion for the core, in radians; None if it was not measured."""
         if self.forward_m is None or self.turn_deg is None:
             return None
         right_m, turn = self.right_m or 0.0, math.radians(self.turn_deg)

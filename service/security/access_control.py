@@ -67,13 +67,6 @@ class AccessControl:
         """Return the caller of a request.
 
         Raises:
-            ExposedWithoutKeysError: a remote request while keys are off.
-            UnauthenticatedError: no valid key or token.
-            TooManyRefusedKeysError: too many invalid keys from the client.
-            RateLimitedError: the caller exceeded its rate limit.
-            StoreUnavailableError: the database is away, and the key is not cached.
-            IssuerUnavailableError: the issuer of tokens cannot be reached.
-            InsufficientScopeError: the key or token lacks the scope.
             HTTPException: unknown route or method.
         """
         if not self._needs_keys:
@@ -98,11 +91,7 @@ class AccessControl:
             await self._rates.charge(caller.identity, sent_bytes)
 
     async def count_photographs(self, caller: Caller, photographs: int) -> None:
-        """Count each photograph of a request against the rate limit of its caller's key.
-
-        Raises:
-            RateLimitedError, InvalidRequestError: see `RateLimits.count_photographs`.
-        """
+        """Count each photograph of a request against the rate limit of its caller's key."""
         if caller.identity is not None:
             await self._rates.count_photographs(caller.identity, photographs)
 
@@ -132,11 +121,7 @@ class AccessControl:
             self._check_local(request, "POST")
 
     def _check_local(self, request: Request, method: str) -> None:
-        """Refuse requests from other machines and from pages of other sites.
-
-        Raises:
-            ExposedWithoutKeysError: the request comes from another machine or site.
-        """
+        """Refuse requests from other machines and from pages of other sites."""
         server = request.scope.get("server")
         if not self._allow_anonymous and not is_local(server):
             raise errors.ExposedWithoutKeysError("over a loopback address", "" if server is None else str(server[0]))
@@ -167,12 +152,7 @@ class AccessControl:
             raise
 
     async def _holder_of_key(self, request: Request, presented: PresentedKey) -> Identity | None:
-        """Return the holder of a key; None if it is unknown or revoked.
-
-        Raises:
-            UnauthenticatedError: the key has expired; only the holder of its secret is told so.
-            StoreUnavailableError: the database is away, and the key is not cached.
-        """
+        """Return the holder of a key; None if it is unknown or revoked."""
         key = await self._keys.find(presented)
         if key is not None and key.is_expired(datetime.now(UTC)):
             add_log_fields(request, key=key.id, tenant=key.tenant)
@@ -187,11 +167,7 @@ def _client_of(request: Request) -> str:
 
 
 def _needed(request: Request) -> Permission:
-    """Return the scope that the request's route requires.
-
-    Raises:
-        HTTPException: unknown route or method.
-    """
+    """Return the scope that the request's route requires."""
     methods = permissions_needed(routed_path(request.scope))
     if not methods:
         raise HTTPException(404)

@@ -59,9 +59,6 @@ def check_origin(
         origins: values of `Origin`, which browsers send with changes.
         allowed: allowed host names besides this machine's, `*` for any.
         pages: allowed origins.
-
-    Raises:
-        ExposedWithoutKeysError: another host name, or a change requested by a page of another site.
     """
     for host in hosts:
         if not is_allowed_host(host, allowed):
@@ -78,9 +75,6 @@ def check_address(host: str, settings: Settings) -> None:
     Args:
         host: numeric address to listen on; `published_on` in the settings takes precedence.
         settings: settings of the service.
-
-    Raises:
-        ConfigError: not a loopback address, while keys are off and `allow_anonymous` is not set.
     """
     reached = settings.access.published_host or host
     if not settings.access.api_keys and not settings.access.allow_anonymous and not is_local((reached, 0)):

@@ -129,11 +129,7 @@ class TokenVerifier:
             return jwt.decode(token, renewed, registry=self._registry)
 
     def _check(self, token: jwt.Token) -> None:
-        """Check type, issuer, audience and times.
-
-        Raises:
-            JoseError: one of them is wrong.
-        """
+        """Check type, issuer, audience and times."""
         kind = token.header.get("typ")
         if (kind.lower() if isinstance(kind, str) else kind) not in _TYPES:
             raise UnauthenticatedError("the token's type must be 'at+jwt' or 'JWT'; send an access token")
@@ -166,11 +162,7 @@ class TokenVerifier:
         return Identity(f"oidc:{subject}", tenant, granted)
 
     async def _keys(self, *, renew: bool = False) -> KeySet:
-        """Return the issuer's keys, with `renew` such that were fetched lately.
-
-        Raises:
-            IssuerUnavailableError: they are not known, or were fetched too long ago.
-        """
+        """Return the issuer's keys, with `renew` such that were fetched lately."""
         age_s = self._age_s()
         if renew or age_s >= _STALE_S:
             await self._fetched()

@@ -32,23 +32,14 @@ class RateLimits:
         self._refused = RateLimitItemPerMinute(REFUSED_KEYS_PER_MINUTE, namespace="refused")
 
     async def count(self, caller: Identity) -> None:
-        """Count a request.
-
-        Raises:
-            RateLimitedError: the limit is exceeded.
-        """
+        """Count a request."""
         if self._burst:
             await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), caller.id, "second")
         if (limit := self._limit_of(caller)) is not None:
             await self._count(limit, caller.id, "minute")
 
     async def count_photographs(self, caller: Identity, photographs: int) -> None:
-        """Count each photograph of a request, which was counted once, as a request; all of them or none.
-
-        Raises:
-            RateLimitedError: they exceed the limit per minute now.
-            InvalidRequestError: they always exceed it.
-        """
+        """Count each photograph of a request, which was counted once, as a request; all of them or none."""
         limit = self._limit_of(caller)
         if limit is None or photographs <= 1:
             return
@@ -65,11 +56,7 @@ class RateLimits:
             await self._limiter.hit(limit, caller.id, cost=min(more, left))
 
     async def count_refused(self, client: str) -> None:
-        """Count an invalid key of a client address.
-
-        Raises:
-            TooManyRefusedKeysError: the limit is exceeded.
-        """
+        """Count an invalid key of a client address."""
         if not await self._limiter.hit(self._refused, _counter_of(client)):
             retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
             raise TooManyRefusedKeysError(self._refused.amount, retry_after_s)

@@ -35,11 +35,7 @@ def _port_mapping(value: str) -> str:
 
 
 def secure_url(value: str) -> str:
-    """Return a URL if what it sends cannot be changed on the way: https, or http on a loopback address.
-
-    Raises:
-        ValueError: another URL.
-    """
+    """Return a URL if what it sends cannot be changed on the way: https, or http on a loopback address."""
     try:
         parts = urlsplit(value)
         host, _port = parts.hostname or "", parts.port

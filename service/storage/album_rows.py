@@ -81,11 +81,7 @@ class AlbumRecord(NewAlbum):
         return "solved" if self.failure is None else "failed"
 
     def check_model(self, model_sha256: str) -> None:
-        """Check that the running model encoded the album's photographs.
-
-        Raises:
-            AlbumOutdatedError: another model did.
-        """
+        """Check that the running model encoded the album's photographs."""
         if self.model_sha256 != model_sha256:
             raise AlbumOutdatedError(self.id)
 
@@ -164,11 +160,7 @@ def is_due() -> ColumnElement[bool]:
 
 
 def find_album(connection: Connection, tenant: str, album_id: str, now: datetime) -> AlbumRecord:
-    """Return an album.
-
-    Raises:
-        UnknownAlbumError: the tenant has no such album, or it has expired.
-    """
+    """Return an album."""
     own = ALBUMS.c.id == album_id, ALBUMS.c.tenant == tenant, ALBUMS.c.expires_at >= now
     row = connection.execute(select_albums().where(*own)).one_or_none()
     if row is None:
@@ -179,12 +171,7 @@ def find_album(connection: Connection, tenant: str, album_id: str, now: datetime
 def lock_album(
     connection: Connection, tenant: str, album_id: str, now: datetime, expected: str | None = None
 ) -> AlbumRecord:
-    """Lock an album until the transaction ends, and return it.
-
-    Raises:
-        UnknownAlbumError: as `find_album`.
-        RevisionMismatchError: it has another revision than `expected`.
-    """
+    """Lock an album until the transaction ends, and return it."""
     connection.execute(select(ALBUMS.c.id).where(ALBUMS.c.id == album_id).with_for_update())
     found = find_album(connection, tenant, album_id, now)
     if expected not in (None, found.revision_id):
@@ -207,11 +194,7 @@ def change_album(connection: Connection, album: AlbumRecord, photographs: int, n
 
 
 def find_photograph(connection: Connection, album_id: str, photograph_id: str) -> PhotographRecord:
-    """Return a photograph of an album.
-
-    Raises:
-        UnknownAlbumPhotographError: the album has no such photograph.
-    """
+    """Return a photograph of an album."""
     own = ALBUM_PHOTOGRAPHS.c.album_id == album_id, ALBUM_PHOTOGRAPHS.c.id == photograph_id
     row = connection.execute(select_photographs(*own)).one_or_none()
     if row is None:

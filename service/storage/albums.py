@@ -113,12 +113,7 @@ class Albums:
             return [album_record(row) for row in connection.execute(query)]
 
     def delete(self, tenant: str, album_id: str, *, expected: str | None = None) -> None:
-        """Delete an album with its photographs.
-
-        Raises:
-            UnknownAlbumError: no such album, or it has expired.
-            RevisionMismatchError: it has another revision than `expected`.
-        """
+        """Delete an album with its photographs."""
 
         def work(connection: Connection) -> None:
             lock_album(connection, tenant, album_id, datetime.now(UTC), expected)
@@ -189,11 +184,6 @@ class Albums:
 
         Returns:
             the photograph, and True if it was added.
-
-        Raises:
-            UnknownAlbumError: no such album, or it has expired.
-            TooManyPhotographsError: the album has `limit` photographs.
-            StorageQuotaError: the tenant would store too many bytes.
         """
         now, columns = datetime.now(UTC), ALBUM_PHOTOGRAPHS.c
         with self._database.writing(grows_by=new.stored_bytes) as connection:
@@ -228,12 +218,7 @@ class Albums:
         ttl_s: float,
         expected: str | None = None,
     ) -> PhotographRecord:
-        """Store the correction of a photograph as JSON; None undoes it.
-
-        Raises:
-            UnknownAlbumError, UnknownAlbumPhotographError: no such album or photograph.
-            RevisionMismatchError: the photograph has another revision than `expected`.
-        """
+        """Store the correction of a photograph as JSON; None undoes it."""
         now = datetime.now(UTC)
         with self._database.writing() as connection:
             album = lock_album(connection, tenant, album_id, now)
@@ -250,11 +235,7 @@ class Albums:
     def delete_photograph(
         self, tenant: str, album_id: str, photograph_id: str, *, ttl_s: float, expected: str | None = None
     ) -> None:
-        """Delete a photograph; the rest is solved again.
-
-        Raises:
-            UnknownAlbumError, UnknownAlbumPhotographError, RevisionMismatchError: as `correct`.
-        """
+        """Delete a photograph; the rest is solved again."""
 
         def work(connection: Connection) -> None:
             now = datetime.now(UTC)
@@ -274,11 +255,7 @@ def _check_revision(found: PhotographRecord, expected: str | None) -> None:
 
 
 def _lock_place(connection: Connection, tenant: str, new: NewAlbum) -> None:
-    """Lock the plan or venue of a new album against deletion until the transaction ends.
-
-    Raises:
-        UnknownFloorPlanError, UnknownVenueError: it was deleted.
-    """
+    """Lock the plan or venue of a new album against deletion until the transaction ends."""
     table, place_id, error = (FLOORPLANS, new.plan_id, UnknownFloorPlanError)
     if place_id is None:
         table, place_id, error = (VENUES, new.venue_id, UnknownVenueError)

@@ -26,11 +26,7 @@ _PAGE = "docs/how-to/operate.md#backup-and-restore"
 
 
 def database_file(url: str) -> Path:
-    """Return the path of an SQLite database.
-
-    Raises:
-        ConfigError: the database is not an SQLite file.
-    """
+    """Return the path of an SQLite database."""
     parsed = make_url(url)
     if parsed.get_backend_name() != "sqlite" or not parsed.database:
         raise ConfigError(
@@ -41,13 +37,7 @@ def database_file(url: str) -> Path:
 
 
 def back_up(database: Path, backup: Path) -> int:
-    """Copy a database to a new file, also while the service uses it, and return the size (bytes) of the copy.
-
-    Raises:
-        ConfigError: no database, or the backup exists or cannot be written.
-        StoreFullError: the disk has no room for the copy.
-        StoreUnavailableError: the database cannot be read.
-    """
+    """Copy a database to a new file, also while the service uses it, and return the size (bytes) of the copy."""
     if not database.is_file():
         raise ConfigError(f"there is no database '{database}' (LALALOC_DATA_DIR, LALALOC_DATABASE_URL)")
     if backup.exists():
@@ -80,11 +70,6 @@ def restore(backup: Path, database: Path) -> Path | None:
 
     Returns:
         The file that the database was moved to; None if there was none.
-
-    Raises:
-        ConfigError: no backup, not a backup of this service or of a newer version, or files that cannot be written.
-        StoreFullError: the disk has no room for the copy.
-        StoreUnavailableError: the service is running.
     """
     if not backup.is_file():
         raise ConfigError(f"there is no file '{backup}'")
@@ -122,11 +107,7 @@ def _uri(file: Path) -> str:
 
 
 def _check_kind(copy: Path, backup: Path) -> None:
-    """Check that a copy is a database of the service; opening it as one would create the tables.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """Check that a copy is a database of the service; opening it as one would create the tables."""
     try:
         with closing(sqlite3.connect(_uri(copy), uri=True)) as connection:
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
@@ -137,11 +118,7 @@ def _check_kind(copy: Path, backup: Path) -> None:
 
 
 def _check(connection: sqlite3.Connection, file: Path) -> None:
-    """Check the structure of a database.
-
-    Raises:
-        ConfigError: it is damaged.
-    """
+    """Check the structure of a database."""
     found = [row[0] for row in connection.execute("PRAGMA quick_check(3)")]
     if found != ["ok"]:
         raise ConfigError(f"'{file}' is damaged: {'; '.join(found)[:300]}")
@@ -149,11 +126,7 @@ def _check(connection: sqlite3.Connection, file: Path) -> None:
 
 @contextmanager
 def _exclusively(database: Path) -> Iterator[None]:
-    """Keep all other processes out of a database; a missing or damaged one has none to keep out.
-
-    Raises:
-        StoreUnavailableError: another process uses it.
-    """
+    """Keep all other processes out of a database; a missing or damaged one has none to keep out."""
     if not database.is_file():
         yield
         return

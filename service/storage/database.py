@@ -114,12 +114,7 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Run a read-only transaction, which sees the database as of its first statement.
-
-        Raises:
-            StoreUnavailableError: the database cannot be reached, or did not answer in time.
-            StoreBusyError: the database answers, but no connection was free in time.
-        """
+        """Run a read-only transaction, which sees the database as of its first statement."""
         with self._transaction(self._engine_for_reading) as connection:
             yield connection
 
@@ -131,7 +126,6 @@ class Database:
             grows_by: approximate size of the stored data; 0 for changes that store little.
 
         Raises:
-            StoreUnavailableError, StoreBusyError: see `reading`.
             StoreFullError: the disk has no room for the data.
         """
         with self._transaction(self.engine_for_writing) as connection:
@@ -144,9 +138,6 @@ class Database:
 
         Args:
             work: deletes the data; called again after a failure for lack of space.
-
-        Raises:
-            StoreUnavailableError, StoreBusyError: see `reading`.
         """
         try:
             with self.writing() as connection:
@@ -183,12 +174,7 @@ class Database:
         disk.restore()
 
     def compact(self) -> None:
-        """Write an SQLite file anew without free space, in the mode that `give_back` needs; PostgreSQL does without.
-
-        Raises:
-            StoreUnavailableError: see `reading`; or another process writes.
-            StoreFullError: the disk has no room for a second file.
-        """
+        """Write an SQLite file anew without free space, in the mode that `give_back` needs; PostgreSQL does without."""
         if self.is_postgresql:
             return
         with self._driver_cursor() as cursor:
@@ -234,11 +220,7 @@ class Database:
         self._file = self._file or _identity(self._path)
 
     def _check_file(self) -> None:
-        """Check that the database file still exists, because SQLite would go on writing to a deleted one.
-
-        Raises:
-            StoreUnavailableError: the file was removed or replaced.
-        """
+        """Check that the database file still exists, because SQLite would go on writing to a deleted one."""
         if self._file is not None and _identity(self._path) != self._file:
             logging.getLogger(LOGGER_NAME).error("the database file is gone", extra={"fields": {"file": self._path}})
             self._failed_s = time.monotonic()

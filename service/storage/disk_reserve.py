@@ -42,11 +42,7 @@ class DiskReserve:
         self._log = Path(f"{database}-wal")
 
     def prepare(self) -> None:
-        """Prepare to open the database: release the reserve if the disk is too full for it.
-
-        Raises:
-            ConfigError: the database is missing or empty beside a log with data, which SQLite would delete.
-        """
+        """Prepare to open the database: release the reserve if the disk is too full for it."""
         if _size(self._database) == 0 and (lost := _size(self._log)) > 0:
             raise ConfigError(
                 f"'{self._database}' is missing or empty, but '{self._log.name}' beside it has {lost} bytes of its "
@@ -62,9 +58,6 @@ class DiskReserve:
         Args:
             connection: the transaction.
             growth: size (bytes) of the data.
-
-        Raises:
-            StoreFullError: it has not, even after the reserve is restored.
         """
         free_pages = connection.exec_driver_sql("PRAGMA freelist_count").scalar_one()
         page_bytes = connection.exec_driver_sql("PRAGMA page_size").scalar_one()

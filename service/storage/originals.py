@@ -33,11 +33,7 @@ class Originals:
             return connection.scalar(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
 
     def checked(self, revision_id: str) -> OriginalFile | None:
-        """Compare a revision's file with its digest, and return the file.
-
-        Raises:
-            DamagedDataError: the stored file has another digest.
-        """
+        """Compare a revision's file with its digest, and return the file."""
         columns = REVISIONS.c
         query = select(columns.plan_id, columns.original_sha256, columns.original_media_type)
         digest, size_bytes = hashlib.sha256(), 0

@@ -38,7 +38,6 @@ class PlanLookup:
             StoreUnavailableError: the database is unavailable, and the plan was not read recently; or too many reads
                 wait already.
             StoreBusyError: all connections are in use.
-            DamagedDataError: the plan's document is damaged.
         """
         if self._breaker.is_open and (known := self._recent(tenant, plan_id)) is not None:
             return known

@@ -118,11 +118,6 @@ class Plans:
             new: the new plan.
             keep: maximum number of revisions.
             expected: id of the revision that the plan must have; None for any.
-
-        Raises:
-            UnknownFloorPlanError: the tenant has no such plan.
-            RevisionMismatchError: the plan is not at revision `expected`.
-            StorageQuotaError: the tenant would store too many bytes.
         """
         record = new_record(new, plan_id, tenant, datetime.now(UTC))
         content = PlanContent.prepare(record.revision_id, new)
@@ -178,11 +173,7 @@ class Plans:
         return {key: FoundPlan(row, plans[key], current) for key, (row, current) in rows.items() if key in plans}
 
     def record(self, found: FoundPlan) -> PlanRecord:
-        """Parse a plan unless it is in memory. This is slow for large plans, and does not touch the database.
-
-        Raises:
-            DamagedDataError: the document is damaged.
-        """
+        """Parse a plan unless it is in memory. This is slow for large plans, and does not touch the database."""
         row, plan = found.row, found.plan
         if isinstance(plan, PlanDocument):
             document = plan
@@ -259,9 +250,6 @@ class Plans:
 
         Returns:
             True if the plan existed.
-
-        Raises:
-            RevisionMismatchError: the plan is not at revision `expected`.
         """
         deleted = self._database.freeing(lambda connection: self._delete(connection, tenant, plan_id, expected))
         self._cache.forget(tenant, plan_id)

@@ -160,8 +160,6 @@ class Sessions:
         """Store the state after the photograph of the request with a token, and end the claim.
 
         Raises:
-            SessionOutdatedError: the claim has expired, and another photograph took its place.
-            UnknownSessionError: the session was deleted meanwhile.
             StorageQuotaError: the tenant would store too many bytes.
         """
         size = ROW_BYTES + len(record.options.encode()) + len(state) + len(pose.encode())
@@ -209,11 +207,7 @@ class Sessions:
 
 
 def _lock(connection: Connection, tenant: str, place: PlanRecord | VenueRecord) -> None:
-    """Lock a plan or venue against deletion until the transaction ends.
-
-    Raises:
-        UnknownFloorPlanError, UnknownVenueError: it was deleted.
-    """
+    """Lock a plan or venue against deletion until the transaction ends."""
     table, error = (FLOORPLANS, UnknownFloorPlanError) if isinstance(place, PlanRecord) else (VENUES, UnknownVenueError)
     query = select(table.c.id).where(table.c.id == place.id, table.c.tenant == tenant)
     if connection.scalar(query.with_for_update(read=True)) is None:

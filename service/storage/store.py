@@ -150,11 +150,7 @@ class Store:
         return count
 
     def compact(self) -> None:
-        """Write an SQLite file anew without free space; afterwards it returns space after deletions.
-
-        Raises:
-            StoreUnavailableError: another process writes, or the disk has no room for a second file.
-        """
+        """Write an SQLite file anew without free space; afterwards it returns space after deletions."""
         self._database.compact()
 
     def give_back(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
@@ -167,11 +163,7 @@ class Store:
 
 
 def open_store(settings: Settings) -> Store:
-    """Open the configured database; the data folder of SQLite is created if it is missing.
-
-    Raises:
-        ConfigError: the data folder or the database cannot be used.
-    """
+    """Open the configured database; the data folder of SQLite is created if it is missing."""
     if settings.database.url is None:
         try:
             settings.data_dir.mkdir(parents=True, exist_ok=True)
@@ -200,12 +192,7 @@ def _default_stored_bytes(settings: Settings) -> int:
 
 
 def _migrate(database: Database) -> None:
-    """Run the missing migrations in one transaction; replicas that start together take turns.
-
-    Raises:
-        CommandError, RevisionError: a newer version of the service has migrated the database.
-        SQLAlchemyError: a migration failed; the database is unchanged.
-    """
+    """Run the missing migrations in one transaction; replicas that start together take turns."""
     script = ScriptDirectory(str(_MIGRATIONS))
     head = script.get_current_head()
     assert head is not None

@@ -76,9 +76,6 @@ class Account:
 
         Args:
             growth: additional bytes, which `used` does not contain.
-
-        Raises:
-            StorageQuotaError: they exceed the limit.
         """
         if growth > 0 and self.used.total + growth > self.limit:
             setting = "`lalaloc-service tenants limit`" if self.own_limit else "LALALOC_MAX_STORED_BYTES"
@@ -110,11 +107,7 @@ class StorageQuota:
             return {row.tenant: self._account(row) for row in connection.execute(query)}
 
     def check(self, connection: Connection, tenant: str, growth: int) -> None:
-        """Check early that a write fits, before it writes much; only `settle` is exact.
-
-        Raises:
-            StorageQuotaError: it does not fit.
-        """
+        """Check early that a write fits, before it writes much; only `settle` is exact."""
         self._find(connection, tenant).check(growth)
 
     def settle(
@@ -139,9 +132,6 @@ class StorageQuota:
 
         Returns:
             The tenant's account after the change.
-
-        Raises:
-            StorageQuotaError: the change exceeds the limit.
         """
         counted = {_column(name): value for name, value in asdict(change).items() if value}
         searched_bytes = change.plans + change.grids + change.venues

@@ -99,13 +99,6 @@ class VenueImports:
 
         Returns:
             The venue, and the records of the plans in order; none if an earlier attempt stored them.
-
-        Raises:
-            UnknownVenueError: the tenant has no such venue.
-            RevisionMismatchError: the venue has another revision.
-            InvalidRequestError: the venue would have too many plans.
-            TooManyFloorPlansError: the tenant would have too many plans.
-            StorageQuotaError: the tenant would store too many bytes.
         """
         batch = _Batch.of(tenant, token, plans)
         size = replace(batch.size, venues=ROW_BYTES * len(plans))

@@ -43,11 +43,7 @@ def insert_members(connection: Connection, venue_id: str, members: Sequence[Venu
 
 
 def check_count(connection: Connection, tenant: str, limit: int) -> None:
-    """Check the number of a tenant's venues; exact after `StorageQuota.settle`, which locks the tenant.
-
-    Raises:
-        TooManyVenuesError: there are more than `limit`.
-    """
+    """Check the number of a tenant's venues; exact after `StorageQuota.settle`, which locks the tenant."""
     own = select(func.count()).select_from(VENUES).where(VENUES.c.tenant == tenant)
     if (connection.scalar(own) or 0) > limit:
         raise TooManyVenuesError(limit)
@@ -127,11 +123,7 @@ def count_members(connection: Connection, venue_id: str) -> int:
 
 
 def check_members(connection: Connection, venue_id: str, limit: int) -> int:
-    """Check the number of a venue's plans after a change, and return it.
-
-    Raises:
-        InvalidRequestError: there are more than `limit`.
-    """
+    """Check the number of a venue's plans after a change, and return it."""
     count = count_members(connection, venue_id)
     if count > limit:
         fault = f"the venue would have {count} plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)"

@@ -134,13 +134,6 @@ class Venues:
             replace_members: `members` replace all plans.
             max_plans: maximum number of plans.
             expected: id of the revision that the venue must have; None for any.
-
-        Raises:
-            UnknownVenueError: the tenant has no such venue.
-            RevisionMismatchError: the venue has another revision.
-            InvalidRequestError: a plan of `members` is not the tenant's, one of `removed` is not in the venue, or the
-                venue has too many plans.
-            StorageQuotaError: the tenant would store too many bytes.
         """
         now = datetime.now(UTC)
         with self._database.writing(grows_by=ROW_BYTES * len(members)) as connection:
@@ -283,11 +276,7 @@ class Venues:
             return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
 
     def delete(self, tenant: str, venue_id: str, *, expected: str | None = None) -> bool:
-        """Delete a venue with its sessions and albums, but none of its plans; False without one.
-
-        Raises:
-            RevisionMismatchError: the venue has another revision than `expected`.
-        """
+        """Delete a venue with its sessions and albums, but none of its plans; False without one."""
 
         def work(connection: Connection) -> bool:
             try:
@@ -306,11 +295,7 @@ class Venues:
 
 
 def _check_plans(connection: Connection, tenant: str, plan_ids: Sequence[str]) -> None:
-    """Lock the plans of a tenant against deletion until the transaction ends.
-
-    Raises:
-        InvalidRequestError: a plan is not the tenant's.
-    """
+    """Lock the plans of a tenant against deletion until the transaction ends."""
     found: set[str] = set()
     own = FLOORPLANS.c.tenant == tenant
     for part in _parts(sorted(plan_ids)):

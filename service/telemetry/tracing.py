@@ -22,11 +22,7 @@ _EXPORT_TIMEOUT_S = 5.0
 
 
 def otlp_exporter(endpoint: str) -> SpanExporter:
-    """Return an OTLP/HTTP exporter to the URL of a collector, such as `http://collector:4318/v1/traces`.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
+    """Return an OTLP/HTTP exporter to the URL of a collector, such as `http://collector:4318/v1/traces`."""
     try:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
     except ImportError as error:

@@ -199,11 +199,7 @@ class PlanIndices:
         return fetched
 
     def _indexed(self, known: PlanList, fresh: Mapping[BlockKey, SortedPrototypes], base: Indexed | None) -> PlanIndex:
-        """Add prototypes to the file and index it.
-
-        Raises:
-            _NotInFileError: the file has no room for all plans.
-        """
+        """Add prototypes to the file and index it."""
         with self._building:
             file = self._opened()
             there = file.find(fresh)

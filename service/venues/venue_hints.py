@@ -49,11 +49,7 @@ class VenueHints:
 
     @classmethod
     def from_form(cls, form: HintFields | SessionDocument, anchor: Anchor | None) -> Self:
-        """Return the hints of a request.
-
-        Raises:
-            InvalidHintError: a point in a frame that the plans do not share.
-        """
+        """Return the hints of a request."""
         return cls(
             anchor=anchor,
             place=_on_earth(form, anchor),
@@ -136,9 +132,6 @@ class VenueHints:
             merged: the plans side by side.
             shares: see `shares`.
             partly: other plans, which may have the rooms, are not searched.
-
-        Raises:
-            InvalidHintError: none of the plans has a room.
         """
         counts, first = [len(plan.rooms) for plan in plans], merged.first_room
         level = None

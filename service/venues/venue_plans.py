@@ -205,11 +205,7 @@ def most_poses(query: Query, max_poses: int) -> int:
 
 
 def possible_plans(ready: PlanList, log_prior: Float[np.ndarray, "p"]) -> PlanList:
-    """Return the plans with a finite log prior.
-
-    Raises:
-        InvalidHintError: there is none.
-    """
+    """Return the plans with a finite log prior."""
     possible = np.isfinite(log_prior)
     if not possible.any():
         raise InvalidHintError("strict", f"none of the {len(ready)} floor plans that are ready matches all hints")

@@ -73,13 +73,7 @@ class VenueSearch:
     async def ready(
         self, venue_id: str, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
     ) -> tuple[PlanList, list[str]]:
-        """Wait for a plan to be ready; return the plans that are ready, and warnings about the others.
-
-        Raises:
-            InvalidHintError: a hint does not match the venue.
-            VenueUnsearchableError: the venue has no plans, or all of them failed.
-            VenueNotReadyError: no plan of the venue was ready by the deadline.
-        """
+        """Wait for a plan to be ready; return the plans that are ready, and warnings about the others."""
         begin = monotonic()
         while True:
             members = await read_plans()

@@ -43,9 +43,6 @@ def load_refiner(
         threads: threads of torch.
         by_latents: whether the model's poses are refined by latents. If so, torch is loaded and warmed up now, else
             with the first job that needs it: poses refined by walls need none, and torch takes a quarter of a gigabyte.
-
-    Raises:
-        RuntimeError: the bundle on disk has another digest.
     """
     bundle = Bundle.open(bundle_folder)
     if bundle.sha256 != model_sha256:

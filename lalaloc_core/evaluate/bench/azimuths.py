@@ -34,11 +34,7 @@ def bench_azimuths(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
 
 
 def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, Any]:
-    """Return the `AzimuthSummary` of a data set's test split, and its `confusion`: shares by true and predicted class.
-
-    Raises:
-        BundleError: the model predicts no wall profile.
-    """
+    """Return the `AzimuthSummary` of a test split, and its `confusion`: shares by true and predicted class."""
     (appearance,) = dataset.appearances
     measures = []
     for name in dataset.scenes("test"):

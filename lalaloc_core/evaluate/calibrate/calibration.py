@@ -74,13 +74,7 @@ class CalibrationConfig:
 
 
 def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
-    """Calibrate the bundle in a folder and return it.
-
-    Raises:
-        BundleError: there is no bundle, or it is damaged.
-        InvalidInputError: views are to be calibrated and the bundle has no encoder of views.
-        RunError: `config.out` holds predictions of another calibration.
-    """
+    """Calibrate the bundle in a folder and return it."""
     bundle, views = Bundle.open(folder), config.views
     if views and bundle.manifest.view is None:
         raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --views")

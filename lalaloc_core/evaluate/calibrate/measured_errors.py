@@ -118,11 +118,7 @@ def predicted_shares(
 
 
 def calibrate_errors(folder: Path, homes: int) -> Errors:
-    """Measure the errors of a bundle's predictions on generated validation homes, and store them in the bundle.
-
-    Raises:
-        InvalidInputError: the bundle has no encoder of views.
-    """
+    """Measure the errors of a bundle's predictions on generated validation homes, and store them in the bundle."""
     bundle = Bundle.open(folder)
     if bundle.manifest.view is None:
         raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --errors")

@@ -36,11 +36,7 @@ _ITERATIONS, _DECIMALS = 200, 3
 
 
 def fit_appearance(encoders: PhotographEncoder, scenes: Iterable[Scene]) -> tuple[tuple[float, ...], ...]:
-    """Return `MatchingWeights.appearance`, fitted on the photographs of scenes in their redrawn plans.
-
-    Raises:
-        BundleError: the model predicts no openings.
-    """
+    """Return `MatchingWeights.appearance`, fitted on the photographs of scenes in their redrawn plans."""
     likelihoods, classes = [], []
     for scene in scenes:
         plan = redrawn(scene.plan, zlib.crc32(scene.name.encode()))

@@ -70,11 +70,7 @@ class Answers:
 
 
 def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
-    """Fit the confidence model on queries with a known heading and with a searched heading.
-
-    Raises:
-        InvalidInputError: stored predictions of an earlier version lack a signal.
-    """
+    """Fit the confidence model on queries with a known heading and with a searched heading."""
     position, _ = _covariance_factors(known.own)
     position_searched, heading = _covariance_factors(searched.own)
     return ConfidenceModel(

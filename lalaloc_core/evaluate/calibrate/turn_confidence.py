@@ -94,11 +94,7 @@ class TurnPredictions(NamedTuple):
 
 
 def calibrate_turns(folder: Path, settings: TurnSettings) -> Bundle:
-    """Fit the confidence of turns, and store it in the bundle's manifest with its validation figures.
-
-    Raises:
-        InvalidInputError: the bundle has no encoder of views.
-    """
+    """Fit the confidence of turns, and store it in the bundle's manifest with its validation figures."""
     bundle = Bundle.open(folder)
     if bundle.manifest.view is None:
         raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --turns")

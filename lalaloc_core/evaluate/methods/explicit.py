@@ -59,12 +59,7 @@ class ExplicitLayout:
         self._grids: LRUCache[Any, _RenderedPoses] = LRUCache(GRIDS_CACHED)
 
     def locate(self, question: Question) -> Answer:
-        """Predict the layout, retrieve, re-sample and align.
-
-        Raises:
-            InvalidInputError: the heading is unknown.
-            BundleError: the bundle predicts no wall profile.
-        """
+        """Predict the layout, retrieve, re-sample and align."""
         if not question.heading_known:
             raise InvalidInputError("method 'explicit' needs the heading; run it with a known heading")
         plan, clock = question.plan, StageClock()

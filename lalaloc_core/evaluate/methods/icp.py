@@ -79,10 +79,6 @@ class Icp:
 
         An alignment that ends outside all rooms belongs to the room of its start. A photograph without valid depth has
         no answer.
-
-        Raises:
-            InvalidInputError: the heading is unknown.
-            DatasetError: the data set has no depth.
         """
         if not question.heading_known:
             raise InvalidInputError("method 'icp' needs the heading; run it with a known heading")

@@ -51,11 +51,7 @@ class Question:
         return profiles_at(self.plan, self.camera.position_m[None], room, np.zeros(1), columns)[0]
 
     def require_photograph(self) -> DatasetPhotograph:
-        """Return the photograph of a panorama query.
-
-        Raises:
-            InvalidInputError: the question has no photograph.
-        """
+        """Return the photograph of a panorama query."""
         if self.photograph is None:
             raise InvalidInputError(f"this {self.kind} query has no photograph; the method needs one")
         return self.photograph

@@ -117,11 +117,7 @@ class _CardWriter:
     """Data set and model of a run, opened to draw its queries; missing parts are added to `left_out`."""
 
     def __init__(self, run: Run, left_out: list[str]) -> None:
-        """Open data set and model.
-
-        Raises:
-            DatasetError, InvalidInputError: the data set is missing or has changed.
-        """
+        """Open data set and model."""
         self._run, self._reopened, self._left_out = run, ReopenedRun(run.info), left_out
         self._encoders = _open_encoders(self._reopened, left_out)
         self._errors_m = position_errors_m(run.predictions)
@@ -129,11 +125,7 @@ class _CardWriter:
         self._outcomes = outcomes(run.predictions)
 
     def card(self, index: int) -> Card:
-        """Draw one query.
-
-        Raises:
-            DatasetError: the scene is missing or has changed.
-        """
+        """Draw one query."""
         prediction = self._run.predictions[index]
         scene, camera = self._reopened.find_camera(prediction)
         question = self._reopened.question(scene, camera)

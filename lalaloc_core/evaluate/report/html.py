@@ -25,9 +25,6 @@ def write_report(runs: Sequence[Path], out: Path, *, pictures: Path | None = Non
     """Write the report on some runs.
 
     `pictures` is a folder for the page's pictures as files, None for none.
-
-    Raises:
-        RunError: a folder holds no run.
     """
     opened = open_runs(runs)
     charts = draw_charts(opened)

@@ -230,13 +230,6 @@ def evaluate_photographs(
     `galleries` is the number of galleries of every photograph, for each heading; 0 measures walls and openings only.
     `views_deg` are fields of view in which eight views of each photograph are measured, and localised in its galleries
     as well; `workers` is as in `run_evaluation`, and `command` repeats the evaluation.
-
-    Raises:
-        DatasetError: the photographs cannot be used.
-        BundleError: the model is missing, or predicts no wall profile.
-        InvalidPhotographError: views are asked for, and the model has no encoder of views.
-        RunError: `out` holds other runs.
-        InvalidInputError: all photographs are of quality "poor".
     """
     dataset = AnnotatedPhotographs(data)
     if not any(photograph.counts for photograph in dataset.photographs):

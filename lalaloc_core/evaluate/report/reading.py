@@ -42,11 +42,7 @@ class Run:
 
 
 def open_runs(folders: Sequence[Path]) -> list[Run]:
-    """Read and score runs.
-
-    Raises:
-        RunError: there is no folder, or a folder holds no run.
-    """
+    """Read and score runs."""
     if not folders:
         raise RunError("a report needs at least one run")
     several = len(folders) > 1

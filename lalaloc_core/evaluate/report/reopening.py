@@ -16,11 +16,7 @@ _SAME_PLACE_M = 1e-3
 
 
 class ReopenedRun:
-    """Data set and model of a run.
-
-    Raises:
-        DatasetError, InvalidInputError: the data set is missing or has changed.
-    """
+    """Data set and model of a run."""
 
     def __init__(self, info: RunInfo) -> None:
         self.info = info
@@ -42,11 +38,7 @@ class ReopenedRun:
         return PhotographEncoder(bundle)
 
     def find_camera(self, prediction: Prediction) -> tuple[Scene, Camera]:
-        """Return the scene and the camera of a query.
-
-        Raises:
-            DatasetError: the camera is missing or has another position.
-        """
+        """Return the scene and the camera of a query."""
         scene, truth = self._dataset.load(prediction.scene, []), prediction.truth
         camera = next((item for item in scene.cameras if item.name == prediction.camera), None)
         if camera is None:

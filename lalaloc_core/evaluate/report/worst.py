@@ -98,10 +98,6 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
     """Draw the worst queries of a run and return `SUMMARY_FILE`'s content without the queries: their common features.
 
     Queries without an answer come first, then by error.
-
-    Raises:
-        RunError: the folder holds no run, or one without predictions.
-        DatasetError, BundleError: data set or model are missing or have changed.
     """
     folder = RunFolder(run)
     info, predictions = folder.read_info(), folder.read_predictions()
@@ -203,11 +199,7 @@ class _QueryAnalyser:
         self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
 
     def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
-        """Return the analysis of a query, and its picture.
-
-        Raises:
-            DatasetError: the query is missing or has changed.
-        """
+        """Return the analysis of a query, and its picture."""
         scene, camera = self._run.find_camera(prediction)
         image = self._run.photograph(scene, camera).image(PICTURE_HEIGHT, PICTURE_WIDTH)
         found, height = prediction.final_pose, camera.camera_height_m

@@ -118,11 +118,6 @@ def train_ablation(
 
     `out` is the folder of all variants of one data set and budget. The validation scenes of `dataset` monitor the
     training. `workers` processes make batches; 0 for this process.
-
-    Raises:
-        ConfigError: the variant is unknown.
-        CheckpointError: `out` holds variants of another budget, configuration or data set.
-        DatasetError: a file of the data set cannot be used.
     """
     ablation = ABLATIONS.get(name)
     if ablation is None:

@@ -82,11 +82,7 @@ class AlbumCase:
 
 
 def album_entry(model: LocalModel, id: str, content: bytes, stated: StatedCamera, taken: Taken) -> AlbumPhotograph:
-    """Return the entry of a photograph's file.
-
-    Raises:
-        InvalidPhotographError: the file cannot be read.
-    """
+    """Return the entry of a photograph's file."""
     manifest = model.bundle.manifest
     view = open_photograph(
         content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), overview=ALBUM_SIDE
@@ -100,9 +96,6 @@ def predict_album(
     """Solve the photographs of a scene as one album; nothing is stated about their poses.
 
     Photographs that cannot be used are left out and their errors appended to `problems`; None raises the first error.
-
-    Raises:
-        DatasetError: the place is too large for an album, or a photograph cannot be used and `problems` is None.
     """
     cameras, photographs = list[Camera](), list[AlbumPhotograph]()
     for camera in scene.cameras:

@@ -48,11 +48,6 @@ def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = No
     """Localise every query of a run, or the rest of an interrupted run; return at most `info.limit` predictions.
 
     `workers` are processes of one thread each; 0 for this process, None for one per core.
-
-    Raises:
-        RunError: `folder` holds a run with another description.
-        DatasetError: a scene or photograph cannot be used, and `info.skip_bad` is off.
-        InvalidInputError: the split has no queries; a new folder is deleted again.
     """
     # Invalid descriptions fail here, before anything is written.
     names = list(build_dataset(info).scenes(info.split))
@@ -179,11 +174,7 @@ class _SceneEvaluator:
         self._layouts: dict[float, ChamferGrid] = {}
 
     def predict(self, camera: Camera, method: Method) -> Prediction:
-        """Localise one query.
-
-        Raises:
-            DatasetError: the photograph cannot be used.
-        """
+        """Localise one query."""
         info, scene = self._info, self._scene
         photograph = None
         if info.kind == "panorama":

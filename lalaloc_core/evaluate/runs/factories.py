@@ -81,11 +81,7 @@ _Settings = TypeVar("_Settings")
 
 
 def build_dataset(info: RunInfo) -> Dataset:
-    """Return the data set of a run.
-
-    Raises:
-        DatasetError: its folder does not exist or holds no data set.
-    """
+    """Return the data set of a run."""
     spheres = _spheres(info)
     return spheres if info.views is None else ViewScenes(spheres, **info.views)
 
@@ -114,13 +110,7 @@ def _spheres(info: RunInfo) -> Dataset:
 
 
 def build_method(info: RunInfo) -> Method:
-    """Return the method of a run, on one thread.
-
-    Raises:
-        BundleError: the model is missing, changed, or lacks a part that the method needs.
-        ConfigError: the method does not have a setting.
-        InvalidInputError: the method needs a bundle and the run names none.
-    """
+    """Return the method of a run, on one thread."""
     if info.method == "similarity":
         return SimilarityRetrieval(_settings(SimilaritySettings, info).metric)
     settings = _settings(LaLaLocSettings if info.method == "lalaloc" else NoSettings, info)
@@ -195,11 +185,7 @@ def describe_model(folder: Path) -> dict[str, str]:
 
 
 def choose_appearance(dataset: Dataset, furniture: str | None, lighting: str | None) -> Appearance:
-    """Return the appearance of a run's photographs; the data set's default for None.
-
-    Raises:
-        InvalidInputError: the data set has no such photographs.
-    """
+    """Return the appearance of a run's photographs; the data set's default for None."""
     default = dataset.appearances[0]
     appearance = Appearance(furniture or default.furniture, lighting or default.lighting)
     if appearance not in dataset.appearances:

@@ -52,12 +52,7 @@ class ReadViews:
 
 
 def read_photographs(encoders: PhotographEncoder, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
-    """Predict walls and openings of each photograph and compare them with the annotation.
-
-    Raises:
-        BundleError: the model predicts no wall profile.
-        DatasetError: a photograph cannot be read.
-    """
+    """Predict walls and openings of each photograph and compare them with the annotation."""
     manifest = encoders.manifest
     read = []
     for photograph in photographs:
@@ -79,13 +74,7 @@ def read_photographs(encoders: PhotographEncoder, photographs: Sequence[Annotate
 def read_views(
     encoders: PhotographEncoder, read: Sequence[ReadPhotograph], field_deg: float, per_photograph: int
 ) -> ReadViews:
-    """Compare level views of photographs, cut at equal angles, with their annotations, at the azimuths they show.
-
-    Raises:
-        BundleError: the model predicts no wall profile.
-        DatasetError: a photograph cannot be read.
-        InvalidPhotographError: the model has no encoder of views.
-    """
+    """Compare level views of photographs, cut at equal angles, with their annotations, at the azimuths they show."""
     size = patch_size(encoders.manifest)
     annotated_m = [item.photograph.profile_m(0, len(item.profile_m)) for item in read]
     constant = np.log(np.median(np.concatenate(annotated_m)))
@@ -128,9 +117,6 @@ def read_azimuths(
 
     Returns:
         the log of the predicted wall profile (m), the log of its scale, and `ReadPhotograph.class_scores`.
-
-    Raises:
-        BundleError: the model predicts no wall profile.
     """
     return _azimuths(encoders.spheres.query(image, 0.0, CameraHeight(camera_height_m, 0.0)), encoders.manifest.name)
 

@@ -128,11 +128,7 @@ class RunFolder:
         self.path = path
 
     def read_info(self) -> RunInfo:
-        """Return the description of the run.
-
-        Raises:
-            RunError: the folder holds no run, or one that this version cannot read.
-        """
+        """Return the description of the run."""
         path = self.path / RUN_FILE
         try:
             return build_config(RunInfo, json.loads(path.read_text(encoding="utf-8")), path=RUN_FILE)
@@ -158,11 +154,7 @@ class RunFolder:
             self.path.rmdir()
 
     def read_predictions(self) -> list[Prediction]:
-        """Return every complete prediction, without a last line that an interruption cut short.
-
-        Raises:
-            RunError: a line is not a prediction.
-        """
+        """Return every complete prediction, without a last line that an interruption cut short."""
         path = self.path / PREDICTIONS_FILE
         if not path.exists():
             return []

@@ -106,11 +106,7 @@ class Scores:
 
 
 def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
-    """Score the predictions of one run; `seed` is that of the bootstrap.
-
-    Raises:
-        InvalidInputError: there are no predictions.
-    """
+    """Score the predictions of one run; `seed` is that of the bootstrap."""
     if not predictions:
         raise InvalidInputError("there are no predictions to score; run `lalaloc evaluate` first")
     bootstrap = _Bootstrap([prediction.scene for prediction in predictions], np.random.default_rng(seed))
@@ -142,12 +138,7 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
 
 
 def score_run(folder: RunFolder) -> dict[str, Any]:
-    """Score a run, write the scores to its folder, and return them as plain data with null for infinite values.
-
-    Raises:
-        RunError: the folder holds no run.
-        InvalidInputError: the run has no predictions.
-    """
+    """Score a run, write the scores to its folder, and return them as plain data with null for infinite values."""
     info = folder.read_info()
     scores = without_infinity(dataclasses.asdict(score(folder.read_predictions())))
     report = {"label": info.label, "dataset": info.dataset, "skipped": len(info.skipped), **scores}

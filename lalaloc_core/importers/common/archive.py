@@ -22,9 +22,6 @@ def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, .
 
     Returns:
         The files by name.
-
-    Raises:
-        InvalidFloorPlanError: the archive is damaged, encrypted or exceeds a limit.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:

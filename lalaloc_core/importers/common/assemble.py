@@ -86,10 +86,6 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     """Make a plan from a sketch in metres, y up.
 
     Outlines with more vertices than `limits` allows are simplified within 2 cm.
-
-    Raises:
-        NoRoomError: the sketch has no rooms.
-        InvalidFloorPlanError: the plan is invalid.
     """
     columns = distinct(sketch.obstacles)
     check_network(columns)
@@ -169,9 +165,6 @@ def assemble_levels(
         options: options of the import.
         budget: limits of the import, which is told every level as it begins.
         make: makes the plan of a level.
-
-    Raises:
-        InvalidFloorPlanError: no level is chosen, none has a room, or the plan of one is invalid; names the level.
     """
     chosen = choose_levels(levels, options)
     if len(chosen) > (most := budget.limits.max_levels):
@@ -248,11 +241,7 @@ def _clean(
 
 
 def _without_low_rooms(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:
-    """Leave out rooms that no camera stands in, such as a cupboard under stairs, and say so.
-
-    Raises:
-        NoRoomError: all rooms are as low.
-    """
+    """Leave out rooms that no camera stands in, such as a cupboard under stairs, and say so."""
     low = [room for room in rooms if (room.ceiling_height_m or math.inf) <= DEFAULT_CAMERA_HEIGHT_M]
     total_m2 = sum(room.shape.area for room in rooms)
     lines = [

@@ -24,11 +24,7 @@ _MAX_PAIRS, _PAIRS_AT_A_TIME, _AREAS_AT_A_TIME = 20_000_000, 500_000, 200
 
 
 def check_outline(shape: BaseGeometry) -> None:
-    """Check the crossings of an outline that is about to be repaired.
-
-    Raises:
-        InvalidFloorPlanError: it crosses itself more often than its number of points allows.
-    """
+    """Check the crossings of an outline that is about to be repaired."""
     segments = _segments([shape])
     limit = min(_PER_OUTLINE + len(segments), _MAX_PER_OUTLINE)
     if _has_more_crossings(segments, limit):
@@ -40,11 +36,7 @@ def check_outline(shape: BaseGeometry) -> None:
 
 
 def check_network(lines: Sequence[BaseGeometry]) -> None:
-    """Check the crossings of lines that are about to be joined.
-
-    Raises:
-        InvalidFloorPlanError: they cross more often than their number allows.
-    """
+    """Check the crossings of lines that are about to be joined."""
     segments = _segments(lines)
     limit = _PER_NETWORK + len(segments)
     if _has_more_crossings(segments, limit):
@@ -63,11 +55,7 @@ def distinct(shapes: Sequence[Shape]) -> list[Shape]:
 def check_overlaps(
     shapes: Sequence[BaseGeometry], others: Sequence[BaseGeometry] | None = None, what: str = "areas"
 ) -> None:
-    """Check the number of areas that lie over one another, or over `others`, before each pair is compared.
-
-    Raises:
-        InvalidFloorPlanError: there are too many pairs for their number.
-    """
+    """Check the number of areas that lie over one another, or over `others`, before each pair is compared."""
     number = len(shapes) + len(others or ())
     limit, pairs = _PAIRS + _PAIRS_PER_AREA * number, 0
     tree = shapely.STRtree(list(shapes if others is None else others))

@@ -19,11 +19,7 @@ MAX_COORDINATE = 1e10
 
 
 def check_coordinates(points: Float[np.ndarray, "..."], where: str) -> None:
-    """Check coordinates before they are computed with.
-
-    Raises:
-        InvalidFloorPlanError: one is not finite, or beyond `MAX_COORDINATE`; names its place `where`.
-    """
+    """Check coordinates before they are computed with."""
     if not in_range(points):
         wrong = ~(np.abs(points) <= MAX_COORDINATE)
         raise InvalidFloorPlanError(
@@ -38,11 +34,7 @@ def in_range(points: Float[np.ndarray, "..."]) -> bool:
 
 
 def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
-    """Return the polygons of a geometry, made valid, without those of no area.
-
-    Raises:
-        InvalidFloorPlanError: a coordinate is not finite, or the geometry crosses itself too often.
-    """
+    """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:
         return []
     valid = geometry
@@ -62,11 +54,7 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
 
 
 def even_odd_polygons(rings: Iterable[shapely.Polygon]) -> list[shapely.Polygon]:
-    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule).
-
-    Raises:
-        InvalidFloorPlanError: the outlines cross too often.
-    """
+    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule)."""
     shapes: list[BaseGeometry] = list(rings)
     check_network(shapes)
     # In pairs, so that the time is not quadratic in the number of outlines.

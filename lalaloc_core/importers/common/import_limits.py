@@ -100,11 +100,7 @@ class Budget:
         return self.clock() - self.started_s
 
     def spend(self, entities: int = 1) -> None:
-        """Count entities and check the time.
-
-        Raises:
-            InvalidFloorPlanError: the number of entities or the time exceeds its limit.
-        """
+        """Count entities and check the time."""
         self.entities += entities
         if self.entities > self.limits.max_entities:
             raise InvalidFloorPlanError(
@@ -127,9 +123,6 @@ class Budget:
 
         Blocks, symbols and packed operators can draw hundreds of thousands of shapes from a few hundred bytes, and the
         time to read a file follows from its shapes. Shapes that a file states take at least `bytes_each` of it.
-
-        Raises:
-            InvalidFloorPlanError: there are too many for the size of the file.
         """
         limit = _COPIES + self.size_bytes // bytes_each
         if shapes > limit:
@@ -139,11 +132,7 @@ class Budget:
             )
 
     def check_time(self) -> None:
-        """Check the time.
-
-        Raises:
-            InvalidFloorPlanError: the import takes longer than `max_import_s`.
-        """
+        """Check the time."""
         if self.elapsed_s > self.limits.max_import_s:
             raise InvalidFloorPlanError(
                 f"reading the file takes more than {self.limits.max_import_s:g} s of CPU time (max_import_s); {_REMEDY}"

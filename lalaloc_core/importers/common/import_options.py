@@ -119,22 +119,14 @@ class ImportOptions:
 
 
 def check_units(units: object) -> str:
-    """Return a known unit.
-
-    Raises:
-        InvalidFloorPlanError: the unit is not in `METRES_PER_UNIT`.
-    """
+    """Return a known unit."""
     if not isinstance(units, str) or units not in METRES_PER_UNIT:
         raise InvalidFloorPlanError(f"units is {str(units)[:50]!r}; set it to one of {', '.join(METRES_PER_UNIT)}")
     return units
 
 
 def check_y_axis(y_axis: object) -> None:
-    """Check a direction of y.
-
-    Raises:
-        InvalidFloorPlanError: it is neither "up" nor "down".
-    """
+    """Check a direction of y."""
     if y_axis not in ("up", "down"):
         raise InvalidFloorPlanError(f"y_axis is {str(y_axis)[:50]!r}; set it to up or down")
 
@@ -168,11 +160,7 @@ def _parse(name: str, text: str) -> object:
 
 
 def _ordered_crop(crop: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Return the corners of a part as (left, lowest y, right, highest y).
-
-    Raises:
-        InvalidFloorPlanError: the part is empty, or a number is out of range.
-    """
+    """Return the corners of a part as (left, lowest y, right, highest y)."""
     x0, y0, x1, y1 = crop
     if not all(abs(number) <= _MAX_NUMBER for number in crop) or x0 == x1 or y0 == y1:
         raise InvalidFloorPlanError(

@@ -23,9 +23,6 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
     """Return the function from file coordinates to metres, the anchor, metres per unit, and the source of the scale.
 
     `crs` is the code of the coordinate reference system, None for WGS84.
-
-    Raises:
-        InvalidFloorPlanError: the coordinates cannot be converted.
     """
     points = np.concatenate([shapely.get_coordinates(shape) for shape in shapes])
     low, high = points.min(axis=0), points.max(axis=0)

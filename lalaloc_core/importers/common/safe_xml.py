@@ -17,11 +17,7 @@ def local_name(element: Element) -> str:
 
 
 def read_xml(content: bytes, budget: Budget) -> Element:
-    """Parse XML without entities and external references, and return its root.
-
-    Raises:
-        InvalidFloorPlanError: the XML is invalid, declares entities, or exceeds a limit.
-    """
+    """Parse XML without entities and external references, and return its root."""
     try:
         root = SafeElementTree.fromstring(content, forbid_dtd=False, forbid_entities=True, forbid_external=True)
     except defusedxml.EntitiesForbidden as error:

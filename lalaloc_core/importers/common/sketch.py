@@ -114,11 +114,7 @@ class Sketch:
 
 
 def choose_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:
-    """Return all storeys, lowest first, or only the one named by the option `level`.
-
-    Raises:
-        InvalidFloorPlanError: no storey has that name or number.
-    """
+    """Return all storeys, lowest first, or only the one named by the option `level`."""
     ordered = sorted(levels.values(), key=lambda item: (_height(item[0]), _order(item[0].name)))
     if options.level is None:
         return ordered

@@ -100,9 +100,6 @@ def import_features(
 
     `crs` is the code of the features' coordinate reference system, None for WGS84, and `format` the name of the file's
     format.
-
-    Raises:
-        InvalidFloorPlanError: there are no features, or their coordinates cannot be converted.
     """
     if not features:
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
@@ -147,11 +144,7 @@ def import_features(
 
 
 def _refuse_map(features: Sequence[Feature], format: str) -> None:
-    """Refuse a map of streets, whose buildings would become rooms.
-
-    Raises:
-        InvalidFloorPlanError: there are outdoor features, and none says that it is part of a building's inside.
-    """
+    """Refuse a map of streets, whose buildings would become rooms."""
     outdoor = sum(not _OUTDOOR.isdisjoint(feature.properties) for feature in features)
     if outdoor and all(_INSIDE.isdisjoint(feature.properties) for feature in features):
         raise InvalidFloorPlanError(

@@ -66,9 +66,6 @@ def drawing_scale(
     a unit has a length on paper, then the dimensions of the first drawing that has them, then the `guess`. `subject`
     names the file in the error message, and `check_time` raises an exception to stop. The option `multiply` multiplies
     any of them.
-
-    Raises:
-        InvalidFloorPlanError: neither the options nor the file give a scale, and there is no guess.
     """
     factor, source = _given_scale(options, subject, drawings, check_time, paper_m_per_unit, own, guess)
     if options.multiply is None:
@@ -116,11 +113,7 @@ def _given_scale(
 
 
 def _checked(metres_per_unit: float, source: str, subject: str) -> tuple[float, str]:
-    """Return a scale with its source.
-
-    Raises:
-        InvalidFloorPlanError: no drawing has it.
-    """
+    """Return a scale with its source."""
     low, high = _METRES_PER_UNIT
     if not low <= metres_per_unit <= high:
         raise InvalidFloorPlanError(

@@ -34,9 +34,6 @@ def drawn_panes(
         walls: the walls; with the areas between the lines of windows, if walls are drawn with two lines.
         least: lines that make a window. Two do in a gap; a wall with two faces is such a pair itself.
         check_time: called between steps; raises an exception to stop.
-
-    Raises:
-        InvalidFloorPlanError: too many lines lie over one another.
     """
     candidates = [line for line in lines if _LENGTH_M[0] <= line.length <= _LENGTH_M[1]]
     if not candidates or walls.is_empty:

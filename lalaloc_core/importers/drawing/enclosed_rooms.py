@@ -116,9 +116,6 @@ def enclose(
     `bodies` and `lines` are walls drawn as areas and as lines; `closers` are doors and windows drawn as areas in the
     walls. `check_time` is called between steps and raises an exception to stop. `rank` ranks a gap, lowest first; a gap
     of rank None is not an opening and stays open.
-
-    Raises:
-        InvalidFloorPlanError: the walls cross too often.
     """
     bodies, lines, closers = distinct(bodies), distinct(lines), distinct(closers)
     check_network([*bodies, *lines, *closers])

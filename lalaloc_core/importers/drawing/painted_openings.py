@@ -36,11 +36,7 @@ class PaintedWalls:
 def cut_painted(
     bodies: Sequence[tuple[shapely.Polygon, int]], patches: Sequence[Patch], check_time: Callable[[], None]
 ) -> PaintedWalls:
-    """Take what is hidden from walls, which come with their places in the order of painting, in metres.
-
-    Raises:
-        InvalidFloorPlanError: too many light areas lie over walls.
-    """
+    """Take what is hidden from walls, which come with their places in the order of painting, in metres."""
     tree = shapely.STRtree([patch.shape for patch in patches])
     visible: list[shapely.Polygon] = []
     hidden: dict[int, list[shapely.Geometry]] = {}

@@ -101,9 +101,6 @@ def choose_reading(
         leaves: leaves and swings of doors.
         builder: the report.
         budget: the budget.
-
-    Raises:
-        InvalidFloorPlanError: there are too many lines for walls, or the time is over.
     """
     readings: list[Reading] = []
     if marked:
@@ -163,11 +160,7 @@ def _count_doors_and_names(reading: Reading, drawing: Drawing, leaves: Sequence[
 
 
 def marked_rooms(drawing: Drawing, builder: ReportBuilder) -> list[Area]:
-    """Return the closed outlines on layers named after rooms: by a word for rooms, or by the use of a room.
-
-    Raises:
-        InvalidFloorPlanError: too many lie over one another.
-    """
+    """Return the closed outlines on layers named after rooms: by a word for rooms, or by the use of a room."""
     by_word = [area for area in drawing.areas if area.role == "room"]
     by_use = [area for area in drawing.areas if area.role is None and _use(area) is not None and is_room_like(area)]
     check_overlaps([area.shape for area in (*by_word, *by_use)], what="rooms")
@@ -312,11 +305,7 @@ def _is_stroke_of_letter(shape: shapely.Polygon) -> bool:
 
 
 def split_lines(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
-    """Return the straight pieces of lines.
-
-    Raises:
-        InvalidFloorPlanError: there are too many.
-    """
+    """Return the straight pieces of lines."""
     pieces = []
     for line in lines:
         points = shapely.get_coordinates(line)

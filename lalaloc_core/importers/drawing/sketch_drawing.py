@@ -62,11 +62,7 @@ _TRACED: Mapping[Role | None, TracePart] = {None: "line", "wall": "wall line", "
 
 @contextmanager
 def naming_text(letterings: Sequence[Lettering], subject: str) -> Iterator[None]:
-    """Say in errors that a file is a page of text if most of its texts are lines of prose.
-
-    Raises:
-        InvalidFloorPlanError: the error within the context.
-    """
+    """Say in errors that a file is a page of text if most of its texts are lines of prose."""
     try:
         yield
     except InvalidFloorPlanError as error:
@@ -79,11 +75,7 @@ def naming_text(letterings: Sequence[Lettering], subject: str) -> Iterator[None]
 
 
 def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:
-    """Find the rooms and openings of a drawing in metres, y up.
-
-    Raises:
-        InvalidFloorPlanError: the drawing has too many lines that could be walls, or the time is over.
-    """
+    """Find the rooms and openings of a drawing in metres, y up."""
     sketch = Sketch(fixtures=drawing.fixtures)
     drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)

@@ -160,11 +160,7 @@ def _from_tags(tags: Iterable[Any]) -> DxfDocument:
 
 
 def _check_blocks(document: DxfDocument, budget: Budget) -> None:
-    """Check the number of entities after expansion; nested arrays of blocks can multiply to billions.
-
-    Raises:
-        InvalidFloorPlanError: blocks are nested too deeply, or `max_entities` is exceeded.
-    """
+    """Check the number of entities after expansion; nested arrays of blocks can multiply to billions."""
     sizes: dict[str, int] = {}
 
     def size(name: str, depth: int) -> int:

@@ -32,11 +32,7 @@ _NEAR_STDS, _NEAR = 3.0, 0.1
 def find_unit(
     document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder, budget: Budget
 ) -> tuple[float, str]:
-    """Return the metres per unit and their source: the options, $INSUNITS, the dimensions, or the sizes of the parts.
-
-    Raises:
-        InvalidFloorPlanError: none gives a unit; the message names the likely one.
-    """
+    """Return the metres per unit and their source: the options, $INSUNITS, the dimensions, or sizes of parts."""
     code = document.header.get("$INSUNITS", 0)
     own_unit = _INSUNITS.get(code)
     if not drawing.shapes:

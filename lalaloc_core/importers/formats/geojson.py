@@ -53,11 +53,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 
 
 def parse_features(document: Any, budget: Budget) -> Iterator[Feature]:
-    """Yield the features of a GeoJSON document that have a geometry.
-
-    Raises:
-        InvalidFloorPlanError: the document or a geometry is invalid.
-    """
+    """Yield the features of a GeoJSON document that have a geometry."""
     if not isinstance(document, Mapping):
         raise InvalidFloorPlanError(f"the GeoJSON is of type {type(document).__name__}; it must be an object")
     kind = document.get("type")
@@ -106,11 +102,7 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
 
 
 def _count_numbers(value: Any, where: str) -> int:
-    """Count the numbers in nested lists.
-
-    Raises:
-        InvalidFloorPlanError: one is out of range.
-    """
+    """Count the numbers in nested lists."""
     pending, count = [value], 0
     while pending:
         item = pending.pop()

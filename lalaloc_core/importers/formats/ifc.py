@@ -53,7 +53,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 
     Raises:
         InvalidFloorPlanError: the model is invalid or has no spaces.
-        ModuleNotFoundError: ifcopenshell is not installed.
     """
     try:
         return _read(content, options, budget)
@@ -353,11 +352,7 @@ class _Meshes:
         return self._budget.elapsed_s < _FIXTURES_SHARE * self._budget.limits.max_import_s
 
     def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
-        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape.
-
-        Raises:
-            InvalidFloorPlanError: the shape has more than `max_entities` parts, or the time is over.
-        """
+        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape."""
         import ifcopenshell.geom
 
         self._budget.check_time()

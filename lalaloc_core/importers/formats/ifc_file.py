@@ -23,7 +23,6 @@ def open_model(content: bytes) -> Any:
 
     Raises:
         InvalidFloorPlanError: the file is truncated or damaged, or has a number or a placement that cannot be used.
-        ModuleNotFoundError: ifcopenshell is not installed.
     """
     import ifcopenshell
 
@@ -57,11 +56,7 @@ def open_model(content: bytes) -> Any:
 
 
 def _check_placements(model: Any) -> None:
-    """Check that placements are relative to few others, and not to themselves, which the library would follow forever.
-
-    Raises:
-        InvalidFloorPlanError: a placement is relative to itself, or to too many others.
-    """
+    """Check that placements are relative to few others, and not to themselves, which the library follows forever."""
     depths: dict[int, int] = {}
     for placement in model.by_type("IfcLocalPlacement"):
         chain: list[Any] = []

@@ -57,9 +57,6 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """Return an IMDF archive of one level with its venue, building, units and openings.
 
     IMDF has no windows: they are openings with the additional property `kind`, which other readers ignore.
-
-    Raises:
-        InvalidFloorPlanError: the plan has no anchor, so it has no coordinates on Earth.
     """
     if anchor is None:
         raise InvalidFloorPlanError("IMDF requires the place of the plan on Earth; set its anchor")

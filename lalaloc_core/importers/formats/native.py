@@ -77,9 +77,6 @@ def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> Importe
 
     The document can contain `units` and `y_axis` ("down"); the options take precedence. Keys that end in `_m` are
     always in metres. The same keys without it (`ceiling_height`) and all coordinates are in `units`.
-
-    Raises:
-        InvalidFloorPlanError: the plan is invalid.
     """
     if not isinstance(document, Mapping):
         raise InvalidFloorPlanError(f"the plan is of type {type(document).__name__}; it must be an object with 'rooms'")

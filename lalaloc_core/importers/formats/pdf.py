@@ -69,11 +69,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 def _read_plan(
     page: pypdfium2.PdfPage, found: PageContent, options: ImportOptions, budget: Budget
 ) -> tuple[ImportedPlan, ...]:
-    """Read the plan on a page.
-
-    Raises:
-        InvalidFloorPlanError: neither the page nor the options give its scale, or there are no rooms.
-    """
+    """Read the plan on a page."""
     builder = ReportBuilder("pdf", is_draft=True)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")

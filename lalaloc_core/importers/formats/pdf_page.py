@@ -64,11 +64,7 @@ class _Subpath:
 
 
 def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdfium2.PdfPage]:
-    """Open a document and one of its pages, counted from 1. The caller closes the document.
-
-    Raises:
-        InvalidFloorPlanError: the file is damaged or encrypted, or has no such page.
-    """
+    """Open a document and one of its pages, counted from 1. The caller closes the document."""
     try:
         document = pypdfium2.PdfDocument(content)
         pages = len(document)
@@ -89,11 +85,7 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
 
 
 def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
-    """Return the paths and texts of a page, and the share that pictures cover.
-
-    Raises:
-        InvalidFloorPlanError: the page has too many entities, or is painted over too often.
-    """
+    """Return the paths and texts of a page, and the share that pictures cover."""
     width, height = page.get_size()
     shapes = _count_shapes(page.raw, pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject, budget, 0)
     budget.check_copies(shapes, _BYTES_PER_SHAPE)

@@ -72,20 +72,12 @@ def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Bu
 
 
 def read_frame(source: Mapping[str, bytes]) -> MapFrame:
-    """Return the grid of a map from its files.
-
-    Raises:
-        InvalidFloorPlanError: the map is invalid.
-    """
+    """Return the grid of a map from its files."""
     return _open(source, Budget(DEFAULT_IMPORT_LIMITS)).frame
 
 
 def map_files(yaml_file: Path) -> dict[str, bytes]:
-    """Return the files of a map by name: a YAML file, and the picture that it names.
-
-    Raises:
-        InvalidFloorPlanError: a file cannot be read, or is invalid.
-    """
+    """Return the files of a map by name: a YAML file, and the picture that it names."""
     try:
         content = yaml_file.read_bytes()
         picture = yaml_file.parent / _text(_settings(content), "image")

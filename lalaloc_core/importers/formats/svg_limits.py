@@ -40,9 +40,6 @@ def check_work(root: Element, budget: Budget) -> None:
     """Count the elements after `<use>` is expanded, which can multiply to billions, and the text read for them.
 
     References are resolved as svgelements does: the last element with an id, and any character before it.
-
-    Raises:
-        InvalidFloorPlanError: a limit is exceeded, or an element contains itself.
     """
     by_id = {element.get("id"): element for element in root.iter() if "id" in element.attrib}
     styles = _style_sizes(root, _MAX_CHARACTERS + _PER_BYTE * budget.size_bytes)
@@ -100,9 +97,6 @@ def _style_sizes(root: Element, limit: int) -> dict[str, int]:
     """Return the characters of declarations by selector, and leave only complete rules in the elements.
 
     The library looks for rules and comments again from every character of those that do not end.
-
-    Raises:
-        InvalidFloorPlanError: joining them takes more than the limit.
     """
     sizes: dict[str, int] = {}
     written = 0

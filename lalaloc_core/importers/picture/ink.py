@@ -104,11 +104,7 @@ def read_ink(
 def blank_outside(
     picture: UInt8[np.ndarray, "h w"], box: tuple[float, float, float, float]
 ) -> UInt8[np.ndarray, "h w"]:
-    """Return a picture that is paper outside a box: left, top, right and bottom in pixels. Coordinates stay.
-
-    Raises:
-        InvalidFloorPlanError: the box has less than 64 pixels in the picture.
-    """
+    """Return a picture that is paper outside a box: left, top, right and bottom in pixels. Coordinates stay."""
     rows, columns = picture.shape
     x0, y0, x1, y1 = (round(number) for number in box)
     left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1, columns), min(y1, rows)

@@ -108,9 +108,6 @@ def sketch_picture(
     blue. Without `straighten`, the coordinates are those of the picture even if its lines are skew; without
     `has_symbols`, fixtures are not looked for. `letterings` are texts in plan metres: rooms with several names are
     divided at wide passages.
-
-    Raises:
-        InvalidFloorPlanError: the walls are too thick for a building, so the scale is wrong; or the time is over.
     """
     budget.begin("straightening the picture")
     ink = read_ink(gray, metres_per_pixel, warmth, straighten=straighten)

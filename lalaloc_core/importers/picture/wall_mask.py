@@ -236,11 +236,7 @@ def _without_furniture(
 
 
 def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[shapely.Polygon]:
-    """Return walls as straightened polygons in plan metres.
-
-    Raises:
-        InvalidFloorPlanError: they have too many outlines, or the time is over.
-    """
+    """Return walls as straightened polygons in plan metres."""
     contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
         return []

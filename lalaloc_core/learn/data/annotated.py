@@ -61,11 +61,7 @@ class AnnotatedPhotographs:
 
     @cached_property
     def photographs(self) -> tuple[AnnotatedPhotograph, ...]:
-        """All photographs, sorted by name.
-
-        Raises:
-            DatasetError: an annotation cannot be read, or there are none.
-        """
+        """All photographs, sorted by name."""
         photographs = tuple(read_annotation(path) for path in annotation_files(self.root))
         if not photographs:
             raise DatasetError("the folder has no annotated photographs", path=self.root)

@@ -97,11 +97,7 @@ def is_annotation(path: Path) -> bool:
 
 
 def read_annotation(path: Path) -> AnnotatedPhotograph:
-    """Read an annotation, and the size of its photograph.
-
-    Raises:
-        DatasetError: the annotation is damaged or impossible, or its photograph is missing.
-    """
+    """Read an annotation, and the size of its photograph."""
     document = read_json(path, scene=path.stem)
     reader = _Reader(path)
     reader.check_keys(document)

@@ -53,9 +53,6 @@ def assemble_plan(
     sets contain some and they hold no camera. Impossible openings are left out with a warning too. `path` and `units`
     ("coordinates are read as millimetres") are for error messages; `opening_kinds` are those that the data set draws
     completely.
-
-    Raises:
-        DatasetError: the rooms are not a valid plan.
     """
     if not outlines:
         raise DatasetError("the scene has no room", scene=scene, path=path)

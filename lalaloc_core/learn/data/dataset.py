@@ -39,11 +39,7 @@ class DatasetPhotograph(Protocol):
         ...
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Return the distance (m) along each pixel's ray, furniture included; NaN without a reading.
-
-        Raises:
-            DatasetError: the data set has no depth.
-        """
+        """Return the distance (m) along each pixel's ray, furniture included; NaN without a reading."""
         ...
 
 
@@ -154,11 +150,7 @@ class HomeScenes:
         return [f"{split}-{index:05d}" for index in range(self.homes)] if split in self.split_numbers else []
 
     def home_number(self, name: str) -> tuple[int, int]:
-        """Return the numbers of a scene's split and home.
-
-        Raises:
-            DatasetError: there is no such scene.
-        """
+        """Return the numbers of a scene's split and home."""
         split, _, index = name.partition("-")
         number = next((n for known, n in self.split_numbers.items() if known == split), None)
         if number is None or not index.isdecimal():
@@ -170,9 +162,6 @@ def load_scenes(dataset: Dataset, names: Iterable[str], problems: list[DatasetEr
     """Load scenes one after another.
 
     Scenes and cameras that cannot be used are left out and their errors appended to `problems`; None raises the first.
-
-    Raises:
-        DatasetError: a scene or camera cannot be used and `problems` is None.
     """
     for name in names:
         with collect_error(problems):

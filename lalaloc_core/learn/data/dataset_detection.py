@@ -16,12 +16,7 @@ _STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
 
 
 def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
-    """Open the data set in a folder; the format is a key of `DATASET_FORMATS`, or None to detect it.
-
-    Raises:
-        DatasetError: the folder does not exist, holds no data set of the given or of any known format, or holds
-            several and no format is given.
-    """
+    """Open the data set in a folder; the format is a key of `DATASET_FORMATS`, or None to detect it."""
     if not root.exists():
         raise DatasetError("the folder does not exist", path=root)
     if not root.is_dir():

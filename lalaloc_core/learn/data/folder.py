@@ -52,11 +52,7 @@ class OwnData:
     appearances = (Appearance(),)
 
     def scenes(self, split: Split) -> Sequence[str]:
-        """Return the names of a split's scenes in order.
-
-        Raises:
-            DatasetError: the table of splits is damaged or does not match the folders.
-        """
+        """Return the names of a split's scenes in order."""
         return [name for name, scene_split in self._splits.items() if scene_split == split]
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
@@ -163,11 +159,7 @@ def _read_plan(path: Path, scene: str) -> FloorPlan:
 
 
 def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *, scene: str | None) -> Iterator[_Row]:
-    """Yield the lines of a CSV file with a header, without empty lines.
-
-    Raises:
-        DatasetError: the file cannot be read, has wrong columns, or a line has too few or too many cells.
-    """
+    """Yield the lines of a CSV file with a header, without empty lines."""
     try:
         # Spreadsheets write a byte order mark.
         text = path.read_text(encoding="utf-8-sig")

@@ -57,11 +57,7 @@ class FilePhotograph:
             raise self._error(str(error), self.path) from error
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Return the distance (m) along each pixel's ray; NaN without a reading.
-
-        Raises:
-            DatasetError: the data set has no depth, or the file is missing or damaged.
-        """
+        """Return the distance (m) along each pixel's ray; NaN without a reading."""
         if self.depth_path is None:
             raise self._error("the data set has no depth", self.path)
         content = self._read(self.depth_path)

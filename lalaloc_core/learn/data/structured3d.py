@@ -92,11 +92,7 @@ class Structured3D:
 
     @cached_property
     def synthetic(self) -> Synthetic | None:
-        """Settings of generated scenes; None for Structured3D itself.
-
-        Raises:
-            DatasetError: the file has invalid values.
-        """
+        """Settings of generated scenes; None for Structured3D itself."""
         path = self.root / SYNTHETIC_FILE
         if not path.exists():
             return None

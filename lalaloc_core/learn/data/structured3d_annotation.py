@@ -59,11 +59,7 @@ class Annotation:
 
 
 def read_annotation(path: Path, scene: str) -> Annotation:
-    """Read the rooms of a scene.
-
-    Raises:
-        DatasetError: the annotation is damaged; names the room.
-    """
+    """Read the rooms of a scene."""
     return _Reader(read_json(path, scene=scene), scene, path).annotation()
 
 

@@ -50,9 +50,6 @@ class Zind:
         """Return all floors of a split's homes on disk, including those without a metric scale.
 
         A home whose file cannot be read is listed by its name alone, so that loading it raises the error.
-
-        Raises:
-            DatasetError: the partition file is missing or damaged.
         """
         homes = self._partition.get(_PARTITION_KEYS[split], [])
         return [name for home in homes if (self.root / home).is_dir() for name in self._floors_of(home)]

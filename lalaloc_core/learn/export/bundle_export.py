@@ -78,9 +78,6 @@ def export_bundle(
 
     The folder is created, or its bundle files are replaced. A bundle without an image encoder answers layout queries
     only. `training` has entries of the manifest's `training`.
-
-    Raises:
-        ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is unchanged.
     """
     for module in filter(None, (layout_encoder, image_encoder, decoder)):
         _freeze(module)
@@ -111,11 +108,7 @@ def _new_files(folder: Path) -> Iterator[Path]:
 
 
 def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, training: dict[str, Any]) -> Bundle:
-    """Add an encoder of views to a bundle, or replace it; its weights are rounded in place.
-
-    Raises:
-        ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
-    """
+    """Add an encoder of views to a bundle, or replace it; its weights are rounded in place."""
     _freeze(encoder)
     generator = torch.Generator().manual_seed(0)
     size = (_PARITY_BATCH, config.view.image_height, config.view.image_width, 4)
@@ -139,12 +132,7 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
 
 
 def add_object_network(bundle: Bundle) -> Bundle:
-    """Add the classifier of objects to a bundle, or replace it; no other network changes.
-
-    Raises:
-        ConfigError: the package of the pretrained weights is not installed.
-        ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
-    """
+    """Add the classifier of objects to a bundle, or replace it; no other network changes."""
     network = ObjectNetwork([number for _, number, _ in OBJECTS])
     _freeze(network)
     generator = torch.Generator().manual_seed(0)
@@ -162,11 +150,7 @@ def add_object_network(bundle: Bundle) -> Bundle:
 def replace_image_encoder(
     bundle: Bundle, config: TrainConfig, encoder: ImageEncoder, training: dict[str, Any]
 ) -> Bundle:
-    """Replace the image encoder of a bundle by one of the same ring; its weights are rounded in place.
-
-    Raises:
-        ExportError: the exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
-    """
+    """Replace the image encoder of a bundle by one of the same ring; its weights are rounded in place."""
     _freeze(encoder)
     with _new_files(bundle.folder) as work:
         parity = _export_image_network(work, config, encoder)
@@ -181,11 +165,7 @@ def replace_image_encoder(
 def reexport_networks(
     bundle: Bundle, config: TrainConfig, layout_encoder: LayoutNetwork, image_encoder: ImageEncoder | None
 ) -> Bundle:
-    """Export the ONNX networks of a bundle again from its own weights; only they and the digests change.
-
-    Raises:
-        ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
-    """
+    """Export the ONNX networks of a bundle again from its own weights; only they and the digests change."""
     with _new_files(bundle.folder) as work:
         for module in filter(None, (layout_encoder, image_encoder)):
             module.cpu().eval().requires_grad_(False)
@@ -296,11 +276,7 @@ def _export(
 
 
 def _parity(name: str, content: bytes, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
-    """Return the largest absolute difference between onnxruntime and torch.
-
-    Raises:
-        ExportError: the difference is not below `PARITY_TOLERANCE`.
-    """
+    """Return the largest absolute difference between onnxruntime and torch."""
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     actual = session.run(outputs, {key: value.numpy() for key, value in inputs.items()})
     expected = module(*inputs.values())

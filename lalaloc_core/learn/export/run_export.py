@@ -49,10 +49,6 @@ def export_run(
     encoder used as teacher (default: `folder`). A `layout_only` bundle answers layout queries only. `last` exports the
     last weights instead of the best by validation; with two stages this applies to the image encoder, because its
     teacher was the best layout encoder.
-
-    Raises:
-        CheckpointError: a stage has no checkpoint, or the branches have different networks.
-        ExportError: the exported networks differ from torch.
     """
     teacher = layout_from or folder
     # Branches trained together are exported from the same step.
@@ -91,10 +87,6 @@ def export_into(
         version: of the model.
         notes: additional entries of the manifest's `training`.
         last: export the last weights instead of the best by validation.
-
-    Raises:
-        CheckpointError: there is no checkpoint of such an encoder, or it has another ring than the bundle.
-        ExportError: an exported network differs from torch.
     """
     stages = [stage for stage in ("image", "view") if (folder / f"{stage}.pt").exists()]
     if not stages:
@@ -125,12 +117,7 @@ def export_into(
 
 
 def reexport_bundle(folder: Path) -> Bundle:
-    """Export the ONNX networks of the bundle in `folder` again, for example after the exporter has improved.
-
-    Raises:
-        BundleError: there is no bundle, or it is damaged.
-        ExportError: the exported networks differ from torch; the bundle is untouched.
-    """
+    """Export the ONNX networks of the bundle in `folder` again, for example after the exporter has improved."""
     bundle = Bundle.open(folder)
     bundle.check()
     manifest, image_encoder = bundle.manifest, None
@@ -144,13 +131,7 @@ def reexport_bundle(folder: Path) -> Bundle:
 
 
 def add_objects(folder: Path) -> Bundle:
-    """Add the pretrained classifier of objects to the bundle in `folder`.
-
-    Raises:
-        BundleError: there is no bundle, or it is damaged.
-        ConfigError: the package of the pretrained weights is not installed.
-        ExportError: the exported network differs from torch; the bundle is untouched.
-    """
+    """Add the pretrained classifier of objects to the bundle in `folder`."""
     bundle = Bundle.open(folder)
     bundle.check()
     return add_object_network(bundle)

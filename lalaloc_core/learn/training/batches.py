@@ -66,9 +66,6 @@ def load_batches(stream: Stream, workers: int) -> Iterator[Any]:
     """Yield batches from `workers` processes with one thread each; 0 makes them in this process.
 
     Each file that cannot be used is logged once, with a running number.
-
-    Raises:
-        DatasetError: a file cannot be used and training must not skip it.
     """
     options: dict[str, Any] = {}
     if workers:

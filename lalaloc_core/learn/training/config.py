@@ -248,11 +248,7 @@ class TrainConfig:
         return build_config(cls, raw, path="config")
 
     def with_settings(self, settings: dict[str, Any]) -> TrainConfig:
-        """Return a copy with some settings replaced, each by its path such as "image.optimiser.learning_rate".
-
-        Raises:
-            ConfigError: no such setting, or a value of the wrong type.
-        """
+        """Return a copy with some settings replaced, each by its path such as "image.optimiser.learning_rate"."""
         raw = self.to_dict()
         for path, value in settings.items():
             part, keys = raw, path.split(".")

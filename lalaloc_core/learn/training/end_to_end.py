@@ -22,11 +22,7 @@ from lalaloc_core.learn.training.stages import (
 
 
 class EndToEndStage(TrainingStage[ImageStageConfig]):
-    """Both branches at once: layouts as in stage 1, images against the layout latents, which get no image gradient.
-
-    Raises:
-        ConfigError: the architecture shares a head between its branches, or the configuration changes exposures.
-    """
+    """Both branches at once: layouts as in stage 1, images against the layout latents, which get no image gradient."""
 
     name = "end-to-end"
 

@@ -46,9 +46,6 @@ def run_stage(
     function of the modules (averaged if averaging is on) that returns metrics; it is called per checkpoint.
     `begun_from` is the origin of the initial weights, stored in checkpoints; a resumed run keeps its checkpoint's
     value.
-
-    Raises:
-        CheckpointError: `resume` is set, and the checkpoint is missing or has another configuration or other data.
     """
     path = folder / f"{stage.name}.pt"
     trainer = _Trainer(stage, device)
@@ -121,11 +118,7 @@ class _Trainer:
         return self.spent / self.budget
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """Update the networks once and return the losses by name.
-
-        Raises:
-            FloatingPointError: the loss is not finite; the last checkpoint remains valid.
-        """
+        """Update the networks once and return the losses by name."""
         for group in self.optimiser.param_groups:
             group["lr"] = group.get("factor", 1.0) * learning_rate(self.settings.optimiser, min(self.progress, 1.0))
         batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}

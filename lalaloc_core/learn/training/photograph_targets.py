@@ -36,10 +36,6 @@ def load_photographs(folders: Sequence[Path], teachers: Sequence[Path], height: 
     Panoramas with an annotation beside them use that; the others need teachers: a TensorFlow Lite segmenter, a bundle
     whose encoder of spheres reads them, or both. With both the walls and passages are the encoder's, and doors and
     windows the mean of the two.
-
-    Raises:
-        ConfigError: a teacher cannot be run, or there is none for a panorama without annotation.
-        DatasetError: a folder has no panorama, or one that cannot be read.
     """
     parts = []
     for folder in folders:

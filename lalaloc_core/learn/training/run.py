@@ -67,11 +67,6 @@ def train_stage(
         layout_from: of the image stage: bundle or run folder whose layout encoder a `folder` without one gets
             (default: `init_from`).
         teacher: of the image stage: run folder of the layout encoder to train against (default: `folder`).
-
-    Raises:
-        CheckpointError: initial weights, the layout encoder or the checkpoint are missing, or have other networks.
-        ConfigError: the stage does not support the architecture or the data.
-        DatasetError: a file of the data set, or a photograph, cannot be used.
     """
     torch.manual_seed(config.seed + _SEED_OF_STAGE[name])
     layout_encoder = _load_teacher(config, folder, teacher, layout_from or init_from) if name == "image" else None

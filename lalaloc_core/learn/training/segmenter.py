@@ -128,11 +128,7 @@ def _class_map(
 
 
 def load_segmenter(path: Path) -> Segment:
-    """Load a segmenter as a function of pictures of 512 x 512 pixels.
-
-    Raises:
-        ConfigError: the file or the package `ai-edge-litert` cannot be used.
-    """
+    """Load a segmenter as a function of pictures of 512 x 512 pixels."""
     try:
         # Only in the extra 'trunk', so a type checker may not find it.
         from ai_edge_litert.interpreter import Interpreter  # pyright: ignore[reportMissingImports]

@@ -104,11 +104,7 @@ class GeneratedSource:
         return np.random.default_rng([3, self.config.seed, visit])
 
     def groups(self, visit: int) -> list[Group]:
-        """Return stage 1's anchors with their neighbours; empty if the scene cannot be used.
-
-        Raises:
-            DatasetError: a file cannot be used and must not be skipped.
-        """
+        """Return stage 1's anchors with their neighbours; empty if the scene cannot be used."""
         stage = self.config.layout
         home, rng = home_of(TRAIN, self.config.seed, visit)
         drawn = sample_triplets(home.plan, stage.anchors_per_home, stage.triplets, rng)
@@ -129,11 +125,7 @@ class GeneratedSource:
         return groups
 
     def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
-        """Return stage 2's panoramas, `height` x `width`; empty if the scene cannot be used.
-
-        Raises:
-            DatasetError: a file cannot be used and must not be skipped.
-        """
+        """Return stage 2's panoramas, `height` x `width`; empty if the scene cannot be used."""
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(

@@ -149,11 +149,7 @@ def sample_styles(
 
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:
-    """Build the optimiser of the parameters in `config.only`, and freeze the others; AdamW decays matrices only.
-
-    Raises:
-        ConfigError: no parameter has such a name.
-    """
+    """Build the optimiser of the parameters in `config.only`, and freeze the others; AdamW decays matrices only."""
     if config.only:
         names = {f"{part}.{name}": p for part, module in modules.items() for name, p in module.named_parameters()}
         for wanted in config.only:

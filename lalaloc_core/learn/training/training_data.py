@@ -59,11 +59,6 @@ class TrainingData:
         """Load the photographs with their targets; None if there are no photographs.
 
         `size` is their (height, width) in pixels (default: the image encoder's).
-
-        Raises:
-            ConfigError: teachers without photographs, photographs with neither annotation nor teacher, an architecture
-                without openings, or a teacher that cannot be run.
-            DatasetError: a photograph cannot be read.
         """
         if not self.photographs:
             if self.teachers:
@@ -76,11 +71,7 @@ class TrainingData:
         return load_photographs(self.photographs, self.teachers, *(size or config.image_size))
 
     def validation(self, config: TrainConfig) -> list[Scene]:
-        """Load the validation scenes; empty if the data set has none.
-
-        Raises:
-            DatasetError: a scene cannot be used and `skip_bad` is off.
-        """
+        """Load the validation scenes; empty if the data set has none."""
         if self.dataset is None:
             generated = GeneratedScenes(
                 homes=self.validation_scenes,
@@ -108,9 +99,6 @@ class TrainingData:
         """Create the validation with panorama queries, in the data set's usual appearance.
 
         Without a `layout_encoder` the one being trained is used; `folder` caches rendered panoramas.
-
-        Raises:
-            DatasetError: a photograph cannot be read and `skip_bad` is off.
         """
         usual = None if self.dataset is None else self.dataset.appearances[0]
         problems: list[DatasetError] | None = [] if self.skip_bad else None

@@ -82,9 +82,6 @@ class ImageValidation:
     one being trained is used. Cameras without a photograph of the `usual` appearance use their first. `problems`
     receives the errors of unreadable photographs, which are left out; None raises the first error. `cache` is a file of
     the photographs, because rendering them is slow.
-
-    Raises:
-        DatasetError: a photograph cannot be read and `problems` is None, or no photograph can be read.
     """
 
     def __init__(

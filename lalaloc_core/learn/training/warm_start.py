@@ -55,11 +55,7 @@ class WarmStart:
     origin: dict[str, Any]
 
     def load_into(self, modules: dict[str, nn.Module]) -> None:
-        """Load these weights into modules; modules without weights here stay unchanged.
-
-        Raises:
-            CheckpointError: a module has other shapes.
-        """
+        """Load these weights into modules; modules without weights here stay unchanged."""
         for name, module in modules.items():
             if name in self.checkpoint.inference_weights:
                 # Exported networks also hold constants that the module computes itself.
@@ -79,12 +75,7 @@ def has_views(folder: Path) -> bool:
 
 
 def load_warm_start(folder: Path, stage: str, config: TrainConfig) -> WarmStart:
-    """Load the weights of a stage from a bundle or a run's folder (its best checkpoint, if any).
-
-    Raises:
-        CheckpointError: the folder has no such weights, or weights of other networks than `config` has.
-        BundleError: the bundle is damaged.
-    """
+    """Load the weights of a stage from a bundle or a run's folder (its best checkpoint, if any)."""
     is_bundle = (folder / MANIFEST_NAME).exists()
     start = bundle_weights(Bundle.open(folder), stage) if is_bundle else _run_weights(folder, stage)
     check_same_networks(stage, config, start.checkpoint.config, str(folder))
@@ -169,9 +160,6 @@ def check_same_networks(stage: str, config: TrainConfig, trained: TrainConfig, w
     """Check that two configurations have the same networks of a stage; the image stage uses both branches.
 
     The layout branches of `ring` and `trunk` are the same.
-
-    Raises:
-        CheckpointError: names the difference.
     """
     parts: dict[str, tuple[object, object]] = {"architecture": (config.architecture, trained.architecture)}
     if stage == "layout" and config.has_ring == trained.has_ring:
@@ -194,9 +182,6 @@ def find_checkpoint(stage: str, folder: Path, *, last: bool = False) -> Checkpoi
     """Load the checkpoint with the networks of stage "layout" or "image", possibly that of end-to-end training.
 
     The best checkpoint is preferred unless `last` is set.
-
-    Raises:
-        CheckpointError: there is no such checkpoint, or there are both.
     """
     own, joint = folder / f"{stage}.pt", folder / f"{JOINT}.pt"
     if own.exists() and joint.exists():

@@ -29,11 +29,7 @@ class Constraint:
 
 
 def constraint_of(ground: AlbumGround, photograph: AlbumPhotograph) -> Constraint:
-    """Return the constraint of a photograph's correction.
-
-    Raises:
-        InvalidCorrectionError: it names a plan or a room that the ground does not have.
-    """
+    """Return the constraint of a photograph's correction."""
     stated = photograph.correction
     assert stated is not None
     if stated.kind == "elsewhere":

@@ -66,11 +66,7 @@ _OPTIONAL: Mapping[str, frozenset[str]] = dict.fromkeys(get_args(CorrectionKind)
 
 
 def read_correction(document: object) -> Correction:
-    """Read a correction that `to_document` wrote.
-
-    Raises:
-        InvalidCorrectionError: a field is unknown or missing, or a value out of range.
-    """
+    """Read a correction that `to_document` wrote."""
     try:
         return build_config(Correction, document, path="correction")
     except (ConfigError, ValueError) as error:

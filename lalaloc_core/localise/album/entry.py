@@ -105,11 +105,7 @@ class AlbumPhotograph:
         return self.view.hfov.source not in ("estimated", "assumed")
 
     def to_bytes(self, bundle: Bundle) -> bytes:
-        """Return the entry as a file, without the correction.
-
-        Raises:
-            InvalidEntryError: the file would be too large even without descriptors.
-        """
+        """Return the entry as a file, without the correction."""
         assert self.view.features is not None
         features = zlib.compress(write_features(self.view, self.view.features.outputs, bundle), _COMPRESSION)
         taken = self.taken
@@ -182,13 +178,7 @@ def _colours(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "64"]:
 
 
 def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
-    """Read an entry.
-
-    Raises:
-        InvalidEntryError: the file is damaged, truncated or too large, or a value is out of range.
-        InvalidFeaturesError: the same of its features.
-        ForeignFeaturesError: the features are another model's.
-    """
+    """Read an entry."""
     header, body = _split(content)
     try:
         at = None if header.taken_at is None else datetime.fromisoformat(header.taken_at)

@@ -66,10 +66,6 @@ def solve_album(
         by_time: use the times at which the photographs were taken.
         progress: called with the number of photographs that were compared with the plan.
         pause: called often, after at most a photograph's comparison; what it raises ends the solve.
-
-    Raises:
-        InvalidInputError: there are too many photographs, or two with one id, or the place is too large.
-        InvalidCorrectionError: a correction names a plan or a room that the ground does not have.
     """
     if len(photographs) > MAX_PHOTOGRAPHS:
         raise InvalidInputError(f"the album has {len(photographs)} photographs; the limit is {MAX_PHOTOGRAPHS}")

@@ -192,10 +192,6 @@ def read_features(content: bytes, bundle: Bundle) -> Photograph:
 
     Returns:
         The photograph, with `features` instead of pixels.
-
-    Raises:
-        InvalidFeaturesError: the file is damaged, truncated or too large, or a value is out of range.
-        ForeignFeaturesError: the features are another model's.
     """
     version, header, body = _split(content)
     manifest = bundle.manifest
@@ -318,11 +314,7 @@ def _camera_model(photograph: Photograph) -> _CameraModel | None:
 
 
 def _camera_of(model: _CameraModel, projection: Projection) -> Camera:
-    """Return the camera of a header.
-
-    Raises:
-        InvalidPhotographError: the projection has no such camera, or a value is out of range.
-    """
+    """Return the camera of a header."""
     StatedCamera(projection=projection, intrinsics=model.intrinsics).check()
     assert projection in ("perspective", "fisheye")
     return camera_of_intrinsics(projection, model.width, model.height, model.intrinsics)

@@ -116,9 +116,6 @@ class SphereEncoder:
         Returns:
             The profile with the heading undone by whole pixels, and the rest: the heading (radians) of the layouts to
             compare it with.
-
-        Raises:
-            BundleError: the bundle's image encoder predicts no wall profile.
         """
         query = self.query(image, heading, CameraHeight(camera_height_m, 0.0))
         if query.profile is None:
@@ -132,9 +129,6 @@ class SphereEncoder:
         """Run the network on a sphere; return its ring (c, s) and all other outputs by name.
 
         All but the ring are averages over the sphere and its mirror image, which are more accurate.
-
-        Raises:
-            BundleError: the bundle has no image encoder.
         """
         if not self.predicts_profile:
             return {"ring": self.run(image[None], camera_height_m, ["ring"])[0][0]}
@@ -199,11 +193,7 @@ class SphereEncoder:
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
-    """Roll a sphere by whole pixels so that its centre looks (almost) along azimuth 0.
-
-    Returns:
-        The rolled sphere, the angle (radians) that was rolled away, and the rest of the heading (radians).
-    """
+    """Roll a sphere by whole pixels so that its centre looks (almost) along azimuth 0."""
     pixel = TWO_PI / image.shape[1]
     shift = round(heading / pixel)
     # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.

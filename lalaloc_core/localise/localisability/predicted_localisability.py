@@ -130,9 +130,6 @@ def localisability(plan: FloorPlan, manifest: Manifest, *, coarse: bool = False,
     """Return the probabilities at places spread over a plan; the work is bounded for plans of any size.
 
     A `coarse` prediction has the fewest places with one draw at each, and takes about a fifth of the time.
-
-    Raises:
-        InvalidInputError: the model has no measured errors.
     """
     errors, step_m = errors_of(manifest), spacing_m(plan)
     rng = np.random.default_rng(seed)

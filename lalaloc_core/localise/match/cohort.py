@@ -70,11 +70,7 @@ class Cohort:
 
     @classmethod
     def of_bundle(cls, bundle: Bundle) -> Cohort | None:
-        """Read the cohort of a bundle; None if it has none.
-
-        Raises:
-            BundleError: the file was altered, or is not a cohort.
-        """
+        """Read the cohort of a bundle; None if it has none."""
         if COHORT not in bundle.manifest.files:
             return None
         try:

@@ -67,11 +67,7 @@ class PoseGrid:
 
     @property
     def known_latents(self) -> Float[np.ndarray, "n d"]:
-        """Latents of the poses.
-
-        Raises:
-            InvalidInputError: the grid has none.
-        """
+        """Latents of the poses."""
         if self.latents is None:
             raise InvalidInputError("the pose grid has no latents, and the model compares latents: make the grid again")
         return self.latents

@@ -123,11 +123,7 @@ def known_heading(
 
 
 def stated_height(plan: FloorPlan, height_m: float | None, std_m: float | None = None) -> CameraHeight:
-    """Return the given camera height, else the plan's, else an unknown one.
-
-    Raises:
-        InvalidPoseError: the height is not positive and finite, or its deviation negative.
-    """
+    """Return the given camera height, else the plan's, else an unknown one."""
     if height_m is not None:
         return CameraHeight(height_m, DEFAULT_STD_M if std_m is None else std_m)
     usual = DEFAULT_STD_M if plan.states_camera_height else math.inf

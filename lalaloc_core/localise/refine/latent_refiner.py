@@ -109,11 +109,7 @@ class PoseRefiner:
 
     @classmethod
     def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> PoseRefiner:
-        """Load the layout encoder of a bundle.
-
-        Raises:
-            BundleError: weights are missing, altered, or do not fit the manifest's configuration.
-        """
+        """Load the layout encoder of a bundle."""
         manifest = bundle.manifest
         try:
             encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))

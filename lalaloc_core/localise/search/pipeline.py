@@ -212,9 +212,6 @@ def localise(
     The grid is the plan's, made for the query's camera height. `refine` is the last stage: "lpo" without a `refiner`,
     or with one that returns None, ends at "vdr". `clock` times the stages. With strict hints, a known heading is not
     doubted.
-
-    Raises:
-        InvalidHintError: the hints do not fit the plan, or strict hints exclude all of it.
     """
     if refiner is None and refine == "lpo":
         refine = "vdr"

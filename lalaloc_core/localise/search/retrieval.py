@@ -45,10 +45,6 @@ def grid_costs(
 
     The coarse pass (`coarse_pass.py`) excludes most pairs; the rest, or all of few pairs, are compared in full. With
     `best_only`, just the best are, which answers need, but not their probabilities.
-
-    Raises:
-        InvalidHintError: strict hints exclude every pose of the grid.
-        InvalidInputError: latents are compared, and the grid has none.
     """
     place_cost = _place_cost(plan, grid, query, weights, hints)
     if not config.compares_profiles(query):
@@ -91,10 +87,6 @@ def _choose(
 
     Pairs that cost `window` more than the best are improbable. `place_cost` is that of hints and fixtures, and
     `relaxed` the same if strict hints were not; the best pairs by that are compared as well.
-
-    Returns:
-        The pairs to compare in full, then the others: pose times the number of hypotheses, plus hypothesis; the number
-        of pairs to compare in full; coarse costs of the first of these, and of the others.
     """
     pairs, nothing = len(grid.poses) * matching_cost.hypotheses, np.empty(0, np.float32)
     if pairs <= _ALL_COMPARED:

@@ -94,9 +94,6 @@ def localise_sequence(
     The queries are in the order in which they were taken, their stated camera heights have the same relative error, and
     `motions` are between neighbours. `refiner` refines paths; None ends at the grid. `top_k` limits the candidates of
     each picture.
-
-    Raises:
-        InvalidMotionError: the number of motions is not one less than that of the pictures.
     """
     refine: SequenceRefine = "none" if refiner is None else "lpo"
     steps = localise_sequence_steps(plan, grid, encoder, queries, motions, refine=refine, top_k=top_k, config=config)

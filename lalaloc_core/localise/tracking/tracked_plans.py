@@ -114,11 +114,7 @@ class TrackedPlans:
         return share_searched(log_mass, searched[best], (by_plan / by_plan.sum())[best])
 
     def entered(self, state: TrackState) -> TrackState:
-        """Return a state with the poses and in the frame of these plans, without those that are left out.
-
-        Raises:
-            InvalidStateError: the grid of a plan has changed.
-        """
+        """Return a state with the poses and in the frame of these plans, without those that are left out."""
         poses = np.diff(self.graph.first)
         number = np.array([self.keys.index(plan.key) if plan.key in self.keys else -1 for plan in state.plans], int)
         for plan, own in zip(state.plans, number, strict=True):

@@ -117,7 +117,6 @@ def track_steps(
 
     Raises:
         InvalidStateError: the state is of another grid or model.
-        InvalidHintError: see `Hints.check`.
     """
     config, clock = config or LocaliseConfig(), clock or StageClock()
     weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching

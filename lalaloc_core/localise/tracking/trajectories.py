@@ -50,11 +50,7 @@ class Trajectory:
     warnings: tuple[str, ...] = ()
 
     def at(self, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
-        """Return the interpolated position and yaw at a time.
-
-        Raises:
-            InvalidMotionError: the time is outside the trajectory.
-        """
+        """Return the interpolated position and yaw at a time."""
         if not self.time_s[0] <= time_s <= self.time_s[-1]:
             raise InvalidMotionError(
                 f"a photograph was taken at {time_s:g} s; the odometry is from {self.time_s[0]:g} to "
@@ -80,11 +76,7 @@ class Trajectory:
 
 
 def read_trajectory(text: str, frame: Frame = "auto") -> Trajectory:
-    """Read a CSV or TUM file; `frame` is that of TUM poses.
-
-    Raises:
-        InvalidMotionError: a line is invalid, times do not rise, or no frame keeps the poses upright.
-    """
+    """Read a CSV or TUM file; `frame` is that of TUM poses."""
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     is_csv = bool(lines) and "," in lines[0]
     rows = _csv_rows(lines) if is_csv else [_tum_row(line, n) for n, line in enumerate(lines, 1)]
@@ -135,11 +127,7 @@ def _rise(position_m: Float[np.ndarray, "n 3"], floor: tuple[int, int]) -> float
 
 
 def _rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotations from the body to the world; columns are the axes of the body.
-
-    Raises:
-        InvalidMotionError: a quaternion has no length.
-    """
+    """Return rotations from the body to the world; columns are the axes of the body."""
     length = np.linalg.norm(quaternions, axis=1, keepdims=True)
     if not (length > 0.5).all():
         raise InvalidMotionError("a pose of the odometry has no rotation: qx qy qz qw must have the length 1")

@@ -89,11 +89,7 @@ class Odometry:
 
     @classmethod
     def of_stds(cls, forward_m: float, right_m: float, turn: float, stds: tuple[float, float, float]) -> Odometry:
-        """Return a motion with independent errors, given the standard deviations (m, m, radians).
-
-        Raises:
-            InvalidMotionError: see `__post_init__`; or a deviation is negative.
-        """
+        """Return a motion with independent errors, given the standard deviations (m, m, radians)."""
         for name, value in zip(("forward_std_m", "right_std_m", "turn_std"), stds, strict=True):
             if not value >= 0.0:
                 raise InvalidMotionError(f"{name} is {value:g}; it must not be negative")
@@ -111,11 +107,7 @@ class Odometry:
 
 
 def _checked_covariance(covariance: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance of a motion (m², radians²).
-
-    Raises:
-        InvalidMotionError: it is none, or a deviation is too large.
-    """
+    """Return the covariance of a motion (m², radians²)."""
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
         raise InvalidMotionError("covariance must have 3 rows of 3 finite numbers")
     variance = np.diagonal(covariance)

@@ -93,9 +93,6 @@ def share_out(scenes: int, split: Split | Literal["all"]) -> dict[Split, tuple[i
     """Choose the numbers of the scenes to write by split: each split's first ones that the paper does not exclude.
 
     "all" divides them like the official splits; each then gets at least one of three or more scenes.
-
-    Raises:
-        InvalidInputError: the number of scenes is below 1 or above the size of the splits.
     """
     numbers: dict[Split, tuple[int, ...]] = {name: scene_numbers(name) for name in SPLITS if split in ("all", name)}
     total = sum(len(available) for available in numbers.values())
@@ -119,10 +116,6 @@ def synthesise(settings: Synthesis, numbers: dict[Split, tuple[int, ...]], *, wo
 
     `numbers` are those of the scenes by split. One worker renders in this process. The result is the number of scenes
     written.
-
-    Raises:
-        InvalidInputError: the number of workers is below 1.
-        DatasetError: the folder has scenes of other settings, or cannot be written to.
     """
     if workers < 1:
         raise InvalidInputError(f"workers is {workers}; the minimum is 1")
@@ -166,9 +159,6 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
     """Render and write one scene; a failure leaves no files.
 
     `stop` is checked between rooms; when set, the scene is abandoned. The result is the number of panoramas written.
-
-    Raises:
-        DatasetError: the scene cannot be written.
     """
     settings, split = job.settings, SPLIT_NUMBERS[job.split]
     home, rng = home_of(split, settings.seed, job.number)

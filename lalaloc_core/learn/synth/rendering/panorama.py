@@ -54,9 +54,6 @@ class PanoramaRenderer:
     `supersample` is the number of rays per pixel along a column and along a row, or one number for both. Photographs
     average over their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too. `window` is the part
     of the sphere to render, None for all of it; it shows no traces of stitching, and nothing that covers the poles.
-
-    Raises:
-        InvalidInputError: `height` is odd, or a count of rays is less than one.
     """
 
     def __init__(

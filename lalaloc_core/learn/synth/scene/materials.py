@@ -42,11 +42,7 @@ class MaterialLibrary:
 
     @classmethod
     def create(cls, rng: np.random.Generator, textures: Path | None = None) -> MaterialLibrary:
-        """Generate pictures, and read those below `textures`: <category>/<material>/<picture>.jpg.
-
-        Raises:
-            InvalidInputError: `textures` is given and holds no picture.
-        """
+        """Generate pictures, and read those below `textures`: <category>/<material>/<picture>.jpg."""
         pictures: list[np.ndarray] = []
         procedural, photographs = {}, {}
         for category in CATEGORIES:
