@@ -57,7 +57,7 @@ class Load:
         size: size of the largest input that is accepted; the work is proportional to it.
         plan: the stored plan in the benchmark.
         connections: connections that repeat the work.
-        refusals: statuses of a refusal of the input itself, besides those for too many requests; 101 of a WebSocket.
+        refusals: statuses of a refusal of the input itself, besides those for too many requests.
     """
 
     routes: tuple[str, ...]
@@ -370,21 +370,6 @@ def _many_parts(caller: Caller, _stored: Stored, size: int) -> None:
     caller.send("POST", "/localise", part * size, _EMPTY_FORM)
 
 
-def _frames(frame: bytes) -> Work:
-    """Return the work of sending a frame to the WebSocket of a session again and again."""
-
-    def work(caller: Caller, stored: Stored, size: int) -> None:
-        answer = caller.send("POST", "/sessions", _body({"floorplan_id": stored.plan_id}))
-        if answer.status == 201:
-            session = f"/sessions/{answer.json()['id']}"
-            head = f"GET {session}/stream HTTP/1.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-            head += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="
-            caller.send_bytes(head, frame * size)
-            caller.send("DELETE", session)
-
-    return work
-
-
 def _administer(caller: Caller, _stored: Stored, _size: int) -> None:
     document = {"tenant": "new", "name": "n" * 200, "scopes": ["metrics", "read", "localise", "write"]}
     answer = caller.send("POST", "/admin/keys", _body(document))
@@ -412,8 +397,8 @@ _ALBUMS = ("POST /albums", f"POST {_ALBUM}/photographs", f"GET {_ALBUM}/events",
 _SESSIONS = ("POST /sessions", f"POST {_SESSION}/photographs")
 _TOO_LONG = frozenset({422})
 _EMPTY_FORM = "multipart/form-data; boundary=b"
-# Statuses of bodies of too many events, and of a WebSocket.
-_TOO_MANY_EVENTS, _SWITCHED = frozenset({400}), frozenset({101})
+# Status of bodies of too many events.
+_TOO_MANY_EVENTS = frozenset({400})
 LOADS = (
     _read("/floorplans", "pages of 500", 500, limit=None),
     _read(_PLAN),
@@ -488,9 +473,6 @@ LOADS = (
     ),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
-    Load(_SESSIONS[:1], "WebSocket: empty pings", _frames(b"\x89\x80\0\0\0\0"), 100_000, refusals=_SWITCHED),
-    Load(_SESSIONS[:1], "WebSocket: empty messages", _frames(b"\x82\x80\0\0\0\0"), 100_000, refusals=_SWITCHED),
-    Load(_SESSIONS[:1], "WebSocket: 1-byte frames", _frames(b"\x02\x81\0\0\0\0x"), 100_000, refusals=_SWITCHED),
     Load(("POST /geopose",), VERTICES_PLAN, _geopose),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
     Load(

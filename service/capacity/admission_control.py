@@ -232,7 +232,7 @@ class AdmissionLimits:
         queries: queries that are computed or wait for a thread.
         waiting_queries: queries that wait for a slot.
         reads: read-only requests.
-        streams: event streams, and WebSockets of sessions.
+        streams: event streams.
         tenant_bytes: bytes of bodies in progress per client, for clients without a limit of their own.
         total_bytes: bytes of bodies in progress.
         deadline_s: timeout of every request except streams and batches; other timeouts normally end a request earlier.
@@ -318,9 +318,7 @@ class Admission:
         )
         telemetry.gauge("lalaloc_queries_waiting", "Queries waiting for a slot.", lambda: self.queries.waiting)
         telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in progress.", lambda: self.reads.in_use)
-        telemetry.gauge(
-            "lalaloc_streams", "Open event streams and WebSockets of sessions.", lambda: self.streams.in_use
-        )
+        telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
 
     def drain(self) -> None:
         """Announce that the service will stop soon. Safe to call in a signal handler."""

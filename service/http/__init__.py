@@ -1,7 +1,6 @@
 """HTTP layer between the socket and the routes: uploads, idempotency, events, errors, headers.
 
-`http_protocol.py` and `socket_protocol.py` parse the bytes of a connection, paced by `paced_parsing.py`; `server.py`
-runs them.
+`http_protocol.py` parses the bytes of a connection, paced by `paced_parsing.py`; `server.py` runs it.
 Begin with `uploads.py` and `multipart.py`, which read bodies, and `middleware/`, which every request passes.
 Routes check form fields with `fields.py`, handle headers and cursors with `accept.py`, `conditional.py`,
 `cursors.py` and `idempotent_request.py`, and stream with `events.py`; `problems.py` answers errors,

@@ -160,7 +160,6 @@ class _BoundedProtocol(H11Protocol):
     _limit: asyncio.TimerHandle | None = None
     _pause: asyncio.TimerHandle | None = None
     _idle_since = 0.0
-    _is_socket = False
     _parser: PacedParser
     conn: _CountedConnection
 
@@ -188,6 +187,10 @@ class _BoundedProtocol(H11Protocol):
             self._pause = self.loop.call_later(self._bounds.dropping.wait_s(len(data)), self._parser.resume)
         self._watch()
 
+    def _should_upgrade(self) -> bool:
+        # There is no other protocol; the server would log each request for one.
+        return False
+
     def send_400_response(self, msg: str) -> None:
         """Refuse what the client sent, and close the connection."""
         if self.cycle is not None and not self.cycle.response_complete:
@@ -204,11 +207,6 @@ class _BoundedProtocol(H11Protocol):
             ):
                 self.transport.write(self.conn.send(event) or b"")
         self.transport.close()
-
-    def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        super().handle_websocket_upgrade(event)
-        self._parser.close()
-        self._is_socket = True
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -257,7 +255,7 @@ class _BoundedProtocol(H11Protocol):
         return cycle is not None and not cycle.response_complete
 
     def _watch(self) -> None:
-        if self._in_work or self._is_socket:
+        if self._in_work:
             self._unwatch()
         elif self._limit is None:
             delay_s = self.timeout_keep_alive + self._bounds.head_deadline_s

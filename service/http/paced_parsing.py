@@ -1,7 +1,7 @@
 """Bytes of a connection that are parsed a bounded number of events at a time.
 
-Events cost more than bytes: one read of 256 KiB can hold 40,000 chunks of a body or frames of a WebSocket, and parsing
-them at once would keep the event loop from all other connections.
+Events cost more than bytes: one read of 256 KiB can hold 40,000 chunks of a body, and parsing them at once would
+keep the event loop from all other connections.
 """
 
 from __future__ import annotations

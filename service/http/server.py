@@ -23,14 +23,9 @@ from starlette.types import Receive, Scope, Send
 from lalaloc_core.errors import ConfigError
 from service.capacity.admission_control import Admission, AdmissionLimits
 from service.http.http_protocol import bounded_protocol
-from service.http.socket_protocol import BoundedSocket
 from service.settings import Settings
 from service.telemetry import LOGGER_NAME
 
-# Messages of WebSockets; a photograph is sent in several.
-_MAX_MESSAGE_BYTES = 2**20
-# Interval of pings, which find connections without a client.
-_PING_INTERVAL_S = 20.0
 # Timeout for the head of a request, and for the rest of a refused body.
 _HEAD_DEADLINE_S = 10.0
 # Fractions of the stop deadline: for requests in progress, then for closing connections. The rest is for workers,
@@ -49,6 +44,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         app,
         # Not uvloop, even if it is installed, as with the extra `ray`.
         loop="asyncio",
+        ws="none",
         log_level="warning",
         # By default uvicorn trusts `X-Forwarded-For` of all clients on this machine.
         proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
@@ -74,26 +70,20 @@ def bound_uvicorn(app: FastAPI, settings: Settings) -> None:
     config = getattr(app.state, "server", None)
     if isinstance(config, uvicorn.Config) and isinstance(config.http, str):
         # Uvicorn has loaded the classes that were named; it listens after the app has started.
-        config.http_protocol_class, config.ws_protocol_class = _bound(config, settings)
+        config.http_protocol_class = _bound(config, settings)
 
 
-def _bound(config: uvicorn.Config, settings: Settings) -> tuple[type[asyncio.Protocol], type[asyncio.Protocol]]:
-    """Bound connections, heads, events and messages; return the protocols of requests and WebSockets."""
+def _bound(config: uvicorn.Config, settings: Settings) -> type[asyncio.Protocol]:
+    """Bound connections, heads and events; return the protocol."""
     limits = AdmissionLimits.from_settings(settings)
     # More than all slots, so that this service's refusals come before the server's own.
     least = limits.requests + limits.reads + limits.streams + 1
     max_connections = max_connections_of(max(settings.requests.max_connections, least), settings)
-    protocols = config.http, config.ws = bounded_protocol(_HEAD_DEADLINE_S, max_connections), BoundedSocket
-    config.ws_max_size = _MAX_MESSAGE_BYTES
-    # Photographs are compressed already.
-    config.ws_per_message_deflate = False
-    config.ws_ping_interval = _PING_INTERVAL_S
-    # The answer to a ping waits behind a photograph that is not read on.
-    config.ws_ping_timeout = limits.deadline_s
+    protocol = config.http = bounded_protocol(_HEAD_DEADLINE_S, max_connections)
     # Idle connections make room first; this applies if all of them have a request in progress.
     config.limit_concurrency = max_connections + 1
     config.timeout_keep_alive = math.ceil(settings.requests.keep_alive_s)
-    return protocols
+    return protocol
 
 
 class Server(uvicorn.Server):

@@ -18,7 +18,6 @@ from service.routes import (
     pages,
     plan_files,
     service_state,
-    session_stream,
     sessions,
     venues,
 )
@@ -34,7 +33,6 @@ ROUTERS = tuple(
         localise_batch,
         localise_sequence,
         sessions,
-        session_stream,
         albums,
         album_photographs,
         oscp,

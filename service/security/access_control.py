@@ -108,18 +108,6 @@ class AccessControl:
         except (errors.StoreUnavailableError, errors.IssuerUnavailableError, errors.UnauthenticatedError):
             return False
 
-    def check_handshake(self, request: Request) -> None:
-        """Refuse an authorised handshake of a WebSocket if a page of another site made it.
-
-        Pages can read the answers of other sites' WebSockets, so the rules are those of changes. Browsers do not send
-        keys with a handshake.
-
-        Raises:
-            ExposedWithoutKeysError: the handshake comes from a page of another site.
-        """
-        if not self._needs_keys:
-            self._check_local(request, "POST")
-
     def _check_local(self, request: Request, method: str) -> None:
         """Refuse requests from other machines and from pages of other sites."""
         server = request.scope.get("server")

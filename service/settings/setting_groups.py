@@ -268,9 +268,7 @@ class RequestSettings(SettingGroup):
         default=16, ge=0, description="Queries that wait for a slot; further ones get 503 before their upload is read."
     )
     max_reads: Count = Field(default=64, description="Read-only requests in progress; further ones get 503.")
-    max_streams: Count = Field(
-        default=64, description="Open event streams and WebSockets of sessions; further ones get 503."
-    )
+    max_streams: Count = Field(default=64, description="Open event streams; further ones get 503.")
     max_connections: Count = Field(
         default=1024, description="Open connections, including idle ones; further ones get 503."
     )

@@ -1,4 +1,4 @@
-"""Connections that send many events in few bytes: chunks, frames, pings, header lines, pipelined requests."""
+"""Connections that send many events in few bytes: chunks, header lines, pipelined requests."""
 
 from __future__ import annotations
 
@@ -10,28 +10,23 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from types import SimpleNamespace
 
 import httpx
 import pytest
-from fastapi import FastAPI, Request, WebSocket, WebSocketDisconnect
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from websockets.sync.client import connect
+from fastapi import FastAPI, Request
 
 from service.capacity.cpu_accounts import CpuAccounts
 from service.http import http_protocol, paced_parsing
 from service.http.http_protocol import MAX_HEAD_BYTES
 from service.http.paced_parsing import EVENTS_PER_TURN, PacedParser
-from service.http.socket_protocol import BoundedSocket
 from service.security.permissions import Caller, put_caller
 from service.settings import Settings
-from tests.service.conftest import wait_for
 from tests.service.test_server import served
 
 HOST = b"Host: localhost\r\n"
 
 
-def _app(received: list[object]) -> FastAPI:
+def _app() -> FastAPI:
     app = FastAPI()
 
     @app.get("/who")
@@ -46,26 +41,12 @@ def _app(received: list[object]) -> FastAPI:
     async def refused() -> str:
         return "no"
 
-    @app.websocket("/messages")
-    async def messages(socket: WebSocket) -> None:
-        await socket.accept()
-        try:
-            while True:
-                received.append(await socket.receive_bytes())
-        except WebSocketDisconnect:
-            received.append("closed")
-
     return app
 
 
 @pytest.fixture
-def received() -> list[object]:
-    return []
-
-
-@pytest.fixture
-def port(received: list[object]) -> Iterator[int]:
-    with served(_app(received), Settings()) as port:
+def port() -> Iterator[int]:
+    with served(_app(), Settings()) as port:
         yield port
 
 
@@ -208,82 +189,18 @@ def test_head_within_the_limits_passes(port: int) -> None:
     assert httpx.get(f"http://127.0.0.1:{port}/who", headers=headers).status_code == 431
 
 
+def test_upgrade_to_a_websocket_is_ignored_without_a_line_of_log(port: int, caplog: pytest.LogCaptureFixture) -> None:
+    upgrade = b"Connection: Upgrade, close\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+    with caplog.at_level(logging.WARNING), _connected(port) as connection:
+        connection.sendall(b"GET /who HTTP/1.1\r\n" + HOST + upgrade + b"\r\n")
+        assert _read_all(connection).startswith(b"HTTP/1.1 200 OK")
+    assert not caplog.records
+
+
 def test_other_version_of_http_is_refused(port: int) -> None:
     with _connected(port) as connection:
         connection.sendall(b"GET /who HTTP/9.9\r\n" + HOST + b"\r\n")
         assert _read_all(connection).startswith(b"HTTP/1.1 505 ")
-
-
-def test_tiny_messages_arrive_in_order(port: int, received: list[object]) -> None:
-    with connect(f"ws://127.0.0.1:{port}/messages") as client:
-        for number in range(2000):
-            client.send(bytes([number % 256]))
-    wait_for(lambda: received[-1:] == ["closed"])
-    assert received[:-1] == [bytes([number % 256]) for number in range(2000)]
-
-
-def _handshake(connection: socket.socket) -> None:
-    connection.sendall(
-        b"GET /messages HTTP/1.1\r\n" + HOST + b"Connection: Upgrade\r\nUpgrade: websocket\r\n"
-        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-    )
-    assert b"101" in connection.recv(4096)
-
-
-def test_answers_to_pings_that_nobody_reads_are_bounded(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    largest = [0]
-    handle_ping = WebSocketsSansIOProtocol.handle_ping
-
-    def watched(self: WebSocketsSansIOProtocol) -> None:
-        handle_ping(self)
-        largest[0] = max(largest[0], self.transport.get_write_buffer_size())
-
-    monkeypatch.setattr(WebSocketsSansIOProtocol, "handle_ping", watched)
-    monkeypatch.setattr(paced_parsing, "EVENTS", paced_parsing.Pace(0.0))
-    # Pings of 125 bytes, each answered with as many.
-    ping = b"\x89\xfd\0\0\0\0" + 125 * b"p"
-    with _connected(port) as flood:
-        _handshake(flood)
-        flood.settimeout(3.0)
-        with pytest.raises(TimeoutError):
-            # More than all buffers of the sockets hold.
-            flood.sendall(200_000 * ping)
-    assert 0 < largest[0] < 2**18
-    assert httpx.get(f"http://127.0.0.1:{port}/who").status_code == 200
-
-
-def test_all_pings_are_answered(port: int) -> None:
-    with _connected(port) as client:
-        _handshake(client)
-        client.sendall(1000 * b"\x89\x80\0\0\0\0")
-        answers = b""
-        while len(answers) < 2000:
-            answers += client.recv(4096)
-    assert answers == 1000 * b"\x8a\0"
-
-
-def test_text_that_is_not_utf_8_is_the_clients_error(
-    port: int, received: list[object], caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.ERROR), _connected(port) as client:
-        _handshake(client)
-        client.sendall(b"\x81\x82\0\0\0\0\xff\xfe")
-        # A close frame with code 1007.
-        assert client.recv(4096)[2:4] == (1007).to_bytes(2, "big")
-        wait_for(lambda: received == ["closed"])
-    assert not caplog.records
-
-
-def test_frames_before_the_handshake_is_answered_end_the_connection_without_an_error() -> None:
-    # Their error has no close frame, as the connection is not open yet.
-    connection = BoundedSocket.__new__(BoundedSocket)
-    closed: list[bool] = []
-    connection.conn = SimpleNamespace(close_sent=None)  # type: ignore[assignment]
-    connection.transport = SimpleNamespace(close=lambda: closed.append(True))  # type: ignore[assignment]
-    connection.queue = asyncio.Queue()
-    connection.handle_parser_exception()
-    assert closed == [True]
-    assert connection.queue.get_nowait()["type"] == "websocket.disconnect"
 
 
 class _Admission:
@@ -296,7 +213,7 @@ class _Admission:
 @pytest.fixture
 def charged(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, CpuAccounts]]:
     """Port and accounts of an app whose path `/keyed` is of a tenant; every reading of the clock takes a second."""
-    app, admission = _app([]), _Admission()
+    app, admission = _app(), _Admission()
     app.state.admission = admission
     clock = itertools.count()
     monkeypatch.setattr(paced_parsing, "thread_time", lambda: float(next(clock)))
@@ -331,12 +248,3 @@ def test_parsing_without_a_key_is_charged_to_the_address(charged: tuple[int, Cpu
         _read_all(flood)
     # A turn of the loop handles a bounded number of events; a refused body is not parsed.
     assert accounts.total_s("127.0.0.1") >= (1000 // EVENTS_PER_TURN if path == "/body" else 1)
-
-
-def test_frames_are_charged_to_the_client(charged: tuple[int, CpuAccounts]) -> None:
-    port, accounts = charged
-    with _connected(port) as client:
-        _handshake(client)
-        before_s = accounts.total_s("127.0.0.1")
-        client.sendall(1000 * b"\x89\x80\0\0\0\0")
-        wait_for(lambda: accounts.total_s("127.0.0.1") >= before_s + 1000 // EVENTS_PER_TURN // 4)

@@ -22,8 +22,6 @@ from lalaloc_core.bundle import default_bundle
 from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
-from tests.service.test_session_stream import put, received, refusal, stream
-from tests.service.test_sessions import begin
 
 CONFIGURATION = Path(__file__).parents[2] / "docker" / "nginx.conf"
 
@@ -208,15 +206,3 @@ def test_silent_replica_becomes_a_problem_document(tmp_path: Path) -> None:
         replicas = [stack.enter_context(httpx.Client(base_url=url)) for _ in range(2)]
         proxy = stack.enter_context(nginx(tmp_path, replicas, read_timeout="200ms", status=504))
         _assert_refused(*_answer_to(proxy, b"GET /floorplans HTTP/1.1\r\nHost: x\r\n\r\n"), 504, "deadline-exceeded")
-
-
-def test_proxy_passes_websockets(
-    start_app: StartApp, postgres: PostgresServer, panorama: bytes, tmp_path: Path
-) -> None:
-    with start_app(tmp_path / "a", database_url=postgres.new_database()) as a, nginx(tmp_path, [a, a]) as proxy:
-        session_id = begin(proxy, upload(proxy))
-        with stream(proxy, session_id) as connection:
-            put(connection, panorama, number=1)
-            assert received(connection)["session"]["photographs"] == 1
-        missing = refusal(proxy, "0" * 32)
-        assert (missing.status_code, missing.json()["type"]) == (404, "urn:lalaloc:problem:unknown-session")

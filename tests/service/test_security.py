@@ -71,8 +71,6 @@ def _documented() -> list[tuple[str, str]]:
 def _served() -> set[tuple[str, str]]:
     """Return method and path of every route of the app, documented or not."""
     free = OPEN_PATHS | PAGES
-    # Every message of a WebSocket is a request to one of the other routes.
-    free = free | {"/sessions/{session_id}/stream"}
     routes = [context for context in iter_route_contexts(create_app().routes) if context.path not in free]
     assert all(route.methods for route in routes), "mounted apps have no scopes"
     return {(method, str(route.path)) for route in routes for method in route.methods or ()}
