@@ -1,9 +1,11 @@
-"""Faults of a running service: crashes, overload, workers that die, and a database that stops.
+"""Faults of a running service: crashes, overload, workers that die, a database that stops, and what durability costs.
 
     python -m benchmarks.faults crash --plans 200 --kills 3
     python -m benchmarks.faults overload --seconds 30
     python -m benchmarks.faults soak --minutes 5 --every 3
     python -m benchmarks.faults outage --seconds 10
+    python -m benchmarks.faults sessions --sessions 12
+    python -m benchmarks.faults durability --writes 500 --folder /var/lib/lalaloc
 
 `crash` kills the service while plans are uploaded, and starts it again. Clients repeat unanswered uploads with the same
 `Idempotency-Key`, as the client library does. In the end every plan is stored exactly once and usable, no other plan is
@@ -19,20 +21,29 @@ query.
 
 `outage` stops PostgreSQL for some seconds, whose server programs it needs (Debian: `apt-get install postgresql`).
 Cached plans localise, other requests get 503, all recovers.
+
+`sessions` sends photographs to several sessions in a venue at once. Beyond the service's capacity they get 503 with
+`Retry-After` within seconds, not 504.
+
+`durability` measures storing a plan and claiming a lease on SQLite, with `synchronous=FULL`, as the service does, and
+`NORMAL`, which can lose the last commits in a power failure. The disk of the folder decides: with FULL it confirms
+every commit. Both take turns, so that other load on the disk affects both.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import random
 import sqlite3
+import statistics
 import sys
 import tempfile
 import threading
 import time
 import uuid
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -43,8 +54,12 @@ import httpx
 import psutil
 
 from benchmarks import harness
+from benchmarks.large_venues import make_venue, wait_until_ready
 from examples.truth import PLAN_PATH, read_poses
 from lalaloc_client import Client
+from lalaloc_core.floorplan import FloorPlan
+from service.storage import Store
+from service.storage.records import GridKey, NewPlan, Original
 from tests.service.postgres import postgres_programs, postgres_server
 
 _CLIENTS, _TIMEOUT_S = 6, 120.0
@@ -65,6 +80,8 @@ _WARM_UP_SHARE = 0.2
 _RESTART_TIMEOUT_S = 30.0
 # Outage.
 _MAX_RECOVERY_S, _OUTAGE_TIMEOUT_S = 5.0, 30.0
+# Sessions: a refused photograph is told so early; its deadline is 10 s.
+_PHOTOGRAPHS, _MAX_REFUSAL_S = 3, 5.0
 
 
 def main() -> int:
@@ -333,12 +350,72 @@ def _is_right(result: harness.LoadResult) -> bool:
     return result.answered.count > 0 and not result.failures + result.refused.count
 
 
+def sessions(options: argparse.Namespace) -> dict[str, Any]:
+    """Follow several sessions in a venue at once; return the waits for answers by status."""
+    waits: dict[int, list[float]] = defaultdict(list)
+    with harness.example_service() as service, httpx.Client(base_url=service.url, timeout=60.0) as client:
+        venue_id = make_venue(service, options.homes)
+        wait_until_ready(client, venue_id)
+
+        def follow(_number: int) -> None:
+            session = client.post("/sessions", json={"venue_id": venue_id}).raise_for_status().json()["id"]
+            for pose in read_poses()[:_PHOTOGRAPHS]:
+                begin = time.perf_counter()
+                files = {"photo": pose.picture.read_bytes()}
+                answer = client.post(f"/sessions/{session}/photographs", files=files)
+                waits[answer.status_code].append(time.perf_counter() - begin)
+                if answer.status_code == httpx.codes.SERVICE_UNAVAILABLE:
+                    time.sleep(float(answer.headers["Retry-After"]))
+
+        with ThreadPoolExecutor(options.sessions) as threads:
+            list(threads.map(follow, range(options.sessions)))
+    return {
+        "waits": {
+            str(status): {"count": len(waited), "median_s": statistics.median(waited), "longest_s": max(waited)}
+            for status, waited in waits.items()
+        },
+        "expected": {
+            "answers or refusals": waits.keys() <= {httpx.codes.OK, httpx.codes.SERVICE_UNAVAILABLE},
+            "refused within 5 s": max(waits[503], default=0.0) <= _MAX_REFUSAL_S,
+        },
+    }
+
+
+def durability(options: argparse.Namespace) -> dict[str, Any]:
+    """Store plans and claim leases with durable commits and without; return the times."""
+    content = PLAN_PATH.read_bytes()
+    plan = FloorPlan.from_dict(json.loads(content))
+    times_ms: dict[str, list[float]] = defaultdict(list)
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        # The pool has one connection, which keeps the mode.
+        stores = {mode: Store(f"sqlite:///{folder}/{mode}.sqlite3", connections=1) for mode in ("NORMAL", "FULL")}
+        for mode, store in stores.items():
+            with store._database._driver_cursor() as cursor:
+                cursor.execute(f"PRAGMA synchronous={mode}")
+        for _ in range(options.writes):
+            for mode, store in stores.items():
+                begin_s = time.perf_counter()
+                stored = store.plans.add("t", uuid.uuid4().hex, NewPlan(plan, Original(content)), limit=10**9)
+                between_s = time.perf_counter()
+                key = GridKey(revision_id=stored.revision_id, model_sha256="m", step_m=0.5, camera_height_mm=1500)
+                store.leases.claim(key, "owner", 60.0)
+                times_ms[f"plan, {mode}"].append(1e3 * (between_s - begin_s))
+                times_ms[f"lease, {mode}"].append(1e3 * (time.perf_counter() - between_s))
+        for store in stores.values():
+            store.close()
+    return {name: harness.Requests(times, math.nan).percentiles_ms() for name, times in times_ms.items()} | {
+        "expected": {}
+    }
+
+
 # Tests with the defaults of their options.
-_TESTS: dict[Callable[[argparse.Namespace], dict[str, Any]], dict[str, int | float]] = {
+_TESTS: dict[Callable[[argparse.Namespace], dict[str, Any]], dict[str, int | float | str]] = {
     crash: {"plans": 200, "kills": 3},
     overload: {"seconds": 30.0},
     soak: {"minutes": 5.0, "clients": 4, "every": 3.0},
     outage: {"seconds": 10.0},
+    sessions: {"sessions": 12, "homes": 61},
+    durability: {"writes": 500, "folder": "."},
 }
 
 

@@ -1,13 +1,16 @@
-"""Set-up that benchmarks share: the service with the example plan, locust's clients, health checks and memory."""
+"""Set-up that benchmarks share: the service with the example plan, clients of load tests, health checks and memory."""
 
 from __future__ import annotations
 
 import argparse
 import http.client
 import io
+import itertools
 import json
 import math
+import multiprocessing
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -17,11 +20,13 @@ import threading
 import time
 import urllib.request
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlsplit
@@ -36,6 +41,11 @@ from examples.truth import PLAN_PATH, TruePose, read_poses
 _JSON = "application/json"
 _REQUEST_TIMEOUT_S, _IDLE_S = 600.0, 5.0
 _START_S, _STOP_S, _HEALTH_TIMEOUT_S = 120.0, 40.0, 20.0
+_SMALL_BUFFER = 4096
+_REFUSED = "refused"
+_KINDS = ("lpo", "vdr", _REFUSED)
+# A position error above this is a wrong answer: the example photographs are located to a few centimetres.
+_MAX_ERROR_M = 0.5
 # Settings under which no request of a throughput test is refused.
 UNLIMITED = {"LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
 
@@ -153,7 +163,12 @@ class Answer:
 
     status: int
     content: bytes = b""
-    etag: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def etag(self) -> str:
+        """Entity tag of the content."""
+        return self.headers.get("ETag", "")
 
     def json(self) -> Any:
         """Return the parsed content."""
@@ -177,16 +192,15 @@ class Caller:
 
     def send(self, method: str, path: str, content: bytes = b"", media: str = _JSON, etag: str = "") -> Answer:
         """Send a request and read its answer; `etag` makes it conditional."""
-        headers = (
-            self._headers | ({"Content-Type": media} if content else {}) | ({"If-None-Match": etag} if etag else {})
-        )
+        headers = dict(self._headers)
+        headers |= ({"Content-Type": media} if content else {}) | ({"If-None-Match": etag} if etag else {})
         if time.monotonic() - self._used_at > _IDLE_S:
             # The service may have closed the idle connection; this opens a new one.
             self._connection.close()
         try:
             self._connection.request(method, path, content, headers)
             response = self._connection.getresponse()
-            answer = Answer(response.status, response.read(), response.headers.get("ETag", ""))
+            answer = Answer(response.status, response.read(), response.headers)
         except (http.client.HTTPException, OSError):
             # The service answers and closes while a refused body is still sent.
             self._connection.close()
@@ -195,23 +209,24 @@ class Caller:
         self._count(answer.status)
         return answer
 
-    def send_bytes(self, head: str, content: bytes) -> Answer:
+    def send_bytes(self, head: str, content: bytes = b"", hold_s: float = 0.0) -> Answer:
         """Send a head, which is completed, and bytes after it on a connection of its own; return the status.
 
-        Bytes after an upgrade wait until it is answered.
+        For `hold_s` after the status, nothing else of the answer is read.
         """
         lines = [head, f"Host: {self._connection.host}", *(f"{name}: {value}" for name, value in self._headers.items())]
         answer = b""
-        address = (self._connection.host, self._connection.port)
-        with suppress(OSError), socket.create_connection(address, _REQUEST_TIMEOUT_S) as connection:
+        with suppress(OSError), socket.socket() as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SMALL_BUFFER)
+            connection.settimeout(_REQUEST_TIMEOUT_S)
+            connection.connect((self._connection.host, self._connection.port))
             connection.sendall("\r\n".join([*lines, "", ""]).encode())
-            if "Upgrade:" in head:
-                answer = connection.recv(4096)
             # The service may answer and close before everything is sent.
             with suppress(ConnectionError):
                 connection.sendall(content)
-            while b"\r\n" not in answer and (part := connection.recv(4096)):
+            while b"\r\n" not in answer and (part := connection.recv(_SMALL_BUFFER)):
                 answer += part
+            time.sleep(hold_s)
         status = int(answer.split(b" ", 2)[1]) if answer.startswith(b"HTTP/") else 0
         self._count(status)
         return Answer(status)
@@ -220,7 +235,7 @@ class Caller:
 class Rehearsal(Caller):
     """Caller that sends nothing."""
 
-    def send_bytes(self, head: str, content: bytes) -> Answer:
+    def send_bytes(self, head: str, content: bytes = b"", hold_s: float = 0.0) -> Answer:
         """Return a broken connection."""
         return Answer(0)
 
@@ -246,40 +261,38 @@ def example_query(number: int, plan_id: str) -> tuple[bytes, str]:
 
 @dataclass(frozen=True)
 class Requests:
-    """Requests of one kind.
+    """Durations (ms) of requests of one kind, and their rate."""
 
-    `times_ms` is the number of requests by their duration, which locust rounds to two digits.
-    """
-
-    times_ms: Mapping[float, int]
+    durations_ms: Sequence[float]
     per_second: float
 
     @property
     def count(self) -> int:
         """Number of requests."""
-        return sum(self.times_ms.values())
+        return len(self.durations_ms)
 
     def percentile_ms(self, percent: float) -> float:
         """Return a percentile of the duration; NaN without requests."""
-        rank, seen = percent / 100.0 * self.count, 0
-        for milliseconds, count in sorted(self.times_ms.items()):
-            seen += count
-            if seen >= rank:
-                return milliseconds
-        return math.nan
+        ordered = sorted(self.durations_ms)
+        return ordered[max(math.ceil(percent / 100.0 * self.count), 1) - 1] if ordered else math.nan
 
     def percentiles_ms(self) -> dict[str, float]:
         """Return median, 95th and 99th percentile."""
-        return {f"p{percent}": self.percentile_ms(percent) for percent in (50, 95, 99)}
+        return {f"p{percent}": round(self.percentile_ms(percent), 1) for percent in (50, 95, 99)}
 
 
+@dataclass(frozen=True)
 class LoadResult:
-    """Result of a load test: requests by stage of their answer, refusals and failures."""
+    """Result of a load test: durations (ms) by stage of the answer, or of refusals with `Retry-After`; and failures."""
 
-    def __init__(self, entries: Sequence[Mapping[str, Any]], seconds: float) -> None:
-        self._entries, self._seconds = entries, seconds
-        self.failures = sum(entry["num_failures"] for entry in entries)
-        self.stages = {entry["name"]: entry["num_requests"] for entry in entries if entry["name"] in ("lpo", "vdr")}
+    durations_ms: Mapping[str, Sequence[float]]
+    failures: int
+    seconds: float
+
+    @property
+    def stages(self) -> dict[str, int]:
+        """Number of answers by their stage."""
+        return {name: len(times) for name, times in self.durations_ms.items() if name != _REFUSED}
 
     @property
     def answered(self) -> Requests:
@@ -289,64 +302,71 @@ class LoadResult:
     @property
     def refused(self) -> Requests:
         """Requests refused with `Retry-After`."""
-        return self._named("refused")
+        return self._named(_REFUSED)
 
     def _named(self, *names: str) -> Requests:
-        times: Counter[float] = Counter()
-        for entry in self._entries:
-            if entry["name"] in names:
-                times.update({float(time_ms): count for time_ms, count in entry["response_times"].items()})
-        return Requests(times, sum(times.values()) / self._seconds)
-
-    def row(self, *cells: object) -> str:
-        """Return a row of a Markdown table: rate, percentiles, share refined by LPO, refused or failed."""
-        answered, lpo = self.answered, self.stages.get("lpo", 0)
-        times = [f"{value:.0f} ms" for value in answered.percentiles_ms().values()]
-        share = f"{lpo / max(answered.count, 1):.0%}"
-        figures = (f"{answered.per_second:.1f}", *times, share, self.refused.count + self.failures)
-        return table_row(*cells, *figures)
+        times = [time_ms for name in names for time_ms in self.durations_ms.get(name, ())]
+        return Requests(times, len(times) / self.seconds)
 
 
-def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, *, pause_s: float = 1.0) -> LoadResult:
-    """Localise with several clients at once.
+def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float) -> LoadResult:
+    """Localise the example photographs with several clients at once, and check the answers.
 
-    The clients take the plans in turns and pause for `pause_s` after a refusal. `seconds` is rounded up.
+    The clients take the plans in turns and pause for about a second after a refusal. They run in a process of their
+    own, whose clock no other thread delays.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report"
-        options = ["--run-time", f"{math.ceil(seconds)}s", "--pause", f"{pause_s}", "--json-file", str(report)]
-        with _locust("TenantUser", url, plan_ids, clients, options) as process:
-            process.wait()
-        return LoadResult(json.loads(report.with_suffix(".json").read_text()), math.ceil(seconds))
-
-
-@contextmanager
-def busy_tenant(url: str, plan_id: str, picture: Path, clients: int, address: str) -> Iterator[None]:
-    """Send a picture with several clients of another tenant until the block ends.
-
-    Without API keys the clients' local `address` is their tenant.
-    """
-    options = ["--picture", str(picture), "--source-address", address]
-    with _locust("BusyUser", url, [plan_id], clients, options):
-        yield
-
-
-@contextmanager
-def _locust(
-    user: str, url: str, plan_ids: Sequence[str], clients: int, options: Sequence[str]
-) -> Iterator[subprocess.Popen[bytes]]:
-    """Run locust in a process of its own, whose clock no other thread delays."""
-    command = [sys.executable, "-m", "locust", "-f", "benchmarks/locustfile.py", "--headless", "--only-summary"]
-    command += ["--host", url, "--plan-ids", ",".join(plan_ids), "--users", str(clients), "--spawn-rate", str(clients)]
-    command += ["--loglevel", "ERROR", "--exit-code-on-error", "0", "--stop-timeout", "30", *options, user]
-    # Failures and percentiles go to standard error; standard output holds the tables of the benchmarks.
-    process = subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr)
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_send_load, args=(url, plan_ids, clients, seconds, theirs), daemon=True)
+    process.start()
+    # The end of the process ends the waiting for its result.
+    theirs.close()
     try:
-        yield process
+        return ours.recv()
     finally:
-        if process.poll() is None:
-            process.kill()
-            process.wait()
+        process.kill()
+        process.join()
+
+
+def _send_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, pipe: Connection) -> None:
+    durations_ms: dict[str, list[float]] = defaultdict(list)
+    failures: Counter[str] = Counter()
+    poses = read_poses()
+    queries = {plan_id: [example_query(number, plan_id) for number in range(len(poses))] for plan_id in plan_ids}
+    end = time.monotonic() + seconds
+
+    def repeat(client: int) -> None:
+        caller = Caller(url)
+        for number in itertools.count(client):
+            if time.monotonic() > end:
+                return
+            begin = time.perf_counter()
+            answer = caller.send("POST", "/localise", *queries[plan_ids[client % len(plan_ids)]][number % len(poses)])
+            kind = _kind_of(answer, poses[number % len(poses)])
+            if kind in _KINDS:
+                durations_ms[kind].append(1e3 * (time.perf_counter() - begin))
+            else:
+                failures[kind] += 1
+            if kind == _REFUSED:
+                time.sleep(random.uniform(0.5, 1.5))
+
+    with ThreadPoolExecutor(clients) as threads:
+        list(threads.map(repeat, range(clients)))
+    for failure, count in failures.items():
+        print(f"{count} times: {failure}", file=sys.stderr)
+    pipe.send(LoadResult(dict(durations_ms), failures.total(), seconds))
+
+
+def _kind_of(answer: Answer, pose: TruePose) -> str:
+    """Return the stage of an answer, "refused", or what is wrong."""
+    if answer.status in (429, 503) and answer.headers.get("Retry-After", "").isdecimal():
+        return _REFUSED
+    if answer.status != httpx.codes.OK:
+        return f"status {answer.status}: {answer.content[:200]!r}"
+    document = answer.json()
+    error_m = math.dist((document["position"]["x_m"], document["position"]["y_m"]), (pose.x_m, pose.y_m))
+    stage: str = document["stage"]
+    return stage if error_m <= _MAX_ERROR_M else f"{pose.file}: {error_m:.2f} m off at stage {stage}"
 
 
 class _Watch(ABC):

@@ -1,4 +1,4 @@
-"""Heaviest accepted input of every route, for `neighbours.py` and the tests of growth.
+"""Heaviest accepted input of every route, and hostile ones, for `neighbours.py` and the tests of growth.
 
 `LOADS` has at least one entry for every operation in `openapi.yaml`; `missing_routes` names those without. The work of
 an entry scales with a size, so that the benchmark sends the largest one and the tests count operations of small ones.
@@ -164,6 +164,14 @@ def _jpeg(kilopixels: int) -> bytes:
     """Return a grey progressive JPEG."""
     height = math.isqrt(500 * kilopixels)
     return plain_picture(2 * height, height, "JPEG", "L", progressive=True)
+
+
+@cache
+def _scans(count: int) -> bytes:
+    """Return a grey progressive JPEG of 98 megapixels with a number of scans."""
+    content = plain_picture(14_000, 7_000, "JPEG", "L", progressive=True)
+    begin = content.rindex(b"\xff\xc4", 0, content.rindex(b"\xff\xda"))
+    return content[:-2] + (count - 6) * content[begin:-2] + content[-2:]
 
 
 @cache
@@ -370,6 +378,21 @@ def _many_parts(caller: Caller, _stored: Stored, size: int) -> None:
     caller.send("POST", "/localise", part * size, _EMPTY_FORM)
 
 
+def _partial_body(caller: Caller, _stored: Stored, size: int) -> None:
+    """Send a part of a body, and wait for the service to give up."""
+    head = f"POST /localise HTTP/1.1\r\nContent-Length: {size}\r\nContent-Type: {_EMPTY_FORM}"
+    caller.send_bytes(head, b"--b")
+
+
+def _unread_answer(caller: Caller, _stored: Stored, size: int) -> None:
+    """Ask for a file that is larger than a socket's buffers, and do not read it."""
+    answer = caller.send("POST", "/floorplans", _body(home(0)) + b" " * (1024 * size))
+    if answer.status == 201:
+        path = f"/floorplans/{answer.json()['id']}"
+        caller.send_bytes(f"GET {path}/original HTTP/1.1", hold_s=2.0)
+        caller.send("DELETE", path)
+
+
 def _administer(caller: Caller, _stored: Stored, _size: int) -> None:
     document = {"tenant": "new", "name": "n" * 200, "scopes": ["metrics", "read", "localise", "write"]}
     answer = caller.send("POST", "/admin/keys", _body(document))
@@ -397,8 +420,8 @@ _ALBUMS = ("POST /albums", f"POST {_ALBUM}/photographs", f"GET {_ALBUM}/events",
 _SESSIONS = ("POST /sessions", f"POST {_SESSION}/photographs")
 _TOO_LONG = frozenset({422})
 _EMPTY_FORM = "multipart/form-data; boundary=b"
-# Status of bodies of too many events.
-_TOO_MANY_EVENTS = frozenset({400})
+# Statuses of bodies of too many events, and of bodies that do not arrive.
+_TOO_MANY_EVENTS, _TOO_LATE = frozenset({400}), frozenset({400, 408})
 LOADS = (
     _read("/floorplans", "pages of 500", 500, limit=None),
     _read(_PLAN),
@@ -447,6 +470,7 @@ LOADS = (
         _localise(_jpeg, floorplan_id="{plan}", projection="equirectangular"),
         98_000,
     ),
+    Load(("POST /localise",), "JPEG of 400 scans", _localise(_scans, floorplan_id="{plan}"), 400, refusals=_TOO_LONG),
     Load(("POST /localise/batch",), f"10 panoramas, {VERTICES_PLAN}", _batch),
     Load(("POST /localise/sequence",), f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
     Load(("POST /localise/sequence",), "10 panoramas, {homes} homes", _sequence(padded=False, venue=True)),
@@ -473,6 +497,8 @@ LOADS = (
     ),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
+    Load(("POST /localise",), "bodies that do not arrive", _partial_body, 100_000, connections=60, refusals=_TOO_LATE),
+    Load((f"GET {_PLAN}/original",), "answers that are not read", _unread_answer, 2_048, connections=64),
     Load(("POST /geopose",), VERTICES_PLAN, _geopose),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
     Load(

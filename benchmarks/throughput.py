@@ -53,14 +53,22 @@ def main() -> int:
             for clients in options.clients:
                 result = harness.run_load(url, plan_ids[:clients], clients, options.seconds)
                 failures += result.failures
-                print(result.row(name, clients), flush=True)
+                print(_row(result, name, clients), flush=True)
             if options.kill and not name.startswith("1 "):
                 timer = threading.Timer(0.5 * options.seconds, kill)
                 timer.start()
                 result = harness.run_load(url, plan_ids, max(options.clients), options.seconds)
                 timer.join()
-                print(result.row(f"{name}, one killed", max(options.clients)), flush=True)
+                print(_row(result, f"{name}, one killed", max(options.clients)), flush=True)
     return int(failures > 0)
+
+
+def _row(result: harness.LoadResult, *cells: object) -> str:
+    answered, lpo = result.answered, result.stages.get("lpo", 0)
+    times = [f"{value:.0f} ms" for value in answered.percentiles_ms().values()]
+    share = f"{lpo / max(answered.count, 1):.0%}"
+    figures = (f"{answered.per_second:.1f}", *times, share, result.refused.count + result.failures)
+    return harness.table_row(*cells, *figures)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError
 
-from benchmarks.large_venue import random_home
+from benchmarks.large_venues import random_home
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import UnknownVenueError
 from service.storage.database import Database
