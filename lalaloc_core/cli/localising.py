@@ -188,7 +188,7 @@ def _opened(content: bytes, model: LocalModel, bundle: Bundle, stated: StatedCam
 def _details(plan: FloorPlan, grid: PoseGrid, bundle: Bundle, view: Photograph, found: Localisation) -> dict[str, Any]:
     """Return the fields of an answer about its photograph, with warnings, advice and the next step."""
     from lalaloc_core.localise.belief import advice_for, information_bits, reason_for
-    from lalaloc_core.localise.localisability.step_report import step_after
+    from lalaloc_core.localise.localisability.reports import step_after
 
     confidence = found.confidence(bundle.manifest.confidence_for(view=found.query.is_view))
     sure = found.posterior.position if confidence is None else confidence.position

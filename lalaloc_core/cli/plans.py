@@ -144,8 +144,8 @@ def _localisability(plan: FloorPlan, arguments: argparse.Namespace) -> tuple[dic
     """Return the report of a plan's localisability, and its summary; draw it on request."""
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.localisability import localisability_svg
-    from lalaloc_core.localise.localisability.localisability_report import report_of, summary_of
     from lalaloc_core.localise.localisability.predicted_localisability import localisability
+    from lalaloc_core.localise.localisability.reports import report_of, summary_of
 
     if arguments.picture is not None:
         check_picture_name(arguments.picture, "--picture")

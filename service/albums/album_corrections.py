@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.album.corrections import Correction
+from lalaloc_core.localise.album.entry import Correction
 from service.errors import InvalidRequestError
 from service.schemas.albums import CorrectionDocument, PinAnswer
 from service.schemas.query_fields import PlanPoint

@@ -7,8 +7,8 @@ import json
 from lalaloc_core.conditions import Condition
 from lalaloc_core.draw.localisability import localisability_svg
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.localisability.localisability_report import report_of
 from lalaloc_core.localise.localisability.predicted_localisability import localisability
+from lalaloc_core.localise.localisability.reports import report_of
 from service.schemas import ModelAnswer
 from service.schemas.localisability import LocalisabilityAnswer
 from service.stored_plan import RenditionJob

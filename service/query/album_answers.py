@@ -54,8 +54,8 @@ def compose_outcome(
             SharedCameraAnswer(
                 make=camera.make,
                 model=camera.model,
-                width=camera.height,
-                height=camera.width,
+                width=camera.width,
+                height=camera.height,
                 photographs=camera.photographs,
                 hfov_deg=math.degrees(camera.hfov),
                 hfov_std_deg=math.degrees(camera.hfov_sd),

@@ -9,10 +9,9 @@ from functools import partial
 
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.album.corrections import read_correction
-from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry, read_entry
+from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry, read_correction, read_entry
+from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
-from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.encode.features import encodes_spheres
 from lalaloc_core.localise.query import KnownHeading, Query

@@ -17,8 +17,7 @@ from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import KnownHeading
 from lalaloc_core.localise.tracking import TrackState
-from lalaloc_core.localise.tracking.passages import PlanOnLevel
-from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from service.capacity.bounded_cache import BoundedCache

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from lalaloc_core.bundle import Manifest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.belief import Confidence, advice_for, information_bits, union_of_arcs
-from lalaloc_core.localise.localisability.step_report import step_after
+from lalaloc_core.localise.localisability.reports import step_after
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.photograph import Assumed, Photograph
 from lalaloc_core.photograph.cameras import Around, Fisheye

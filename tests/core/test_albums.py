@@ -13,11 +13,17 @@ from PIL import Image, ImageDraw, ImageFilter
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.album.corrections import Correction, read_correction
-from lalaloc_core.localise.album.entry import MAX_ENTRY_BYTES, AlbumPhotograph, photograph_entry, read_entry
+from lalaloc_core.localise.album.entry import (
+    MAX_ENTRY_BYTES,
+    AlbumPhotograph,
+    Correction,
+    photograph_entry,
+    read_correction,
+    read_entry,
+)
+from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.links import pair_odds
-from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.pins import Pin, PinPose, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
 from lalaloc_core.localise.album.solve import MAX_ROOMS, solve_album

@@ -40,7 +40,7 @@ from lalaloc_core.learn.data.synthetic import GeneratedScenes, training_plans
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import Cohort, MatchingConfig, cohort_of, cost_by_chance, log_cost_to_chance
-from lalaloc_core.localise.match.cohort import SIZE
+from lalaloc_core.localise.match.fit_by_chance import SIZE
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, localise

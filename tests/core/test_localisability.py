@@ -14,7 +14,6 @@ from lalaloc_core.draw.localisability import localisability_svg
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.calibrate.measured_errors import measured
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.localisability.localisability_report import report_of, summary_of
 from lalaloc_core.localise.localisability.predicted_localisability import (
     Errors,
     Searches,
@@ -22,6 +21,7 @@ from lalaloc_core.localise.localisability.predicted_localisability import (
     localisability,
     spacing_m,
 )
+from lalaloc_core.localise.localisability.reports import report_of, summary_of
 from lalaloc_core.render.sampling import PoseSet
 
 

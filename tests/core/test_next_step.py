@@ -12,7 +12,7 @@ from lalaloc_core.bundle import Bundle, Manifest, default_bundle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Support
 from lalaloc_core.localise.localisability.next_step import Known, NextStep, next_step, next_steps
-from lalaloc_core.localise.localisability.step_report import words_of
+from lalaloc_core.localise.localisability.reports import words_of
 
 _FIELD = math.radians(80.0)
 

@@ -30,12 +30,11 @@ from lalaloc_core.localise.match import (
     layouts_at,
     likeliest,
 )
-from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
-from lalaloc_core.localise.match.coarse_table import CoarseTable
+from lalaloc_core.localise.match.coarse_pass import CoarseTable
 from lalaloc_core.localise.match.cost_terms import latent_distances, precisions
+from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedOpenings, PredictedProfile, Query, rolled
-from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, retrieve
-from lalaloc_core.localise.search.vogel import resample, vogel_disc
+from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, resample, retrieve, vogel_disc
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from tests.strategies import plan_of, present, rectangle, seeds
 

@@ -23,9 +23,8 @@ from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.search.pipeline import run_steps
 from lalaloc_core.localise.tracking import Odometry, TrackState
-from lalaloc_core.localise.tracking.passages import PlanOnLevel
 from lalaloc_core.localise.tracking.track_state import MAX_STATES, StatePlan
-from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.walk_motion import States, WalkGraph, moved
 from lalaloc_core.localise.venue.merged_plans import MergedPlans

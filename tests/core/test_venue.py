@@ -15,9 +15,8 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, layouts_at
-from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
-from lalaloc_core.localise.match.coarse_pass import coarse_costs
-from lalaloc_core.localise.match.coarse_table import CoarseTable
+from lalaloc_core.localise.match.coarse_pass import CoarseTable, coarse_costs
+from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.query import (
     CameraHeight,
     PredictedCeiling,
@@ -28,12 +27,11 @@ from lalaloc_core.localise.query import (
     rolled,
 )
 from lalaloc_core.localise.venue.index_search import DividedIndex, PlanSearch, SearchLimits
+from lalaloc_core.localise.venue.index_segment import CodeScan, lookup_tables, product_codes
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
-from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of, family_of, shipped_cells
-from lalaloc_core.localise.venue.prototype_codes import CodeScan, lookup_tables, product_codes
-from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
+from lalaloc_core.localise.venue.prototype_costs import PrototypeAlignment, PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
     Prototypes,

@@ -26,7 +26,7 @@ from lalaloc_core.learn.data.drawn_rooms import plan_of_rooms
 from lalaloc_core.learn.data.synthetic.albums import taken_album, two_views
 from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.localise.album.entry import AlbumPhotograph
-from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import stated_height
 from lalaloc_core.photograph import StatedCamera

@@ -26,7 +26,7 @@ from lalaloc_core.localise.belief import CONFIDENT, Confidence
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.localisability.next_step import BEHIND_M, HEADING_ERROR, NextStep, next_steps
-from lalaloc_core.localise.localisability.step_report import known_of
+from lalaloc_core.localise.localisability.reports import known_of
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Hints, Query
 from lalaloc_core.localise.search.pipeline import Localisation, localise

@@ -2,7 +2,7 @@
 
 The homes' photographs are localised with the bundle. In this order the bundle gets
 
-1. the cohort (`localise.match.cohort`): the layouts of unknown places, from training homes;
+1. the cohort (`localise.match.fit_by_chance`): the layouts of unknown places, from training homes;
 2. the appearance of openings, and the weights of the matching cost;
 3. the confidence and covariance, fitted on predictions made with these weights: for the home's own photographs, for
    disturbed ones, because real cameras and plans are worse than rendered ones, and for photographs of unknown places.

@@ -24,7 +24,7 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.refine import LpoConfig, RefinementJob
 from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, StageClock
-from lalaloc_core.localise.search.vogel import disc_poses
+from lalaloc_core.localise.search.retrieval import disc_poses
 from lalaloc_core.render.profile import layout_depth
 from lalaloc_core.render.sampling import PoseSet
 

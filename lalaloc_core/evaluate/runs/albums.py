@@ -13,10 +13,9 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, collect_error
 from lalaloc_core.learn.data.photograph_files import FilePhotograph
 from lalaloc_core.learn.data.views import ViewPhotograph, encode_jpeg
-from lalaloc_core.localise.album.corrections import Correction
-from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry
+from lalaloc_core.localise.album.entry import AlbumPhotograph, Correction, photograph_entry
+from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
-from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.pins import Pin, PinPose
 from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size

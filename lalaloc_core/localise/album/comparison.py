@@ -1,7 +1,13 @@
-"""Comparison of one photograph with all poses of an album's ground, for every error of the camera height."""
+"""Comparison of one photograph with all poses of an album's ground, for every error of the camera height.
+
+The cost of a wall at an azimuth depends on its log distance, the kind of opening there, and the error of the camera's
+height alone. For each azimuth of a photograph a table has that cost for every bin of distance, kind and height error;
+the cost of a pose under a heading is a sum of entries, as in `localise.match.coarse_pass`, at all azimuths.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,16 +16,91 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, TWO_PI
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.album.binned_ground import BINS, KINDS, BinnedGround, bin_centres
-from lalaloc_core.localise.match import MatchingConfig
+from lalaloc_core.localise.match import Layouts, MatchingConfig
 from lalaloc_core.localise.match.cost_terms import median_distance_m, opening_losses, precisions, smoothed
 from lalaloc_core.localise.query import PredictedProfile, Query
 
 _CONFIG = MatchingConfig()
 # Poses compared at a time.
 _CHUNK = 1024
+# Width of the bins of log distance, and range of distances (m).
+_BIN = 0.05
+_MIN_M, _MAX_M = 0.1, 60.0
+_FIRST_BIN = math.floor(math.log(_MIN_M) / _BIN)
+_BINS = math.ceil(math.log(_MAX_M) / _BIN) - _FIRST_BIN
+_KINDS = len(OPENING_CLASSES)
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedGround:
+    """Binned layouts of n poses.
+
+    Attributes:
+        index: (n, 2w) bin of the distance times the number of kinds, plus the kind, twice around the horizon.
+        row, column: (e,) pose and azimuth column of the walls that are seen through openings.
+        own, behind: (e,) bin of the own wall and its kind as in `index`, and bin of the wall behind.
+        odds: (e,) odds that a prediction is of the wall behind.
+    """
+
+    index: Int[np.ndarray, "n v"]
+    row: Int[np.ndarray, "e"]
+    column: Int[np.ndarray, "e"]
+    own: Int[np.ndarray, "e"]
+    behind: Int[np.ndarray, "e"]
+    odds: Float[np.ndarray, "e"]
+
+    @classmethod
+    def of(cls, layouts: Layouts) -> BinnedGround:
+        """Bin layouts at heading 0."""
+        index = _bins(layouts.log_profile.astype(np.float32)) * _KINDS
+        if layouts.kind is not None:
+            index += layouts.kind
+        seen = layouts.seen
+        if seen is None:
+            none = np.zeros(0, np.intp)
+            return cls(np.concatenate([index, index], axis=1), none, none, none, none, np.zeros(0, np.float32))
+        share = np.where(seen.kind == PASSAGE_CODE, _CONFIG.open_passage, _CONFIG.open_door).astype(np.float32)
+        return cls(
+            index=np.concatenate([index, index], axis=1),
+            row=seen.row.astype(np.intp),
+            column=seen.column.astype(np.intp),
+            own=index[seen.row, seen.column],
+            behind=_bins(seen.log_behind.astype(np.float32)),
+            odds=share / (1.0 - share),
+        )
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def columns(self) -> int:
+        """Azimuth columns of the horizon."""
+        return self.index.shape[1] // 2
+
+    def part(self, rows: slice) -> BinnedGround:
+        """Return successive poses."""
+        begin, end = np.searchsorted(self.row, (rows.start, rows.stop))
+        seen = (values[begin:end] for values in (self.row - rows.start, self.column, self.own, self.behind, self.odds))
+        return BinnedGround(self.index[rows], *seen)
+
+    def chosen(self, rows: Int[np.ndarray, "m"]) -> BinnedGround:
+        """Return some poses, by their numbers in rising order."""
+        place = np.full(len(self), -1)
+        place[rows] = np.arange(len(rows))
+        kept = place[self.row] >= 0
+        seen = (values[kept] for values in (place[self.row], self.column, self.own, self.behind, self.odds))
+        return BinnedGround(self.index[rows], *seen)
+
+
+def _bins(log_m: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+    return np.clip(np.floor(log_m / _BIN).astype(np.intp) - _FIRST_BIN, 0, _BINS - 1)
+
+
+def _bin_centres() -> Float[np.ndarray, "b"]:
+    """Return the log distance (m) at the centre of each bin."""
+    return _BIN * (_FIRST_BIN + 0.5 + np.arange(_BINS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +139,8 @@ class Comparison:
         assert query.profile is not None
         width = query.profile.log_m.shape[1]
         columns = np.flatnonzero(np.isfinite(query.profile.log_scale[0]))
-        centres = bin_centres()[None, :, None] - offsets[None, None, :]
-        likelihood = np.zeros((len(columns), BINS, len(offsets)))
+        centres = _bin_centres()[None, :, None] - offsets[None, None, :]
+        likelihood = np.zeros((len(columns), _BINS, len(offsets)))
         for centre, log_scale, odds in _modes(query.profile, columns):
             precision = precisions(centre, log_scale, reach_m, weights.tail)
             apart = (centres - centre[:, None, None]) * precision[:, None, None]
@@ -85,7 +166,7 @@ class Comparison:
         for begin, end in pairwise([0, *ends]):
             openings = self.openings[trust_number[begin]]
             cost = self.walls[:, :, None, :] + openings[:, None, :, None]
-            cost = cost.reshape(len(cost), BINS * KINDS, self.walls.shape[2])
+            cost = cost.reshape(len(cost), _BINS * _KINDS, self.walls.shape[2])
             for first in range(begin, end, _CHUNK):
                 part = slice(first, min(first + _CHUNK, end))
                 yield part, self._part(ground.part(part), cost, openings)
@@ -100,7 +181,7 @@ class Comparison:
             total += cost[number].take(ground.index[:, column : column + width], axis=0)
             if len(ground.row):
                 turn = (ground.column - column) % width
-                own, kind = np.divmod(ground.own, KINDS)
+                own, kind = np.divmod(ground.own, _KINDS)
                 either = self.likelihood[number][own] + ground.odds[:, None] * self.likelihood[number][ground.behind]
                 either = -np.log(np.minimum(either, 1.0)) + openings[number][kind][:, None]
                 total[ground.row, turn] += either - cost[number][ground.own]
@@ -129,7 +210,7 @@ def _opening_losses(
     assert profile is not None
     trusts, _ = plan.class_trusts
     if predicted is None or not trusts.any():
-        return np.zeros((len(trusts), profile.log_m.shape[1], KINDS), np.float32)
+        return np.zeros((len(trusts), profile.log_m.shape[1], _KINDS), np.float32)
     precision = precisions(profile.log_m[0], profile.log_scale[0], reach_m, weights.tail)
     spread = reach_m / median_distance_m(profile.log_m[0], precision)
     probability = smoothed(np.exp(predicted.log_probability[:1]), spread)[0]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.localise.album.entry import AlbumPhotograph, Descriptors
-from lalaloc_core.localise.album.memory import AlbumMemory
+from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.overlap import turn_between
 

@@ -87,9 +87,9 @@ class SharedCamera:
     """A camera of the album: photographs of one maker, model and size share their field of view.
 
     Attributes:
-        make, model, width, height: as in the photographs; the sides in rising order.
+        make, model, width, height: as in its photographs; the width is the longer side, pixels.
         photographs: number of its photographs.
-        hfov: horizontal field of view of the first of them, radians.
+        hfov: horizontal field of view, radians.
         hfov_sd: its standard deviation; 0 if every photograph states it.
     """
 

@@ -1,9 +1,9 @@
 """Solve of an album: the pins of all photographs at once.
 
-Each photograph is compared with the plan alone (`single.py`); this is kept in the `AlbumMemory`. Overlap, compasses and
-corrections then change the evidence (`states.py`), and all photographs are assigned to rooms together
-(`room_assignment.py`), by their own evidence, the walk from one to the next (`walks.py`), and the pairs that look as if
-they are of one room (`links.py`). Within its room, a photograph is at the pose that fits it best.
+Each photograph is compared with the plan alone (`evidence.py`); this is kept in the `AlbumMemory`. Overlap, compasses
+and corrections then change the evidence (`states.py`), and all photographs are assigned to rooms together
+(`room_assignment.py`), by their own evidence, the walk from one to the next, and the pairs that look as if they are of
+one room (`links.py`). Within its room, a photograph is at the pose that fits it best.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.localise.album.constraints import Constraint, constraint_of
 from lalaloc_core.localise.album.entry import AlbumPhotograph
-from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.evidence import (
+    AlbumMemory,
+    SearchedPlan,
+    camera_height,
+    shared_cameras,
+    single_evidence,
+)
+from lalaloc_core.localise.album.ground import AlbumGround, Constraint, constraint_of
 from lalaloc_core.localise.album.links import Found, find_links, pair_odds
-from lalaloc_core.localise.album.memory import AlbumMemory
 from lalaloc_core.localise.album.pins import Album, AlbumLink, Pin, Suggestion
-from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
-from lalaloc_core.localise.album.shared import camera_height, shared_cameras
-from lalaloc_core.localise.album.single import SearchedPlan, single_evidence
+from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms, expected_photographs, walk_of
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
-from lalaloc_core.localise.album.walks import expected_photographs, walk_of
 from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, outside_odds
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.localise.album.memory import Arrays
+from lalaloc_core.localise.album.evidence import Arrays
 from lalaloc_core.localise.belief import suppress
 
 # Deviation (radians) of a turn by overlap, and probability that it is wrong.
@@ -47,7 +47,7 @@ class States:
 
     @classmethod
     def of(cls, arrays: Arrays, headings: int) -> States:
-        """Return the states of `single.single_evidence`, for a number of headings around the horizon."""
+        """Return the states of `evidence.single_evidence`, for a number of headings around the horizon."""
         return cls(
             pose=arrays["pose"],
             position_m=arrays["position_m"].astype(float),

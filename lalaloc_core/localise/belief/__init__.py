@@ -1,13 +1,23 @@
 """Probability of places, and confidence and covariance of an answer.
 
 Begin with `posterior.py`, the probability of all places; `ranking.py` orders candidates. `confidence.py` has the
-probability that an answer is right, `covariance.py` its covariance, and `information.py` the information in the
-photograph.
+probability that an answer is right, its covariance, and advice where the photograph tells too little.
 """
 
-from lalaloc_core.localise.belief.confidence import Confidence, Signals, confidence_of, signals_of
-from lalaloc_core.localise.belief.covariance import PoseUncertainty, marginal_information, pose_uncertainty
-from lalaloc_core.localise.belief.information import CONFIDENT, advice_for, information_bits, reason_for, union_of_arcs
+from lalaloc_core.localise.belief.confidence import (
+    CONFIDENT,
+    Confidence,
+    PoseUncertainty,
+    Signals,
+    advice_for,
+    confidence_of,
+    information_bits,
+    marginal_information,
+    pose_uncertainty,
+    reason_for,
+    signals_of,
+    union_of_arcs,
+)
 from lalaloc_core.localise.belief.posterior import (
     HEADING_WITHIN,
     NEGLIGIBLE,

@@ -1,7 +1,7 @@
 """Query: an encoded photograph, and what is stated about its camera.
 
-Begin with `query.py`. `predictions.py` has what the networks predict of a photograph; `stated_pose.py` has the height
-and heading that the caller, the metadata or the plan state; `hints.py` has priors of the place.
+Begin with `query.py`. `stated_pose.py` has the height and heading that the caller, the metadata or the plan state;
+`hints.py` has priors of the place.
 """
 
 from lalaloc_core.localise.query.hints import (
@@ -14,18 +14,19 @@ from lalaloc_core.localise.query.hints import (
     log_factor,
     rooms_named,
 )
-from lalaloc_core.localise.query.predictions import (
+from lalaloc_core.localise.query.query import (
+    Candidate,
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,
     PredictedRoomType,
+    Query,
     RivalWall,
     SeenObject,
     SeenObjects,
     WallDirection,
     rolled,
 )
-from lalaloc_core.localise.query.query import Candidate, Query
 from lalaloc_core.localise.query.stated_pose import (
     DEFAULT_STD_M,
     UNKNOWN_RANGE_M,

@@ -15,8 +15,15 @@ from array_api_compat import array_namespace, device
 from jaxtyping import Bool, Float
 
 from lalaloc_core.conventions import Array
-from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
-from lalaloc_core.localise.refine.refinement_problem import Evaluation, LpoConfig, Problem, clipped, diagonal
+from lalaloc_core.localise.refine.refinement_problem import (
+    Evaluation,
+    LpoConfig,
+    Problem,
+    RefinementJob,
+    RefinementResult,
+    clipped,
+    diagonal,
+)
 
 
 class DescentResult(NamedTuple):

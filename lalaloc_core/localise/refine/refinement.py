@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, layouts_at
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, Query
-from lalaloc_core.localise.refine.refinement_job import RefinementJob, RefinementResult
+from lalaloc_core.localise.refine.refinement_problem import RefinementJob, RefinementResult
 from lalaloc_core.render.sampling import PoseSet
 
 

@@ -33,8 +33,7 @@ from lalaloc_core.localise.match import MatchingConfig, PoseGrid, cost_by_chance
 from lalaloc_core.localise.query import NO_HINTS, Candidate, HintName, Hints, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement import refined_candidates, refinement_job, with_latents
-from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, missed_hints, retrieve
-from lalaloc_core.localise.search.vogel import resample
+from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, missed_hints, resample, retrieve
 
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")

@@ -3,6 +3,6 @@
 Begin with `merged_plans.py`, which merges the plans to search into one; `localise.search.pipeline` then searches it
 like a single plan. For a large venue, `index_search.py` selects these plans by prototypes, a few poses of each plan
 (`prototypes.py`), in the stages of `plan_index.py`. Prototypes are stored in the cells of inverted files
-(`index_segment.py`, `prototype_cells.py`), compared by product codes (`prototype_codes.py`), the best ones exactly
-(`prototype_costs.py`), and the best of these at the best pose nearby (`prototype_alignment.py`).
+(`prototype_cells.py`, `index_segment.py`) and compared by product codes, the best ones exactly (`prototype_costs.py`),
+and the best of these at the best pose nearby.
 """

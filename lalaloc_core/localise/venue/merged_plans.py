@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.match.layouts import joined_layouts
+from lalaloc_core.localise.match.pose_layouts import joined_layouts
 from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.venue.prototypes import claims_of_trust, trust_of_claims
 from lalaloc_core.render.sampling import PoseSet

@@ -6,10 +6,10 @@ prototype and a hypothesis of the heading and the camera height. Four stages, ea
 1. **Inverted file.** A coarse quantiser assigns each prototype to a cell (`prototype_cells`). The query computes the
    cost of every cell under every hypothesis and probes the cheapest ones.
 2. **Code scan.** The pairs of the probed cells are compared by product codes of 25 bytes, with a lookup table for each
-   hypothesis (`prototype_codes`).
+   hypothesis (`index_segment`).
 3. **Exact comparison.** The cheapest pairs of the scan get their exact cost (`prototype_costs`) and are summed to the
    masses of their plans. All other pairs count as zero.
-4. **Alignment.** The cheapest of these get the cost at the best pose nearby (`prototype_alignment`), whose sums replace
+4. **Alignment.** The cheapest of these get the cost at the best pose nearby (`PrototypeAlignment`), whose sums replace
    the masses of their plans. All other masses change by the median factor.
 
 Small indexes skip stages: if the query has at most `scanned` pairs all cells are probed, if it has at most `compared`
@@ -42,10 +42,9 @@ from lalaloc_core.localise.venue.index_search import (
     ShardSizes,
     cheapest,
 )
-from lalaloc_core.localise.venue.index_segment import Segment
-from lalaloc_core.localise.venue.prototype_alignment import PrototypeAlignment
+from lalaloc_core.localise.venue.index_segment import Segment, lookup_tables
 from lalaloc_core.localise.venue.prototype_cells import Cells, claims_of
-from lalaloc_core.localise.venue.prototype_codes import lookup_tables
+from lalaloc_core.localise.venue.prototype_costs import PrototypeAlignment
 from lalaloc_core.localise.venue.prototypes import Prototypes, joined
 
 # Pairs compared at a time, to bound memory.

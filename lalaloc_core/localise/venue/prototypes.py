@@ -2,7 +2,7 @@
 
 The *prototypes* of a plan are every other pose of its pose grid, like the black squares of a chessboard. Each has the
 floor area that it represents, the wall profile and openings at 32 azimuths, and the room's ceiling and type. Their cost
-is a coarser matching cost (`prototype_costs`), for the best ones at the best pose nearby (`prototype_alignment`), and
+is a coarser matching cost (`prototype_costs`), for the best ones at the best pose nearby, and
 gives every plan a mass, its unnormalised probability:
 
     mass(plan) = sum over its prototypes and the hypotheses of  area · exp(-T cost)

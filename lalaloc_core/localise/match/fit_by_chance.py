@@ -20,10 +20,10 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.bundle import COHORT, Bundle, MatchingWeights
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.match.binned_layouts import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.match.coarse_pass import coarse_costs
-from lalaloc_core.localise.match.layouts import Layouts, layouts_at
 from lalaloc_core.localise.match.matching_cost import MatchingConfig, MatchingCost
+from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
+from lalaloc_core.localise.match.pose_layouts import Layouts, layouts_at
 from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import pose_grid
 

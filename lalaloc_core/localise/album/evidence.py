@@ -1,0 +1,301 @@
+"""Evidence of the photographs of an album: the best states of each alone, and the unknowns that all share.
+
+`AlbumMemory` keeps what is slow to find and does not depend on corrections. Fields of view, the camera's height, and
+the scale of the plan are the same for many photographs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.bundle import Manifest, MatchingWeights
+from lalaloc_core.conventions import ROOM_TYPES
+from lalaloc_core.errors import InvalidEntryError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.album.comparison import BinnedGround, Comparison
+from lalaloc_core.localise.album.entry import AlbumPhotograph
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.pins import SharedCamera
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import MatchingConfig, PlaceCost, PoseGrid, layouts_at
+from lalaloc_core.localise.match.cost_terms import ceiling_costs, room_type_losses
+from lalaloc_core.localise.query import DEFAULT_STD_M, NO_HINTS, CameraHeight, Query
+from lalaloc_core.photograph import Photograph
+from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
+
+# Finer grid for plans of at most so many poses, and the distance (m) within which its best pose counts as exact:
+# single photographs name the right room more often than with the grid of queries.
+FINE_STEP_M, _FINE_REACH_M, _MAX_FINE = 0.25, 0.08, 8000
+# Logs of true over usual camera height that are tried, and the height (m) that people hold cameras at.
+OFFSETS = np.linspace(-0.36, 0.36, 9)
+USUAL_HEIGHT_M, USUAL_LOG_SD = 1.5, 0.15
+# States that are kept: of every room, at least so many, and of all.
+_PER_ROOM, _MAX_STATES = 96, 8192
+# Every so many of the poses of other homes are compared: about as many as a home has.
+_EVERY = 4
+_CONFIG = MatchingConfig()
+# Arrays of one photograph by name.
+Arrays = dict[str, np.ndarray]
+_MAX_BYTES = 2**28
+_DAMAGE = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RecursionError, zipfile.BadZipFile)
+# Standard deviation of the scale of a plan; of the log height from one photograph to the next; and of a median over
+# that of a mean. Errors of fields of view by lines are alike, so the error of many is not less than `_LINES_SD`.
+_SCALE_SD, _HAND_SD, _MEDIAN, _LINES_SD = 0.05, 0.05, 1.25, 0.03
+
+
+@dataclass(eq=False)
+class AlbumMemory:
+    """Evidence of single photographs and links between them, for one ground and model.
+
+    Pass the same object to every `solve_album` of an album; it is filled there. Not safe to share between threads.
+
+    Attributes:
+        key: digest of ground and model; empty for a new memory.
+        evidence: arrays of each photograph, by id.
+        links: matches and turn by pair of ids; None for pairs that do not overlap.
+    """
+
+    key: str = ""
+    evidence: dict[str, Arrays] = field(default_factory=dict)
+    links: dict[tuple[str, str], tuple[int, float] | None] = field(default_factory=dict)
+
+    def use(self, ground: AlbumGround, manifest: Manifest) -> None:
+        """Drop everything that is of another ground or model."""
+        key = hashlib.sha256(f"{ground.digest} {sorted(manifest.files.items())}".encode()).hexdigest()
+        if key != self.key:
+            # Links depend on the photographs alone.
+            self.key, self.evidence = key, {}
+
+    def keep(self, ids: set[str]) -> None:
+        """Drop what is about photographs that are no longer in the album."""
+        self.evidence = {id: arrays for id, arrays in self.evidence.items() if id in ids}
+        self.links = {pair: link for pair, link in self.links.items() if ids.issuperset(pair)}
+
+    def to_bytes(self) -> bytes:
+        """Return the memory as a file: an archive of arrays, as numpy writes them."""
+        ids = sorted(self.evidence)
+        links = [[*pair, *(link or (0, 0.0))] for pair, link in sorted(self.links.items())]
+        head = {"key": self.key, "ids": ids, "links": links}
+        arrays: dict[str, Any] = {
+            f"{number}.{name}": values for number, id in enumerate(ids) for name, values in self.evidence[id].items()
+        }
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, head=np.frombuffer(json.dumps(head).encode(), np.uint8), **arrays)
+        return buffer.getvalue()
+
+    @classmethod
+    def read(cls, content: bytes) -> AlbumMemory:
+        """Read a memory that this service stored itself.
+
+        Raises:
+            InvalidEntryError: the file is damaged; go on with a new memory.
+        """
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                if sum(entry.file_size for entry in archive.zip.infolist()) > _MAX_BYTES:
+                    raise InvalidEntryError(f"the memory of the album would be larger than {_MAX_BYTES} bytes")
+                head = json.loads(archive["head"].tobytes())
+                evidence: dict[str, Arrays] = {id: {} for id in head["ids"]}
+                for name in archive.files:
+                    number, _, kind = name.partition(".")
+                    if kind:
+                        evidence[head["ids"][int(number)]][kind] = archive[name]
+                links = {
+                    (str(first), str(second)): (int(matches), float(turn)) if matches else None
+                    for first, second, matches, turn in head["links"]
+                }
+                return cls(str(head["key"]), evidence, links)
+        except _DAMAGE as error:
+            raise InvalidEntryError(f"the memory of the album is damaged: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedPlan:
+    """The plan of an album as photographs are compared with it.
+
+    Attributes:
+        poses: its poses.
+        reach_m: distance (m) from the camera within which the best pose is.
+    """
+
+    plan: FloorPlan
+    poses: PoseSet
+    reach_m: float
+    binned: BinnedGround
+
+    @classmethod
+    def of(cls, plan: FloorPlan, grid: PoseGrid, columns: int) -> SearchedPlan:
+        """Return the plan with a fine grid, or if it is too large with the given one."""
+        if grid_size(plan, FINE_STEP_M) > _MAX_FINE:
+            reach_m = _CONFIG.grid_reach * grid.step_m
+            return cls(plan, grid.poses, reach_m, BinnedGround.of(grid.layouts(plan)))
+        poses = pose_grid(plan, FINE_STEP_M)
+        layouts = layouts_at(plan, poses, np.zeros(len(poses)), columns)
+        return cls(plan, poses, _FINE_REACH_M, BinnedGround.of(layouts))
+
+    @cached_property
+    def types(self) -> Int[np.ndarray, "r"]:
+        """Number of each room's type in `conventions.ROOM_TYPES`."""
+        return np.array([ROOM_TYPES.index(room.type) for room in self.plan.rooms])
+
+
+def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Photograph) -> Arrays:
+    """Compare a photograph with all poses.
+
+    Returns:
+        `pose`, `position_m`, `room`, `hypothesis` and `log_likelihood` of the states that are kept;
+        `room_types` (r,), the log likelihood of the type of every room; `heights` (j,), the log evidence of each height
+        offset; `chance`, the log likelihood of the best of as many poses of other homes.
+    """
+    weights = encoder.manifest.evidence_for(view=not view.is_sphere)
+    query = encoder.query(view, None, CameraHeight(USUAL_HEIGHT_M, 0.0))
+    compared = Comparison.of(searched.plan, query, searched.reach_m, weights, OFFSETS)
+    usual = (0.5 * np.square(OFFSETS / USUAL_LOG_SD)).astype(np.float32)
+    ceilings = (usual + _ceilings(searched.plan, query, weights)).astype(np.float32)
+    best = np.empty((len(searched.poses), len(query.roll)), np.float32)
+    heights = np.full(len(OFFSETS), -np.inf)
+    trusts = searched.plan.class_trusts[1][searched.poses.room_index]
+    pose = np.arange(len(best))
+    places = PlaceCost.of(searched.plan, query, NO_HINTS, 1.0, searched.poses.position_m, searched.poses.room_index)
+    for part, log in compared.log_likelihoods(searched.binned, trusts):
+        log -= ceilings[searched.poses.room_index[part], None, :]
+        heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(OFFSETS))])
+        best[part] = log.max(axis=2)
+        if places is not None:
+            best[part] -= places.of_poses(pose[part])
+    kept = _kept(best, searched.poses.room_index, len(searched.plan.rooms))
+    pose, hypothesis = np.divmod(kept, best.shape[1])
+    return {
+        "pose": pose.astype(np.int32),
+        "position_m": searched.poses.position_m[pose].astype(np.float32),
+        "room": searched.poses.room_index[pose].astype(np.int32),
+        "hypothesis": hypothesis.astype(np.uint8),
+        "log_likelihood": best.ravel()[kept].astype(np.float32),
+        "room_types": _room_types(searched, query, weights).astype(np.float32),
+        "heights": heights.astype(np.float32),
+        "chance": np.array(_by_chance(encoder, compared, usual, int(trusts[best.max(axis=1).argmax()])), np.float32),
+    }
+
+
+def _by_chance(
+    encoder: PhotographEncoder, compared: Comparison, usual: Float[np.ndarray, "j"], trust_number: int
+) -> float:
+    """Return the log likelihood of the best pose of other homes, under one trust; -inf if the model has none."""
+    cohort = encoder.cohort
+    if cohort is None:
+        return -math.inf
+    layouts = cohort.layouts.rows(np.arange(0, len(cohort.layouts), _EVERY))
+    ground, trusts = BinnedGround.of(layouts), np.full(len(layouts), trust_number)
+    return max(float((log - usual).max()) for _, log in compared.log_likelihoods(ground, trusts))
+
+
+def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Int[np.ndarray, "m"]:
+    """Return the row-major numbers of the best states of every room."""
+    each = max(min(_PER_ROOM, _MAX_STATES // rooms), 1)
+    parts = []
+    for room in range(rooms):
+        rows = np.flatnonzero(room_index == room)
+        values = best[rows].ravel()
+        top = np.argpartition(-values, min(each, len(values) - 1))[:each] if len(values) else np.zeros(0, int)
+        place, hypothesis = np.divmod(top, best.shape[1])
+        parts.append(rows[place] * best.shape[1] + hypothesis)
+    return np.concatenate(parts)
+
+
+def _room_types(searched: SearchedPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r"]:
+    """Return the log likelihood of every room's type.
+
+    As in the matching cost, recognised objects replace the encoder's own prediction.
+    """
+    if query.objects is not None:
+        return -room_type_losses(query.objects.room_type, _CONFIG.floor)[searched.types]
+    if query.room_type is None:
+        return np.zeros(len(searched.types))
+    losses = room_type_losses(query.room_type, _CONFIG.floor)
+    return -weights.room_type * weights.temperature * losses[searched.types]
+
+
+def _ceilings(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r j"]:
+    """Return the negative log likelihood of every room's ceiling at each height."""
+    if query.ceiling is None:
+        return np.zeros((len(plan.rooms), len(OFFSETS)))
+    clearance_m = plan.ceiling_heights_m[:, None] - USUAL_HEIGHT_M * np.exp(OFFSETS)
+    return weights.ceiling * weights.temperature * ceiling_costs(query.ceiling, clearance_m, OFFSETS, weights.tail)
+
+
+def _log_sum(values: np.ndarray) -> float:
+    highest = float(values.max())
+    return highest + math.log(float(np.exp(values - highest).sum()))
+
+
+def shared_cameras(photographs: Sequence[AlbumPhotograph]) -> tuple[SharedCamera, ...]:
+    """Return the cameras of an album, with the field of view by all photographs of each."""
+    groups: dict[tuple[str, str, int, int], list[AlbumPhotograph]] = {}
+    for photograph in photographs:
+        if not photograph.view.is_sphere:
+            groups.setdefault(photograph.camera_key, []).append(photograph)
+    found = []
+    for (make, model, width, height), members in groups.items():
+        stated = [each for each in members if each.has_stated_field]
+        half = np.array([min(0.5 * each.view.hfov.value, 1.5) for each in stated or members])
+        log_tangent = np.log(np.tan(half))
+        spread = float(np.median(np.abs(log_tangent - np.median(log_tangent)))) * 1.48
+        hfov = 2.0 * math.atan(math.exp(float(np.median(log_tangent))))
+        sd = 0.0 if len(stated) == len(members) else math.hypot(_MEDIAN * spread / math.sqrt(len(half)), _LINES_SD)
+        found.append(
+            SharedCamera(
+                make=make,
+                model=model,
+                width=width,
+                height=height,
+                photographs=len(members),
+                hfov=hfov,
+                hfov_sd=sd * math.sin(hfov),
+            )
+        )
+    return tuple(found)
+
+
+def camera_height(ground: AlbumGround, evidence: Sequence[Arrays]) -> tuple[float, float, float, float]:
+    """Return the height of the cameras (m) and the scale of the plan, each followed by its standard deviation.
+
+    Photographs tell the height in units of the plan, so one factor is divided between both by what is known of each.
+    """
+    total = np.zeros(len(OFFSETS))
+    usual = -0.5 * np.square(OFFSETS / USUAL_LOG_SD)
+    spread = np.exp(-0.5 * np.square((OFFSETS[:, None] - OFFSETS) / _HAND_SD))
+    for arrays in evidence:
+        alone = arrays["heights"] - usual
+        total += np.log(spread @ np.exp(alone - alone.max()) + 1e-3)
+    plan = ground.plan
+    prior_m = plan.camera_height_m if plan.states_camera_height else USUAL_HEIGHT_M
+    stated_sd_m = DEFAULT_STD_M if plan.camera_height_std_m is None else plan.camera_height_std_m
+    log_sd = max(stated_sd_m / prior_m, 1e-3) if plan.states_camera_height else USUAL_LOG_SD
+    prior = math.log(prior_m / USUAL_HEIGHT_M)
+    total -= 0.5 * np.square(OFFSETS - prior) / (log_sd**2 + _SCALE_SD**2)
+    share = np.exp(total - total.max())
+    share /= share.sum()
+    mean = float(share @ OFFSETS)
+    sd = math.sqrt(float(share @ np.square(OFFSETS - mean)) + (OFFSETS[1] - OFFSETS[0]) ** 2 / 12.0)
+    # A higher camera and a smaller plan look the same.
+    part = _SCALE_SD**2 / (log_sd**2 + _SCALE_SD**2)
+    moved = mean - prior
+    height_m = prior_m * math.exp((1.0 - part) * moved)
+    left = math.sqrt((1.0 - part) * _SCALE_SD**2)
+    return (
+        height_m,
+        height_m * math.hypot(left, (1.0 - part) * sd),
+        math.exp(-part * moved),
+        math.hypot(left, part * sd),
+    )
