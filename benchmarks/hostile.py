@@ -1,11 +1,16 @@
-"""Hostile requests: uploads that exhaust memory, and requests that keep the service busy.
+"""Hostile requests, which exhaust memory or keep the service busy, and hostile plan files.
 
     python -m benchmarks.hostile
+    python -m benchmarks.hostile --files roomplan --bytes 100000
 
 Prints a Markdown table: the request, its bytes, the statuses, the duration, the slowest health check meanwhile, and the
 rise of the resident memory of the service and its workers. Every request must be answered soon and without an internal
 error, health checks within a second, and memory must stay within its limit. The picture of the largest allowed size and
 the first frame of an animation are answered; other pictures and bodies are refused.
+
+`--files` imports small plan files that are made to take an import worker's time or memory: those whose "format,
+content" match an expression, by default all, each in a process of its own with the service's limits. The exit status
+is 1 when a request or a file takes longer or more than it may, or ends its process.
 """
 
 from __future__ import annotations
@@ -14,6 +19,10 @@ import io
 import itertools
 import json
 import math
+import multiprocessing
+import os
+import re
+import resource
 import socket
 import struct
 import sys
@@ -24,6 +33,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from typing import Any, Literal
 
 import httpx
@@ -31,7 +41,11 @@ import numpy as np
 from PIL import Image
 
 from benchmarks import harness
+from benchmarks.hostile_drawings import HOSTILE_PLANS
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.importers import ImportLimits, import_plans
 from service.settings import Settings
+from service.workers.process import limit_memory
 
 _MAX_HEALTH_S, _MAX_ANSWER_S, _TIMEOUT_S, _SETTLE_TIMEOUT_S = 1.0, 10.0, 90.0, 20.0
 # Uploads have up to 40 MiB; parsed JSON takes some 30 times its bytes. A worker may hold the pixels that it decodes.
@@ -44,6 +58,8 @@ _GIGABYTE = 1 << 30
 _CLIENTS = 60
 # More connections than the default limit of file descriptors of a process.
 _IDLE_CONNECTIONS = 1_044
+# CPU time that a file may take: the libraries of its format, and its content.
+_MAX_FILE_S, _MAX_S_PER_100_KB, _WALL_TIMEOUT_S = 4.0, 4.0, 300.0
 _JSON = {"Content-Type": "application/json"}
 _FORM = {"Content-Type": "multipart/form-data; boundary=b"}
 _PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
@@ -69,8 +85,16 @@ class Attack:
 
 
 def main() -> int:
-    """Send everything; return 1 when a limit is exceeded or an attack succeeds."""
-    harness.argument_parser(__doc__).parse_args()
+    """Send or import everything; return 1 when a limit is exceeded or an attack succeeds."""
+    parser = harness.argument_parser(__doc__)
+    parser.add_argument("--files", nargs="?", const="", metavar="EXPRESSION", help="import plan files instead")
+    parser.add_argument("--bytes", type=int, default=100_000, help="approximate size of a file")
+    options = parser.parse_args()
+    return int(send_requests() if options.files is None else import_files(options.files, options.bytes))
+
+
+def send_requests() -> bool:
+    """Send all requests; return whether one fails."""
     failed = False
     with harness.example_service() as service:
         memory_before = harness.service_memory_mb(service.process)
@@ -95,7 +119,7 @@ def main() -> int:
         left_mb = harness.service_memory_mb(service.process) - memory_before
         failed |= left_mb > _MAX_LEFT_MB
         print(f"\nMemory after all requests: {left_mb:+.0f} MB against before.")
-    return int(failed)
+    return failed
 
 
 def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
@@ -315,6 +339,64 @@ def _send_parts(url: str, head: str, body: Iterator[bytes]) -> list[int]:
             except OSError:
                 break
     return [int(answer.split(b" ", 2)[1]) if answer.startswith(b"HTTP/") and sent <= _MAX_SENT_BYTES else 0]
+
+
+def _import_here(number: int, size: int, pipe: Connection) -> None:
+    plan, settings = HOSTILE_PLANS[number], Settings()
+    content = plan.make(size)
+    resource.setrlimit(resource.RLIMIT_CPU, (120, 121))
+    os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
+    begin_s = time.process_time()
+    limit_memory(settings.imports.memory_bytes)
+    pipe.send(len(content))
+    try:
+        plans = import_plans(content, plan.options, ImportLimits())
+        outcome = f"{sum(len(plan.document['rooms']) for plan in plans)} rooms"
+    except InvalidInputError as error:
+        outcome = str(error)
+    except MemoryError:
+        outcome = "MemoryError"
+    except Exception as error:
+        outcome = f"FAULT {type(error).__name__}: {error}"
+    used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    pipe.send((time.process_time() - begin_s, used_mb, outcome))
+
+
+def _import(number: int, size: int) -> tuple[int, float, float, str]:
+    """Import a file in a process of its own; return its bytes, CPU time (s), memory (MB) and the result in words."""
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_import_here, args=(number, size, theirs))
+    process.start()
+    theirs.close()
+    begin_s = time.monotonic()
+    bytes_sent = 0
+    try:
+        bytes_sent = ours.recv()
+        if not ours.poll(_WALL_TIMEOUT_S):
+            process.kill()
+            raise EOFError
+        seconds, memory_mb, outcome = ours.recv()
+    except EOFError:
+        process.join()
+        seconds, memory_mb = time.monotonic() - begin_s, math.nan
+        outcome = f"process ended with {process.exitcode}"
+    process.join()
+    return bytes_sent, seconds, memory_mb, outcome
+
+
+def import_files(expression: str, size: int) -> bool:
+    """Import the files whose "format, content" match an expression; return whether one takes too much."""
+    harness.print_table_head("format", "content", "bytes", "CPU", "memory", "result")
+    failed = False
+    for number, plan in enumerate(HOSTILE_PLANS):
+        if not re.search(expression, f"{plan.format}, {plan.title}"):
+            continue
+        count, seconds, memory_mb, outcome = _import(number, size)
+        is_slow = seconds > _MAX_FILE_S + _MAX_S_PER_100_KB * count / 1e5
+        failed |= is_slow or outcome.startswith(("FAULT", "process"))
+        figures = f"{count:,}", f"{seconds:.1f} s", f"{memory_mb:.0f} MB", f"{'SLOW ' * is_slow}{outcome[:150]}"
+        print(harness.table_row(plan.format, plan.title, *figures), flush=True)
+    return failed
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Hostile plan files of drawings and building models: SVG, DXF, PDF and IFC; see `hostile_plans.py`."""
+"""Small files of drawings and building models, SVG, DXF, PDF and IFC, that are made to take time or memory."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Sequence
 
-from benchmarks.hostile_shapes import Point, boxes, chords, lattice, plan, rounded, star, stars
+from benchmarks.hostile_files import MODELS, PICTURES, Point, boxes, chords, lattice, plan, rounded, star, stars
 from lalaloc_core.importers import ImportOptions
 
 _POINTS = ImportOptions(metres_per_pixel=0.02)
@@ -370,3 +370,4 @@ DRAWINGS = (
     plan("ifc", "a tube that crosses itself", _ifc_disks),
     plan("ifc", "nested lists", lambda s: _ifc("IFCPOLYLINE(" + "(" * s + ")" * s + ")")),
 )
+HOSTILE_PLANS = (*MODELS, *DRAWINGS, *PICTURES)

@@ -1,23 +1,23 @@
-"""CPU time per query of two checkouts of this repository, taken in turns, and the differences of their answers.
+"""Durations and CPU times of two checkouts of this repository, taken in turns, and the differences of their answers.
 
     git worktree add ../before v0.9.0
-    python -m benchmarks.pairs ../before . --rounds 6 --clients 1 4
+    taskset -c 0 python -m benchmarks.pairs ../before . --rounds 5
 
-Each checkout runs the service of its own code with this interpreter. In every round each answers as many queries, in
+Each checkout runs the service of its own code with this interpreter. In every round each does the same work, in
 changing order, so that other load on the machine affects both; the CPU time (user and system) of all processes is
-counted, which load affects less than durations. Prints a Markdown table of medians over the rounds, and the largest
-differences. Exits with 1 if an answer of one checkout is more than 1e-6 m, degrees or probability from the other's.
-
-    taskset -c 0 python -m benchmarks.pairs ../before . --rounds 5 --figures
-
-`--figures` measures one client with a photograph of 12 megapixels, a sphere, a turn, a film and two plans, four
-clients, and the start of the service and of two commands instead. `--only NAME` chooses some of them.
+counted, which load affects less than durations. The work is a photograph of 12 megapixels, spheres, a turn, a film and
+two plans by one client, four clients, and the start of the service and of two commands; `--only NAME` chooses some of
+it. Prints a Markdown table of medians over the rounds, and the largest differences of the answers to spheres. Exits
+with 1 if one is more than 1e-6 m, degrees or probability.
 """
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
 import os
-import statistics
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -26,20 +26,31 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
 
-from benchmarks import harness, pair_inputs
+from benchmarks import harness
 from examples.truth import PLAN_PATH, read_poses
+from lalaloc_core.evaluate.bench.service_latency import PHONE_FIELD_DEG, phone_photograph
+from lalaloc_core.learn.data.views import cut_view, encode_jpeg
+from lalaloc_core.learn.synth.homes.buildings import building_of
+from lalaloc_core.learn.synth.homes.plans import VALIDATION
+from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.photograph import open_picture
 
-_TIMEOUT_S, _WARM_UP = 120.0, 20
+_TIMEOUT_S = 120.0
 _SETTINGS = {**harness.UNLIMITED, "LALALOC_REQUEST_DEADLINE_S": "60"}
 # Queries of a round for figures of single queries, and for those of four clients.
 _SINGLE, _SEVERAL = 6, 40
 _TOLERANCE = 1e-6
+_TURN, _FIELD_DEG = 12, 53.0
+# Frames of the film as they are drawn, at half of its size; FFmpeg repeats and enlarges them to 30 a second in 1080p.
+_FRAMES, _FRAMES_PER_S = 100, 10
+_OFFICE_M2 = 2000.0
 
 
 @dataclass(eq=False)
@@ -51,85 +62,28 @@ class Checkout:
     service: harness.Service
     answers: dict[tuple[bool, int], dict[str, Any]] = field(default_factory=dict)
 
-    def ask(self, client: httpx.Client, number: int, *, known: bool) -> float:
-        """Localise an example panorama; return the duration (s)."""
+    def ask(self, client: httpx.Client, number: int, *, known: bool) -> httpx.Response:
+        """Localise an example photograph."""
         poses = read_poses()
         query = harness.query_of(poses[number % len(poses)], floorplan_id=self.service.plan_id)
         if not known:
             del query["data"]["heading_deg"]
-        begin = time.perf_counter()
         response = client.post("/localise", **query).raise_for_status()
-        duration_s = time.perf_counter() - begin
         self.answers[known, number % len(poses)] = response.json()
-        return duration_s
+        return response
 
-    def burst(self, queries: int, clients: int, *, known: bool) -> Burst:
-        """Answer queries of several clients; return CPU time per query, duration and rate."""
+    def burst(self, clients: int) -> Burst:
+        """Answer queries of several clients with unknown headings."""
         before_s, begin = harness.cpu_s(self.service.process), time.perf_counter()
         with ThreadPoolExecutor(clients) as threads:
-            parts = threads.map(lambda first: self._series(range(first, queries, clients), known=known), range(clients))
+            parts = threads.map(lambda first: self._series(range(first, _SEVERAL, clients)), range(clients))
             durations_s = [duration for part in parts for duration in part]
-        wall_s = time.perf_counter() - begin
-        spent_s = harness.cpu_s(self.service.process) - before_s
-        return Burst(1e3 * spent_s / queries, [1e3 * s for s in durations_s], queries / wall_s)
+        wall_s, spent_s = time.perf_counter() - begin, harness.cpu_s(self.service.process) - before_s
+        return Burst(Spent(wall_s / _SEVERAL, spent_s / _SEVERAL), durations_s)
 
-    def _series(self, numbers: Sequence[int], *, known: bool) -> list[float]:
+    def _series(self, numbers: Sequence[int]) -> list[float]:
         with httpx.Client(base_url=self.service.url, timeout=_TIMEOUT_S) as client:
-            return [self.ask(client, number, known=known) for number in numbers]
-
-
-@dataclass(frozen=True)
-class Burst:
-    """CPU time per query (ms), duration of each (ms) and queries per second."""
-
-    cpu_ms: float
-    durations_ms: list[float]
-    per_second: float
-
-
-def main() -> int:
-    """Measure; return 1 when answers differ."""
-    parser = harness.argument_parser(__doc__)
-    parser.add_argument("checkouts", nargs=2, type=Path, help="folders of the checkouts, the one before first")
-    parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--queries", type=int, default=80, help="queries of each checkout and round")
-    parser.add_argument("--clients", type=int, nargs="*", default=(1, 4))
-    parser.add_argument("--figures", action="store_true", help="measure the figures of all ways to localise")
-    parser.add_argument("--only", action="append", choices=tuple(FIGURES), help="a figure of these; repeatable")
-    options = parser.parse_args()
-    with ExitStack() as stack:
-        checkouts = [stack.enter_context(running_checkout(folder.resolve())) for folder in options.checkouts]
-        if options.figures or options.only:
-            print_figures(checkouts, options.rounds, options.only or list(FIGURES))
-            return 0
-        harness.print_table_head("heading", "clients", "checkout", "CPU per query", "p50", "p99", "queries/s")
-        for known in (True, False):
-            for clients in options.clients:
-                for row in _rows(checkouts, options.rounds, options.queries, clients, known=known):
-                    print(row, flush=True)
-    differences = differences_of(*checkouts)
-    print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
-    return int(max(differences.values()) > _TOLERANCE)
-
-
-def bursts_of(
-    checkouts: Sequence[Checkout], rounds: int, queries: int, clients: int, *, known: bool
-) -> dict[str, Burst]:
-    """Let checkouts answer queries in turns; return the median of their CPU times and rates, and all durations."""
-    for checkout in checkouts:
-        checkout.burst(_WARM_UP, clients, known=known)
-    bursts: dict[str, list[Burst]] = {checkout.name: [] for checkout in checkouts}
-    for index in range(rounds):
-        for checkout in checkouts if index % 2 else reversed(checkouts):
-            bursts[checkout.name].append(checkout.burst(queries, clients, known=known))
-    return {
-        name: Burst(
-            statistics.median(burst.cpu_ms for burst in found),
-            [duration for burst in found for duration in burst.durations_ms],
-            statistics.median(burst.per_second for burst in found),
-        )
-        for name, found in bursts.items()
-    }
+            return [self.ask(client, number, known=False).elapsed.total_seconds() for number in numbers]
 
 
 class Spent(NamedTuple):
@@ -137,6 +91,28 @@ class Spent(NamedTuple):
 
     wall_s: float
     cpu_s: float
+
+
+class Burst(NamedTuple):
+    """Time per answer, and the duration of each (s)."""
+
+    per_answer: Spent
+    durations_s: list[float]
+
+
+def main() -> int:
+    """Measure; return 1 when answers differ."""
+    parser = harness.argument_parser(__doc__)
+    parser.add_argument("checkouts", nargs=2, type=Path, help="folders of the checkouts, the one before first")
+    parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--only", action="append", choices=tuple(FIGURES), help="a figure of these; repeatable")
+    options = parser.parse_args()
+    with ExitStack() as stack:
+        checkouts = [stack.enter_context(_running_checkout(folder.resolve())) for folder in options.checkouts]
+        _print_figures(checkouts, options.rounds, options.only or list(FIGURES))
+    differences = _differences(*checkouts)
+    print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
+    return int(max(differences.values()) > _TOLERANCE)
 
 
 def _sent(send: Callable[[httpx.Client, Checkout], httpx.Response], repeats: int = 1) -> Callable[[Checkout], Spent]:
@@ -153,17 +129,71 @@ def _sent(send: Callable[[httpx.Client, Checkout], httpx.Response], repeats: int
     return measure
 
 
+def _living_room() -> np.ndarray:
+    (living_room,) = (pose for pose in read_poses() if pose.file == "living_room.jpg")
+    return open_picture(living_room.picture.read_bytes(), max_size=(1024, 512))
+
+
+@cache
+def _phone_photograph() -> tuple[bytes, dict[str, str]]:
+    """Return a photograph of 12 megapixels, and the fields of its query."""
+    return phone_photograph(_living_room()), {"hfov_deg": f"{PHONE_FIELD_DEG:g}"}
+
+
+@cache
+def _turn() -> list[bytes]:
+    """Return twelve photographs of a turn, of 1440 x 1080 pixels."""
+    camera, sphere = Perspective.of_hfov(1080, 1440, math.radians(_FIELD_DEG)), _living_room()
+    angles = 2.0 * math.pi * np.arange(_TURN) / _TURN
+    return [encode_jpeg(cut_view(sphere, camera, azimuth=float(a), pitch=0.0, roll=0.0)) for a in angles]
+
+
+def _can_film() -> bool:
+    """Return whether FFmpeg is installed."""
+    return shutil.which("ffmpeg") is not None
+
+
+@cache
+def _film() -> bytes:
+    """Return a film of 10 s in 1080p of a turn once around; needs FFmpeg ."""
+    camera, sphere = Perspective.of_hfov(540, 960, math.radians(_FIELD_DEG)), _living_room()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "turn.mp4"
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "540x960", "-r", f"{_FRAMES_PER_S}", "-i", "-"]
+        coded = [
+            "-vf",
+            "fps=30,scale=1080:1920",
+            "-c:v",
+            "libx264",
+            "-preset",
+            "ultrafast",
+            "-pix_fmt",
+            "yuv420p",
+            "-threads",
+            "1",
+        ]
+        command = ["ffmpeg", "-v", "error", "-y", *source, *coded, str(path)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+            assert process.stdin is not None
+            for index in range(_FRAMES):
+                azimuth = 2.0 * math.pi * index / _FRAMES
+                process.stdin.write(cut_view(sphere, camera, azimuth=azimuth, pitch=0.0, roll=0.0).tobytes())
+            process.stdin.close()
+        return path.read_bytes()
+
+
+@cache
+def _plan(name: str) -> bytes:
+    """Return the example flat, or a generated office of 2,000 m²."""
+    if name == "flat":
+        return PLAN_PATH.read_bytes()
+    return json.dumps(building_of(VALIDATION, 3, _OFFICE_M2).plan.to_dict()).encode()
+
+
 def _photograph(client: httpx.Client, checkout: Checkout) -> httpx.Response:
-    content, fields = pair_inputs.photograph()
+    content, fields = _phone_photograph()
     data = {"floorplan_id": checkout.service.plan_id, **fields}
     return client.post("/localise", data=data, files={"photo": ("p.jpg", content, "image/jpeg")})
-
-
-def _sphere(client: httpx.Client, checkout: Checkout, *, known: bool) -> httpx.Response:
-    query = harness.query_of(read_poses()[0], floorplan_id=checkout.service.plan_id)
-    if not known:
-        del query["data"]["heading_deg"]
-    return client.post("/localise", **query)
 
 
 def _sequence(client: httpx.Client, checkout: Checkout, name: str, contents: Sequence[bytes]) -> httpx.Response:
@@ -171,15 +201,15 @@ def _sequence(client: httpx.Client, checkout: Checkout, name: str, contents: Seq
     return client.post("/localise/sequence", data=data, files=[(name, ("p", content)) for content in contents])
 
 
-def _four_clients(checkout: Checkout) -> Spent:
-    """Return the time per answer of four clients."""
-    burst = checkout.burst(_SEVERAL, 4, known=False)
-    return Spent(1.0 / burst.per_second, burst.cpu_ms / 1e3)
+def _spheres(*, known: bool) -> Callable[[Checkout], Spent]:
+    """Return the measurement of the example photographs, with or without their headings."""
+    numbers = itertools.count()
+    return _sent(lambda client, checkout: checkout.ask(client, next(numbers), known=known), _SINGLE)
 
 
 def _spread(checkout: Checkout) -> Spent:
     """Return the 99th percentile of four clients over the median of one, in place of a duration."""
-    one, four = (checkout.burst(_SEVERAL, clients, known=False).durations_ms for clients in (1, 4))
+    one, four = (checkout.burst(clients).durations_s for clients in (1, 4))
     return Spent(float(np.quantile(four, 0.99) / np.median(one)), float("nan"))
 
 
@@ -188,7 +218,7 @@ def _localisability(name: str) -> Callable[[Checkout], Spent]:
 
     def measure(checkout: Checkout) -> Spent:
         with httpx.Client(base_url=checkout.service.url, timeout=_TIMEOUT_S) as client:
-            stored = client.post("/floorplans", files={"file": (f"{name}.json", pair_inputs.plan(name))})
+            stored = client.post("/floorplans", files={"file": (f"{name}.json", _plan(name))})
             place = f"/floorplans/{stored.raise_for_status().json()['id']}"
             harness.wait_until(lambda: client.get(place).json()["status"] == "ready", "the plan is ready", _TIMEOUT_S)
             spent = _sent(lambda client, _: client.get(f"{place}/localisability"))(checkout)
@@ -229,14 +259,12 @@ def _start(checkout: Checkout) -> Spent:
 # Measurements by name; inputs are made when they are first needed.
 FIGURES: Mapping[str, Callable[[Checkout], Spent]] = {
     "photograph of 12 megapixels": _sent(_photograph, _SINGLE),
-    "sphere, heading known": _sent(lambda client, checkout: _sphere(client, checkout, known=True), _SINGLE),
-    "sphere, heading unknown": _sent(lambda client, checkout: _sphere(client, checkout, known=False), _SINGLE),
-    "four clients, per answer": _four_clients,
+    "sphere, heading known": _spheres(known=True),
+    "sphere, heading unknown": _spheres(known=False),
+    "four clients, per answer": lambda checkout: checkout.burst(4).per_answer,
     "p99 of four over p50 of one": _spread,
-    "turn of twelve photographs": _sent(
-        lambda client, checkout: _sequence(client, checkout, "photo", pair_inputs.turn())
-    ),
-    "film of 10 s, 1080p": _sent(lambda client, checkout: _sequence(client, checkout, "film", [pair_inputs.film()])),
+    "turn of twelve photographs": _sent(lambda client, checkout: _sequence(client, checkout, "photo", _turn())),
+    "film of 10 s, 1080p": _sent(lambda client, checkout: _sequence(client, checkout, "film", [_film()])),
     "localisability, example flat": _localisability("flat"),
     "localisability, office of 2,000 m²": _localisability("office"),
     "lalaloc --help": _command("--help"),
@@ -245,7 +273,7 @@ FIGURES: Mapping[str, Callable[[Checkout], Spent]] = {
 }
 
 
-def print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[str]) -> None:
+def _print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[str]) -> None:
     """Print the medians of figures over rounds in which the checkouts take turns, after a round as a warm-up.
 
     Ratios are medians of the ratios within a round.
@@ -253,7 +281,7 @@ def print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[st
     before, after = (checkout.name for checkout in checkouts)
     harness.print_table_head("figure", before, after, "ratio", f"CPU, {before}", f"CPU, {after}", "ratio")
     for name in names:
-        if name.startswith("film") and not pair_inputs.can_film():
+        if name.startswith("film") and not _can_film():
             print(harness.table_row(name, *["needs FFmpeg"] * 2, *[""] * 4), flush=True)
             continue
         found: list[list[Spent]] = []
@@ -270,18 +298,11 @@ def print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[st
         print(harness.table_row(name, *cells), flush=True)
 
 
-def _rows(checkouts: Sequence[Checkout], rounds: int, queries: int, clients: int, *, known: bool) -> Iterator[str]:
-    for name, burst in bursts_of(checkouts, rounds, queries, clients, known=known).items():
-        p50, p99 = np.quantile(burst.durations_ms, [0.5, 0.99])
-        times = f"{burst.cpu_ms:.1f} ms", f"{p50:.0f} ms", f"{p99:.0f} ms"
-        yield harness.table_row("known" if known else "unknown", clients, name, *times, f"{burst.per_second:.1f}")
-
-
-def differences_of(before: Checkout, after: Checkout) -> dict[str, float]:
-    """Return the largest absolute differences of the answers to equal queries."""
+def _differences(before: Checkout, after: Checkout) -> dict[str, float]:
+    """Return the largest absolute differences of the answers to equal queries that both answered."""
     largest: dict[str, float] = {"position (m)": 0.0, "heading (°)": 0.0, "confidence": 0.0}
-    for key, old in before.answers.items():
-        new = after.answers[key]
+    for key in before.answers.keys() & after.answers.keys():
+        old, new = before.answers[key], after.answers[key]
         turned = (new["heading_deg"] - old["heading_deg"] + 180.0) % 360.0 - 180.0
         moved = max(abs(new["position"][axis] - old["position"][axis]) for axis in ("x_m", "y_m"))
         found = moved, abs(turned), abs((new["confidence"] or 0.0) - (old["confidence"] or 0.0))
@@ -290,7 +311,7 @@ def differences_of(before: Checkout, after: Checkout) -> dict[str, float]:
 
 
 @contextmanager
-def running_checkout(folder: Path) -> Iterator[Checkout]:
+def _running_checkout(folder: Path) -> Iterator[Checkout]:
     """Run the service of the checkout in a folder, with a temporary data folder and the example plan."""
     with harness.example_service(_SETTINGS, folder) as service:
         yield Checkout(folder.name, folder, service)

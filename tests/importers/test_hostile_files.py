@@ -21,9 +21,8 @@ import svgelements
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
-from benchmarks.hostile_drawings import pdf
-from benchmarks.hostile_plans import HOSTILE_PLANS
-from benchmarks.hostile_shapes import HostilePlan, star
+from benchmarks.hostile_drawings import HOSTILE_PLANS, pdf
+from benchmarks.hostile_files import HostilePlan, star
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans

@@ -12,9 +12,8 @@ import pypdfium2
 import pytest
 from PIL import Image
 
-from benchmarks.hostile_drawings import ifc_space, pdf
-from benchmarks.hostile_plans import HOSTILE_PLANS
-from benchmarks.hostile_shapes import boxes, chords
+from benchmarks.hostile_drawings import HOSTILE_PLANS, ifc_space, pdf
+from benchmarks.hostile_files import boxes, chords
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
