@@ -18,7 +18,7 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 from shapely.geometry.base import BaseGeometry
 
-from benchmarks.plan_drawing import Model, OpeningSymbol, scan
+from benchmarks.plan_drawing import Model, OpeningSymbol, door_leaves, hatch_lines, scan
 from lalaloc_core.draw import rasterise
 from lalaloc_core.draw.canvas import font_file
 
@@ -148,17 +148,14 @@ def draw_home(model: Model, style: FileStyle, language: str, rng: np.random.Gene
     for part in parts:
         drawing.marks.append(Mark("wall", part, tone if solid else None, 0.0 if solid else _THICK_PEN))
     if style == "hatched":
-        drawing.marks.extend(Mark("wall", line, None, _THIN_PEN) for line in _hatch(walls, model.size_m))
+        drawing.marks.extend(
+            Mark("wall", line, None, _THIN_PEN)
+            for line in hatch_lines(walls, model.size_m, _HATCH_M)
+            if line.length > 0.01
+        )
     for opening in model.openings:
         drawing.marks.extend(_opening(opening, painted=style == "painted over"))
     return drawing
-
-
-def _hatch(walls: BaseGeometry, size_m: tuple[float, float]) -> list[BaseGeometry]:
-    width, height = size_m
-    offsets = np.arange(-height, width, _HATCH_M * math.sqrt(2.0))
-    lines = shapely.multilinestrings([[(x, 0.0), (x + height, height)] for x in offsets])
-    return [part for part in shapely.get_parts(shapely.intersection(lines, walls)) if part.length > 0.01]
 
 
 def _opening(opening: OpeningSymbol, *, painted: bool) -> list[Mark]:
@@ -169,12 +166,7 @@ def _opening(opening: OpeningSymbol, *, painted: bool) -> list[Mark]:
         return [*marks, Mark("window", opening.shape, None, _THIN_PEN), Mark("window", line, None, _THIN_PEN)]
     if opening.kind != "door":
         return marks
-    start, end = np.asarray(opening.shape.exterior.coords)[:2]
-    width = float(np.linalg.norm(end - start))
-    along = (end - start) / width
-    inward = np.array([-along[1], along[0]])
-    leaves = [(start, along, width)] if width <= 1.3 else [(start, along, 0.5 * width), (end, -along, 0.5 * width)]
-    for hinge, direction, radius in leaves:
+    for hinge, direction, inward, radius in door_leaves(opening):
         tip = hinge + radius * inward
         angles = sorted(math.degrees(math.atan2(v[1], v[0])) for v in (direction, inward))
         first, last = angles if angles[1] - angles[0] <= 180.0 else (angles[1], angles[0] + 360.0)

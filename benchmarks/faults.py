@@ -237,7 +237,7 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
         def kill_workers() -> None:
             rng = random.Random(0)
             while not stop.wait(options.every):
-                if workers := harness.worker_processes(service.process):
+                if workers := _worker_processes(service.process):
                     worker = rng.choice(workers)
                     with suppress(psutil.NoSuchProcess):
                         worker.kill()
@@ -274,6 +274,18 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
             "memory does not grow": warm[-1] <= warm[0] + _MAX_GROWTH_MB,
         },
     }
+
+
+def _worker_processes(process: psutil.Process) -> list[psutil.Process]:
+    """Return the worker processes of a service, without Python's resource tracker."""
+    workers = []
+    for child in process.children(recursive=True):
+        try:
+            if "spawn_main" in " ".join(child.cmdline()):
+                workers.append(child)
+        except psutil.NoSuchProcess:
+            continue
+    return workers
 
 
 def _workers_restart(url: str) -> bool:

@@ -9,17 +9,11 @@ import itertools
 import json
 import math
 import multiprocessing
-import os
 import random
-import signal
 import socket
-import subprocess
 import sys
 import tempfile
-import threading
 import time
-import urllib.request
-from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +22,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -40,7 +34,6 @@ from examples.truth import PLAN_PATH, TruePose, read_poses
 
 _JSON = "application/json"
 _REQUEST_TIMEOUT_S, _IDLE_S = 600.0, 5.0
-_START_S, _STOP_S, _HEALTH_TIMEOUT_S = 120.0, 40.0, 20.0
 _SMALL_BUFFER = 4096
 _REFUSED = "refused"
 _KINDS = ("lpo", "vdr", _REFUSED)
@@ -98,25 +91,6 @@ def example_service(settings: Mapping[str, str] | None = None, checkout: Path = 
         yield replace(service, plan_id=upload_example_plan(service.url))
 
 
-@contextmanager
-def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Run the service as `uvicorn --workers` on one database; yield its URL and the first process."""
-    port = free_port()
-    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
-    command += ["--workers", str(processes)]
-    with tempfile.TemporaryDirectory() as data:
-        environment = {**os.environ, **settings, "LALALOC_LOG_LEVEL": "error", "LALALOC_DATA_DIR": data}
-        process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True)
-        url = f"http://127.0.0.1:{port}"
-        try:
-            # The processes share the port, so only several answers in a row show that all are ready.
-            wait_until(lambda: all(_is_ready(url) for _ in range(10 * processes)), "the service is ready", _START_S)
-            yield url, process
-        finally:
-            os.killpg(process.pid, signal.SIGTERM)
-            process.wait(_STOP_S)
-
-
 def wait_until(is_true: Callable[[], bool], condition: str, timeout_s: float, pause_s: float = 0.05) -> None:
     """Wait until a condition holds."""
     deadline = time.monotonic() + timeout_s
@@ -124,19 +98,6 @@ def wait_until(is_true: Callable[[], bool], condition: str, timeout_s: float, pa
         if time.monotonic() > deadline:
             raise TimeoutError(f"it does not hold after {timeout_s:g} s that {condition}")
         time.sleep(pause_s)
-
-
-def free_port() -> int:
-    """Return a port that is free now."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return probe.getsockname()[1]
-
-
-def _is_ready(url: str) -> bool:
-    try:
-        return httpx.get(f"{url}/readyz").status_code == httpx.codes.OK
-    except httpx.TransportError:
-        return False
 
 
 def upload_example_plan(url: str) -> str:
@@ -369,62 +330,6 @@ def _kind_of(answer: Answer, pose: TruePose) -> str:
     return stage if error_m <= _MAX_ERROR_M else f"{pose.file}: {error_m:.2f} m off at stage {stage}"
 
 
-class _Watch(ABC):
-    """Check that is repeated in a thread while a block runs."""
-
-    def __init__(self, pause_s: float) -> None:
-        self._pause_s, self._end = pause_s, threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._end.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        self._check()
-        while not self._end.wait(self._pause_s):
-            self._check()
-
-    @abstractmethod
-    def _check(self) -> None: ...
-
-
-class HealthWatch(_Watch):
-    """Health checks on new connections, as a load balancer sends them, while a block runs.
-
-    A failed check makes `slowest_s` infinite.
-    """
-
-    def __init__(self, url: str, pause_s: float = 0.05) -> None:
-        super().__init__(pause_s)
-        self._url, self.slowest_s = url, 0.0
-
-    def _check(self) -> None:
-        begin = time.perf_counter()
-        try:
-            with urllib.request.urlopen(f"{self._url}/healthz", timeout=_HEALTH_TIMEOUT_S) as response:
-                response.read()
-        except OSError:
-            self.slowest_s = math.inf
-        self.slowest_s = max(self.slowest_s, time.perf_counter() - begin)
-
-
-class MemoryWatch(_Watch):
-    """Peak resident memory (MB) of a service and its workers while a block runs."""
-
-    def __init__(self, process: psutil.Process) -> None:
-        super().__init__(0.02)
-        self._process = process
-        self.before = self.highest = service_memory_mb(process)
-
-    def _check(self) -> None:
-        self.highest = max(self.highest, service_memory_mb(self._process))
-
-
 def cpu_s(process: psutil.Process) -> float:
     """Return the CPU time (s, user and system) of a service and its workers."""
     total_s = 0.0
@@ -446,15 +351,3 @@ def resident_mb(process: psutil.Process) -> float:
         return process.memory_info().rss / 2**20
     except psutil.NoSuchProcess:
         return 0.0
-
-
-def worker_processes(process: psutil.Process) -> list[psutil.Process]:
-    """Return the worker processes of a service, without Python's resource tracker."""
-    workers = []
-    for child in process.children(recursive=True):
-        try:
-            if "spawn_main" in " ".join(child.cmdline()):
-                workers.append(child)
-        except psutil.NoSuchProcess:
-            continue
-    return workers

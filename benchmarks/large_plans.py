@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import UInt8
 
-from benchmarks.harness import argument_parser, print_table_head
+from benchmarks.harness import argument_parser, print_table_head, table_row
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
@@ -25,7 +24,7 @@ from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Query
@@ -39,27 +38,6 @@ _AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 190_000.0)
 _MAX_OPENINGS = 30_000
 _STEP_M = 0.5
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True)
-class _Row:
-    """Figures of one building; seconds and milliseconds of processor time."""
-
-    plan: FloorPlan
-    poses: int
-    read_s: float
-    ready_s: float
-    megabytes: float
-    known_ms: float
-    unknown_ms: float
-    retrieve_ms: float
-
-    def __str__(self) -> str:
-        return (
-            f"| {self.plan.area_m2:,.0f} | {len(self.plan.rooms):,} | {self.poses:,} | {self.read_s:.2f} s "
-            f"| {self.ready_s:.2f} s | {self.megabytes:.1f} MB, {1e3 * self.megabytes / self.poses:.2f} kB "
-            f"| {self.known_ms:.0f} ms | {self.unknown_ms:.0f} ms | {self.retrieve_ms:.0f} ms |"
-        )
 
 
 def main() -> None:
@@ -76,52 +54,45 @@ def main() -> None:
     print_table_head(*head.split(", "))
     for area_m2 in arguments.areas:
         building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)
-        print(_measure(building, bundle, renderers, arguments.queries), flush=True)
+        print(table_row(*_measure(building, bundle, renderers, arguments.queries)), flush=True)
 
 
-def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int) -> _Row:
+def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int) -> Iterator[str]:
     encoders = PhotographEncoder(bundle, threads=1)
     document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
     read_s, plan = _time_of(lambda: FloorPlan.from_dict(document, limits))
-    grids: list[PoseGrid] = []
-
-    def prepare() -> None:
-        grid = embed(plan, encoders, step_m=_STEP_M, camera_height_m=plan.camera_height_m)
-        grid.binned(plan)
-        grids.append(grid)
-
-    ready_s, _ = _time_of(prepare)
-    grid, rng = grids[0], np.random.default_rng(5)
-    homes = rng.integers(len(building.homes), size=count)
-    shots = [sample_shots(building.homes[home], 1, rng)[0] for home in homes]
+    ready_s, grid = _time_of(lambda: _prepared(plan, encoders))
+    megabytes = grid_bytes(grid) / 1e6
+    yield from (f"{plan.area_m2:,.0f}", f"{len(plan.rooms):,}", f"{len(grid.poses):,}")
+    yield from (f"{read_s:.2f} s", f"{ready_s:.2f} s")
+    yield f"{megabytes:.1f} MB, {1e3 * megabytes / len(grid.poses):.2f} kB"
+    rng = np.random.default_rng(5)
+    shots = [sample_shots(building.homes[home], 1, rng)[0] for home in rng.integers(len(building.homes), size=count)]
     refiner, config, weights = local_refiner(bundle), MatchingConfig(), encoders.manifest.evidence
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
     images = [renderers.renderer(height, width).render([shot]).cpu().numpy()[0] for shot in shots]
-    spent: dict[bool, list[float]] = {True: [], False: []}
-    retrieved = []
 
-    def localise_shot(image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> None:
-        query = _encode(encoders, image, shot, known=known)
-        localise(plan, grid, encoders, query, refiner=refiner)
+    def query(number: int, *, known: bool) -> Query:
+        shot = shots[number]
+        heading = shot.heading if known else None
+        return encoders.spheres.query(images[number], heading, CameraHeight(shot.camera_height_m))
 
-    for number, (image, shot) in enumerate(zip(images, shots, strict=True)):
-        for known in (True, False):
-            if not number:
-                localise_shot(image, shot, known=known)
-            spent[known].append(
-                _time_of(lambda image=image, shot=shot, known=known: localise_shot(image, shot, known=known))[0]
-            )
-        query = _encode(encoders, image, shot, known=False)
-        retrieved.append(_time_of(lambda query=query: grid_costs(plan, grid, query, weights, config))[0])
-    known_ms, unknown_ms, retrieve_ms = (
-        1e3 * statistics.median(times) for times in (spent[True], spent[False], retrieved)
-    )
-    megabytes = grid_bytes(grid) / 1e6
-    return _Row(plan, len(grid.poses), read_s, ready_s, megabytes, known_ms, unknown_ms, retrieve_ms)
+    def search(number: int, *, known: bool) -> None:
+        localise(plan, grid, encoders, query(number, known=known), refiner=refiner)
+
+    for known in (True, False):
+        search(0, known=known)
+        times = [_time_of(partial(search, number, known=known))[0] for number in range(count)]
+        yield f"{1e3 * statistics.median(times):.0f} ms"
+    unknown = [query(number, known=False) for number in range(count)]
+    times = [_time_of(partial(grid_costs, plan, grid, each, weights, config))[0] for each in unknown]
+    yield f"{1e3 * statistics.median(times):.0f} ms"
 
 
-def _encode(encoders: PhotographEncoder, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
-    return encoders.spheres.query(image, shot.heading if known else None, CameraHeight(shot.camera_height_m))
+def _prepared(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
+    grid = embed(plan, encoders, step_m=_STEP_M, camera_height_m=plan.camera_height_m)
+    grid.binned(plan)
+    return grid
 
 
 def _time_of(work: Callable[[], _T]) -> tuple[float, _T]:

@@ -305,13 +305,8 @@ class _Sheet:
             self._outline(part, (0, 0, 0), 2)
 
     def _hatch(self, parts: list[BaseGeometry], spacing_m: float) -> None:
-        walls = shapely.unary_union(parts)
-        width, height = self._model.size_m
-        offsets = np.arange(-height, width, spacing_m * math.sqrt(2.0))
-        lines = shapely.multilinestrings([[(x, 0.0), (x + height, height)] for x in offsets])
-        for line in shapely.get_parts(shapely.intersection(lines, walls)):
-            if isinstance(line, shapely.LineString):
-                self._line(line.coords[0], line.coords[-1], (0, 0, 0), 1)
+        for line in hatch_lines(shapely.unary_union(parts), self._model.size_m, spacing_m):
+            self._line(line.coords[0], line.coords[-1], (0, 0, 0), 1)
 
     def draw_openings(self) -> None:
         for opening in self._model.openings:
@@ -323,13 +318,7 @@ class _Sheet:
 
     def _door(self, opening: OpeningSymbol) -> None:
         """Draw leaf and arc into the room of the opening; wide doors have two leaves."""
-        corners = np.asarray(opening.shape.exterior.coords)[:2]
-        start, end = corners
-        width = float(np.linalg.norm(end - start))
-        along = (end - start) / width
-        inward = np.array([-along[1], along[0]])
-        leaves = [(start, along, width)] if width <= 1.3 else [(start, along, 0.5 * width), (end, -along, 0.5 * width)]
-        for hinge, direction, radius in leaves:
+        for hinge, direction, inward, radius in door_leaves(opening):
             self._line(hinge, hinge + radius * inward, (0, 0, 0), 1)
             angles = np.linspace(0.0, 0.5 * np.pi, 25)[:, None]
             arc = hinge + radius * (np.cos(angles) * direction + np.sin(angles) * inward)
@@ -363,6 +352,26 @@ class _Sheet:
     def _pixel(self, point: tuple[float, float]) -> tuple[int, int]:
         x, y = self._fixed(np.array([point]))[0] / 2**_SHIFT
         return round(x), round(y)
+
+
+def hatch_lines(walls: BaseGeometry, size_m: tuple[float, float], spacing_m: float) -> list[shapely.LineString]:
+    """Return lines at 45 degrees within walls on a sheet."""
+    width, height = size_m
+    offsets = np.arange(-height, width, spacing_m * math.sqrt(2.0))
+    lines = shapely.multilinestrings([[(x, 0.0), (x + height, height)] for x in offsets])
+    parts = shapely.get_parts(shapely.intersection(lines, walls))
+    return [part for part in parts if isinstance(part, shapely.LineString)]
+
+
+def door_leaves(opening: OpeningSymbol) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+    """Return the hinge, the direction when shut and when open, and the width of each leaf; wide doors have two."""
+    start, end = np.asarray(opening.shape.exterior.coords)[:2]
+    width = math.dist(start, end)
+    along = (end - start) / width
+    inward = np.array([-along[1], along[0]])
+    if width <= 1.3:
+        return [(start, along, inward, width)]
+    return [(start, along, inward, 0.5 * width), (end, -along, inward, 0.5 * width)]
 
 
 def scan(picture: UInt8[np.ndarray, "h w 3"], degrees: float, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:

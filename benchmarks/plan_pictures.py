@@ -7,16 +7,17 @@ shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that ar
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
 import shapely
 
+from benchmarks.harness import argument_parser, print_table_head, table_row
 from benchmarks.plan_drawing import STYLES, DrawnPlan, OpeningSymbol, Style, draw_plan
 from benchmarks.plan_symbols import FIXTURES
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -30,59 +31,72 @@ _SIGMA, _DARKEST, _PIXELS_PER_M_AT_150_DPI = 5.0, 0.6, 0.01 * 150.0 / 0.0254
 
 
 @dataclass
-class Score:
-    """Counts over plans of one style."""
+class Count:
+    """Number of drawn things, of imported ones, and of those in both."""
 
-    rooms: int = 0
-    rooms_found: int = 0
-    rooms_imported: int = 0
-    seconds: float = 0.0
-    plans: int = 0
-    door: tuple[int, int, int] = (0, 0, 0)
-    window: tuple[int, int, int] = (0, 0, 0)
+    drawn: int = 0
+    imported: int = 0
+    matched: int = 0
+
+    def add(self, drawn: int, imported: int, matched: int) -> None:
+        """Add the counts of a plan."""
+        self.drawn, self.imported, self.matched = self.drawn + drawn, self.imported + imported, self.matched + matched
 
     @property
-    def room_share(self) -> float:
-        """Share of rooms found with an intersection over union of at least 0.9."""
-        return self.rooms_found / max(self.rooms, 1)
+    def f1(self) -> float:
+        """F1 score."""
+        return 2.0 * self.matched / max(self.drawn + self.imported, 1)
 
 
-def f1(counts: tuple[int, int, int]) -> float:
-    """Return the F1 score of (true, imported, found)."""
-    true, imported, found = counts
-    return 2.0 * found / max(true + imported, 1)
+@dataclass
+class Score:
+    """Counts of rooms, doors, windows and fixtures over plans, and the CPU time of their import."""
+
+    counts: dict[str, Count] = field(default_factory=lambda: defaultdict(Count))
+    seconds: float = 0.0
+    plans: int = 0
+
+    def add(self, drawn: DrawnPlan, content: bytes) -> dict[str, Any]:
+        """Import a picture, count what is found, and return the plan; none where the import is refused."""
+        began = time.process_time()
+        try:
+            document = import_plan(content, ImportOptions(metres_per_pixel=drawn.metres_per_pixel)).document
+        except InvalidFloorPlanError:
+            document = {"rooms": []}
+        self.seconds += time.process_time() - began
+        self.plans += 1
+        rooms = [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
+        self.counts["room"].add(len(drawn.rooms), len(rooms), _overlapping(drawn.rooms, rooms, _IOU))
+        for kind in ("door", "window"):
+            lines = [shapely.LineString(o["line"]) for o in document.get("openings", []) if o["kind"] == kind]
+            truth = [opening for opening in drawn.openings if opening.kind == kind]
+            self.counts[kind].add(len(truth), len(lines), _matches(truth, lines))
+        for kind in FIXTURES:
+            outlines = [shapely.Polygon(e["outline"]) for e in document.get("fixtures", []) if e["kind"] == kind]
+            symbols = [symbol.outline for symbol in drawn.symbols if symbol.kind == kind]
+            self.counts[kind].add(len(symbols), len(outlines), _overlapping(outlines, symbols, _SYMBOL_IOU))
+        return document
+
+    def row(self, label: str) -> str:
+        """Return the figures of rooms and openings as a row of a Markdown table."""
+        room, per_plan = self.counts["room"], self.seconds / max(self.plans, 1)
+        share = f"{100.0 * room.matched / max(room.drawn, 1):.1f}%"
+        scores = (f"{self.counts[kind].f1:.3f}" for kind in ("door", "window"))
+        return table_row(label, room.drawn, share, *scores, f"{per_plan:.1f} s")
 
 
-def score_plan(drawn: DrawnPlan, content: bytes, score: Score) -> dict[str, Any]:
-    """Import one picture, count the rooms and openings found, and return the plan; none where the import is refused."""
-    began = time.process_time()
-    try:
-        document = import_plan(content, ImportOptions(metres_per_pixel=drawn.metres_per_pixel)).document
-    except InvalidFloorPlanError:
-        document = {"rooms": []}
-    score.seconds += time.process_time() - began
-    score.plans += 1
-    imported = [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
-    score.rooms += len(drawn.rooms)
-    score.rooms_imported += len(imported)
-    score.rooms_found += sum(any(_iou(room, candidate) >= _IOU for candidate in imported) for room in drawn.rooms)
-    openings = document.get("openings", [])
-    for kind in ("door", "window"):
-        lines = [shapely.LineString(opening["line"]) for opening in openings if opening["kind"] == kind]
-        truth = [opening for opening in drawn.openings if opening.kind == kind]
-        counts = (len(truth), len(lines), _matches(truth, lines))
-        setattr(score, kind, tuple(a + b for a, b in zip(getattr(score, kind), counts, strict=True)))
-    return document
-
-
-def _iou(a: shapely.Polygon, b: shapely.Polygon) -> float:
+def intersection_over_union(a: shapely.Polygon, b: shapely.Polygon) -> float:
+    """Return the share of the area of two polygons that both cover."""
     shared = shapely.intersection(a, b).area
     return shared / (a.area + b.area - shared)
 
 
+def _overlapping(shapes: Sequence[shapely.Polygon], others: Sequence[shapely.Polygon], least: float) -> int:
+    return sum(any(intersection_over_union(shape, other) >= least for other in others) for shape in shapes)
+
+
 def _matches(truth: Sequence[OpeningSymbol], imported: Sequence[shapely.LineString]) -> int:
     unmatched = list(imported)
-    found = 0
     for opening in truth:
         line = shapely.LineString([opening.start, opening.end])
         around = line.buffer(_APART_M, cap_style="flat")
@@ -90,155 +104,105 @@ def _matches(truth: Sequence[OpeningSymbol], imported: Sequence[shapely.LineStri
             shared = shapely.intersection(around, candidate).length
             if shared >= _OVERLAP * max(line.length, candidate.length):
                 unmatched.remove(candidate)
-                found += 1
                 break
-    return found
+    return len(imported) - len(unmatched)
 
 
-def measure(style: Style, plans: int, first_seed: int = 0) -> Score:
-    """Return the score of a number of generated plans of a style."""
+def measure(style: Style, seeds: range, *, has_symbols: bool = False) -> Score:
+    """Return the score of generated plans of a style."""
     score = Score()
-    for seed in range(first_seed, first_seed + plans):
-        drawn = draw_plan(style, seed)
-        score_plan(drawn, drawn.jpeg() if style == "scanned" else drawn.png(), score)
+    for seed in seeds:
+        drawn = draw_plan(style, seed, has_symbols=has_symbols)
+        score.add(drawn, _file(style, drawn))
     return score
 
 
-def measure_condition(condition: Condition, plans: int, first_seed: int = 0) -> Score:
+def _file(style: Style, drawn: DrawnPlan) -> bytes:
+    return drawn.jpeg() if style == "scanned" else drawn.png()
+
+
+def measure_condition(condition: Condition, seeds: range) -> Score:
     """Return the score of generated plans under a condition, over all styles that are no scans."""
-    score = Score()
+    score, is_jpeg = Score(), condition.startswith("JPEG")
+    pixels_per_m = _PIXELS_PER_M_AT_150_DPI if is_jpeg else None
     for style in STYLES:
-        for seed in range(first_seed, first_seed + plans if style != "scanned" else first_seed):
-            is_jpeg = condition.startswith("JPEG")
-            drawn = draw_plan(
-                style,
-                seed,
-                is_furnished=condition == "furniture",
-                pixels_per_m=_PIXELS_PER_M_AT_150_DPI if is_jpeg else None,
-            )
+        for seed in seeds if style != "scanned" else ():
+            drawn = draw_plan(style, seed, is_furnished=condition == "furniture", pixels_per_m=pixels_per_m)
             if "shadow" in condition:
                 drawn = drawn.shaded(_DARKEST)
             if "noise" in condition:
                 drawn = drawn.noisy(_SIGMA, seed)
-            score_plan(drawn, drawn.jpeg() if is_jpeg else drawn.png(), score)
+            score.add(drawn, drawn.jpeg() if is_jpeg else drawn.png())
     return score
 
 
-def measure_symbols(style: Style, plans: int, first_seed: int = 0) -> tuple[Score, dict[str, tuple[int, int, int]]]:
-    """Return the score of plans with symbols, and by kind of fixture how many are drawn, imported, and both."""
-    score = Score()
-    counts: dict[str, tuple[int, int, int]] = dict.fromkeys(FIXTURES, (0, 0, 0))
-    for seed in range(first_seed, first_seed + plans):
-        drawn = draw_plan(style, seed, has_symbols=True)
-        document = score_plan(drawn, drawn.jpeg() if style == "scanned" else drawn.png(), score)
-        fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in document.get("fixtures", [])]
-        for kind in FIXTURES:
-            truth = [symbol.outline for symbol in drawn.symbols if symbol.kind == kind]
-            found = [outline for name, outline in fixtures if name == kind]
-            matched = sum(any(_iou(outline, other) >= _SYMBOL_IOU for other in truth) for outline in found)
-            drawn_before, found_before, matched_before = counts[kind]
-            counts[kind] = drawn_before + len(truth), found_before + len(found), matched_before + matched
-    return score, counts
+def _print_scores(scores: Iterator[tuple[str, Score]], label: str = "style") -> list[Score]:
+    """Print the rows as they are measured."""
+    print_table_head(label, "rooms", "found, IoU ≥ 0.9", "doors, F1", "windows, F1", "CPU time per picture")
+    measured = []
+    for name, score in scores:
+        print(score.row(name), flush=True)
+        measured.append(score)
+    return measured
 
 
-def symbol_table(counts: Sequence[dict[str, tuple[int, int, int]]]) -> str:
-    """Return the precision and the recall of fixtures, summed over styles, as a Markdown table."""
-    lines = ["| fixture | drawn | imported | precision | recall |", "|---|---|---|---|---|"]
-    for kind in (*FIXTURES, "all"):
-        chosen = FIXTURES if kind == "all" else (kind,)
-        drawn, found, matched = np.sum([part[name] for part in counts for name in chosen], axis=0).tolist()
-        precision = f"{100.0 * matched / found:.1f}%" if found else "-"
-        lines.append(f"| {kind} | {drawn} | {found} | {precision} | {100.0 * matched / max(drawn, 1):.1f}% |")
-    return "\n".join(lines)
+def _print_symbols(scores: Sequence[Score]) -> None:
+    """Print the precision and the recall of fixtures, summed over styles."""
+    print_table_head("fixture", "drawn", "imported", "precision", "recall")
+    for name in (*FIXTURES, "all"):
+        total = Count()
+        for kind in FIXTURES if name == "all" else (name,):
+            for count in (score.counts[kind] for score in scores):
+                total.add(count.drawn, count.imported, count.matched)
+        precision = f"{100.0 * total.matched / total.imported:.1f}%" if total.imported else "-"
+        recall = f"{100.0 * total.matched / max(total.drawn, 1):.1f}%"
+        print(table_row(name, total.drawn, total.imported, precision, recall))
 
 
-@dataclass
-class ScaleScore:
-    """Relative errors of estimated scales, as logarithms, with their estimates; and the number of plans refused."""
-
-    errors: list[float] = field(default_factory=list)
-    stds: list[float] = field(default_factory=list)
-    refused: int = 0
-
-
-def measure_scale(style: Style, plans: int, first_seed: int = 0) -> ScaleScore:
-    """Return the errors of the scales of plans without any text and without options."""
-    score = ScaleScore()
-    for seed in range(first_seed, first_seed + plans):
+def scale_errors(style: Style, seeds: range) -> list[tuple[float, float] | None]:
+    """Return the errors of scales, as logarithms, with their standard deviations, of plans without text and options."""
+    errors: list[tuple[float, float] | None] = []
+    for seed in seeds:
         drawn = draw_plan(style, seed, has_texts=False)
         try:
-            report = import_plan(drawn.jpeg() if style == "scanned" else drawn.png()).report
+            report = import_plan(_file(style, drawn)).report
         except InvalidFloorPlanError:
-            score.refused += 1
-            continue
-        score.errors.append(abs(math.log(report.metres_per_unit / drawn.metres_per_pixel)))
-        score.stds.append(report.scale_std)
-    return score
+            errors.append(None)
+        else:
+            errors.append((abs(math.log(report.metres_per_unit / drawn.metres_per_pixel)), report.scale_std))
+    return errors
 
 
-def scale_table(scores: dict[str, ScaleScore]) -> str:
-    """Return the errors of scales as a Markdown table, with a row of all styles."""
-    everything = ScaleScore()
-    for score in scores.values():
-        everything.errors += score.errors
-        everything.stds += score.stds
-        everything.refused += score.refused
-    lines = [
-        "| style | plans | refused | error, median | 90th percentile | within two standard deviations |",
-        "|---|---|---|---|---|---|",
-    ]
-    for style, score in {**scores, "all": everything}.items():
-        errors = 100.0 * np.array(score.errors or [np.nan])
-        within = np.mean(np.array(score.errors) <= 2.0 * np.array(score.stds)) if score.errors else np.nan
-        lines.append(
-            f"| {style} | {len(score.errors) + score.refused} | {score.refused} | {np.median(errors):.1f}% | "
-            f"{np.percentile(errors, 90.0):.1f}% | {100.0 * within:.0f}% |"
-        )
-    return "\n".join(lines)
-
-
-def table(scores: dict[str, Score], label: str = "style") -> str:
-    """Return the figures as a Markdown table."""
-    lines = [
-        f"| {label} | rooms | found, IoU ≥ 0.9 | doors, F1 | windows, F1 | CPU time per picture |",
-        "|---|---|---|---|---|---|",
-    ]
-    for style, score in scores.items():
-        share = f"{100.0 * score.room_share:.1f}%"
-        per_plan = score.seconds / max(score.plans, 1)
-        lines.append(
-            f"| {style} | {score.rooms} | {share} | {f1(score.door):.3f} | {f1(score.window):.3f} | {per_plan:.1f} s |"
-        )
-    return "\n".join(lines)
+def _print_scales(errors: Mapping[str, list[tuple[float, float] | None]]) -> None:
+    """Print the errors of scales, with a row of all styles."""
+    print_table_head("style", "plans", "refused", "error, median", "90th percentile", "within two standard deviations")
+    for style, found in {**errors, "all": [pair for pairs in errors.values() for pair in pairs]}.items():
+        pairs = np.array([pair for pair in found if pair] or [(np.nan, np.nan)])
+        median, most = 100.0 * np.percentile(pairs[:, 0], (50.0, 90.0))
+        within = 100.0 * np.mean(pairs[:, 0] <= 2.0 * pairs[:, 1])
+        print(table_row(style, len(found), found.count(None), f"{median:.1f}%", f"{most:.1f}%", f"{within:.0f}%"))
 
 
 def main() -> None:
-    """Measure every style and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Measure and print the tables."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--plans", type=int, default=40, help="generated plans per style")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first plan")
-    parser.add_argument(
-        "--conditions", action="store_true", help="also measure plans with noise, shadow, furniture, JPEG"
-    )
+    parser.add_argument("--conditions", action="store_true", help="also measure noise, shadow, furniture and JPEG")
     parser.add_argument("--scale", action="store_true", help="measure the errors of estimated scales instead")
     parser.add_argument("--symbols", action="store_true", help="measure the symbols of fixtures that are found instead")
-    arguments = parser.parse_args()
-    if arguments.plans < 1:
-        parser.error(f"--plans is {arguments.plans}, the minimum is 1")
-    if arguments.symbols:
-        measured = {style: measure_symbols(style, arguments.plans, arguments.seed) for style in STYLES}
-        print(table({style: score for style, (score, _) in measured.items()}))
-        print(symbol_table([counts for _, counts in measured.values()]))
+    options = parser.parse_args()
+    seeds = range(options.seed, options.seed + options.plans)
+    if options.scale:
+        _print_scales({style: scale_errors(style, seeds) for style in STYLES})
         return
-    if arguments.scale:
-        print(scale_table({style: measure_scale(style, arguments.plans, arguments.seed) for style in STYLES}))
-        return
-    print(table({style: measure(style, arguments.plans, arguments.seed) for style in STYLES}))
-    if arguments.conditions:
+    scores = _print_scores((style, measure(style, seeds, has_symbols=options.symbols)) for style in STYLES)
+    if options.symbols:
+        _print_symbols(scores)
+    if options.conditions:
         # Four styles each.
-        plans = max(1, arguments.plans // 4)
-        scores = {name: measure_condition(name, plans, arguments.seed) for name in get_args(Condition)}
-        print(table(scores, "condition"))
+        few = range(options.seed, options.seed + max(1, options.plans // 4))
+        _print_scores(((name, measure_condition(name, few)) for name in get_args(Condition)), "condition")
 
 
 if __name__ == "__main__":

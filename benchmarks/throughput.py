@@ -14,6 +14,9 @@ machines. `--ray-nodes` needs the extra `ray`. `--kill` adds a row in the middle
 from __future__ import annotations
 
 import os
+import signal
+import socket
+import subprocess
 import sys
 import tempfile
 import threading
@@ -22,12 +25,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import httpx
 import psutil
 
 from benchmarks import harness
+from examples.launch import ROOT
 from service.settings import Settings
 
 _CLIENTS = (1, 2, 4, 8, 16)
+_START_S, _STOP_S = 120.0, 40.0
 _CPUS_PER_NODE = 4
 _OBJECT_STORE_BYTES = 200 * 2**20
 
@@ -78,9 +84,34 @@ def _uvicorn(processes: int) -> Iterator[tuple[str, Callable[[], None]]]:
     if processes > 1:
         settings["LALALOC_WORKERS"] = str(max(cores.workers // processes, 1))
         settings["LALALOC_COMPUTE_THREADS"] = str(max(cores.compute_threads // processes, 1))
-    with harness.uvicorn_service(processes, settings) as (url, server):
-        # The last child is a worker; the first one tracks resources of all.
-        yield url, lambda: psutil.Process(server.pid).children()[-1].kill()
+    port = _free_port()
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
+    with tempfile.TemporaryDirectory() as data:
+        environment = {**os.environ, **settings, "LALALOC_LOG_LEVEL": "error", "LALALOC_DATA_DIR": data}
+        server = subprocess.Popen(
+            [*command, "--workers", str(processes)], cwd=ROOT, env=environment, start_new_session=True
+        )
+        url = f"http://127.0.0.1:{port}"
+        try:
+            # The processes share the port, so only several answers in a row show that all are ready.
+            harness.wait_until(lambda: all(_is_ready(url) for _ in range(10 * processes)), "it is ready", _START_S)
+            # The last child is a worker; the first one tracks resources of all.
+            yield url, lambda: psutil.Process(server.pid).children()[-1].kill()
+        finally:
+            os.killpg(server.pid, signal.SIGTERM)
+            server.wait(_STOP_S)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]
+
+
+def _is_ready(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/readyz").status_code == httpx.codes.OK
+    except httpx.TransportError:
+        return False
 
 
 @contextmanager
@@ -100,7 +131,7 @@ def _ray_service(nodes: int) -> Iterator[tuple[str, Callable[[], None]]]:
     try:
         others = [cluster.add_node(**node) for _ in range(nodes - 1)]
         ray.init(address=cluster.address, log_to_driver=False)
-        port = harness.free_port()
+        port = _free_port()
         serve.start(http_options={"host": "127.0.0.1", "port": port})
         with tempfile.TemporaryDirectory() as data:
             settings = Settings(data_dir=Path(data), log_level="error", max_queries=64, lpo_queue=64)

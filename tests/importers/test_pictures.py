@@ -12,7 +12,7 @@ import shapely
 from PIL import Image, ImageDraw
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
-from benchmarks.plan_pictures import Score, _iou, f1, score_plan, table
+from benchmarks.plan_pictures import Score, intersection_over_union
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -40,11 +40,11 @@ def drawn() -> dict[Style, DrawnPlan]:
 def test_rooms_and_openings_are_found_in_every_style(drawn: dict[Style, DrawnPlan], style: Style):
     plan = drawn[style]
     score = Score()
-    score_plan(plan, plan.jpeg() if style == "scanned" else plan.png(), score)
-    assert score.rooms_found == score.rooms == len(plan.rooms)
-    assert f1(score.door) >= 0.8
-    assert f1(score.window) >= 0.8
-    assert f"| {style} | {score.rooms} | 100.0% |" in table({style: score})
+    score.add(plan, plan.jpeg() if style == "scanned" else plan.png())
+    assert score.counts["room"].matched == score.counts["room"].drawn == len(plan.rooms)
+    assert score.counts["door"].f1 >= 0.8
+    assert score.counts["window"].f1 >= 0.8
+    assert f"| {style} | {len(plan.rooms)} | 100.0% |" in score.row(style)
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def test_drawings_of_plan_svg_are_read_back(coloured: bool):
         return points + origin
 
     found = [shapely.transform(room, placed) for room in shapes(plan)]
-    shares = [max(_iou(room.shape, candidate) for candidate in found) for room in flat.rooms]
+    shares = [max(intersection_over_union(room.shape, candidate) for candidate in found) for room in flat.rooms]
     assert min(shares) > 0.95
     for kind in ("door", "window", "passage"):
         found_lines = [shapely.transform(line, placed) for line in lines(plan, kind)]
@@ -322,7 +322,9 @@ def test_clear_symbols_become_fixtures_and_other_shapes_are_counted():
     fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in draft.document["fixtures"]]
     assert {kind for kind, _ in fixtures} == {"stairs", "sink", "bath", "stove", "basin", "shower"}
     for kind, outline in fixtures:
-        assert any(symbol.kind == kind and _iou(symbol.outline, outline) > 0.6 for symbol in plan.symbols)
+        assert any(
+            symbol.kind == kind and intersection_over_union(symbol.outline, outline) > 0.6 for symbol in plan.symbols
+        )
     assert any("fixtures are taken from their symbols" in line for line in draft.report.unsure)
     assert any("no clear symbols of fixtures" in line for line in draft.report.notes)
 
