@@ -64,7 +64,7 @@ _IDLE_CONNECTIONS = 1_044
 _MAX_FILE_S, _MAX_S_PER_100_KB, _WALL_TIMEOUT_S = 4.0, 4.0, 300.0
 _JSON = {"Content-Type": "application/json"}
 _FORM = {"Content-Type": "multipart/form-data; boundary=b"}
-_PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
+_PART = b'--b\r\nContent-Disposition: form-data; name="photo"; filename="p"\r\n\r\n'
 
 Point = list[float]
 
@@ -165,8 +165,9 @@ def _watched(service: harness.Service) -> Iterator[_Seen]:
 
 
 def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
-    def panorama(name: str, content: bytes, *, accepted: bool = False) -> Attack:
-        data, files = {"floorplan_id": plan_id}, {"panorama": ("p", content)}
+    def picture(name: str, content: bytes, *, accepted: bool = False) -> Attack:
+        data = {"floorplan_id": plan_id, "projection": "equirectangular"}
+        files = {"photo": ("p", content)}
         send = lambda: [_post(f"{url}/localise", data=data, files=files)]  # noqa: E731
         return Attack(name, len(content), send, "accepted" if accepted else "refused")
 
@@ -177,22 +178,22 @@ def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
 
         return Attack(name, len(content), send, "refused" if refused else "any")
 
-    yield panorama("PNG of 60,000 x 30,000 pixels of one colour", _png(60_000, 30_000, full=True))
-    yield panorama("PNG with a header of 2^31 x 2^30 pixels", _png(1 << 31, 1 << 30, full=False))
-    yield panorama("JPEG with a header of 65,500 x 32,750 pixels", _jpeg_with_size(65_500, 32_750))
-    yield panorama(
+    yield picture("PNG of 60,000 x 30,000 pixels of one colour", _png(60_000, 30_000, full=True))
+    yield picture("PNG with a header of 2^31 x 2^30 pixels", _png(1 << 31, 1 << 30, full=False))
+    yield picture("JPEG with a header of 65,500 x 32,750 pixels", _jpeg_with_size(65_500, 32_750))
+    yield picture(
         "WebP of 16,383 x 8,191 pixels of one colour",
         harness.plain_picture(16_383, 8_191, "WEBP", lossless=True, method=0),
     )
-    yield panorama(
+    yield picture(
         "PNG of 14,140 x 7,070 pixels, the largest allowed", harness.plain_picture(14_140, 7_070, "PNG"), accepted=True
     )
-    yield panorama("WebP of 9,000 frames", _animation(9_000), accepted=True)
-    yield panorama("PNG with 100 MB of compressed text", _png_with_text(100_000_000))
+    yield picture("WebP of 9,000 frames", _animation(9_000), accepted=True)
+    yield picture("PNG with 100 MB of compressed text", _png_with_text(100_000_000))
     jpeg = harness.plain_picture(256, 128, "JPEG")
-    yield panorama("JPEG of 5 million empty comments", jpeg[:2] + _segment(0xFE, b"") * 5_000_000 + jpeg[2:])
+    yield picture("JPEG of 5 million empty comments", jpeg[:2] + _segment(0xFE, b"") * 5_000_000 + jpeg[2:])
     exif = _segment(0xE1, b"Exif\0\0" + bytes(60_000))
-    yield panorama("JPEG of 640 segments of Exif", jpeg[:2] + exif * 640 + jpeg[2:])
+    yield picture("JPEG of 640 segments of Exif", jpeg[:2] + exif * 640 + jpeg[2:])
     yield Attack("body of 1 GB with its length", _GIGABYTE, lambda: _send_gigabyte(url, has_length=True), "refused")
     yield Attack("body of 1 GB in chunks", _GIGABYTE, lambda: _send_gigabyte(url, has_length=False), "refused")
     yield Attack("body of one byte a second", 100_000, lambda: _send_slowly(url), "refused", is_slow=True)

@@ -1,4 +1,4 @@
 """Demo: an example flat and photographs in it, localised over HTTP.
 
-Begin with `demo.py`. `serve.py` starts the service with the example flat.
+Begin with `demo.py`. `launch.py` starts the service.
 """

@@ -14,16 +14,17 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from examples.launch import ROOT, ServiceFailedError, running_service
-from examples.picture import Panel, draw_demo
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, ClientError, Localisation
+from lalaloc_core.draw.canvas import MUTED, document, image, pixels, words
 
 _PLAN_TIMEOUT_S = 120.0
 # Long timeouts prevent a fallback to a coarser stage on a busy machine. Messages of the log would interrupt the table,
@@ -35,6 +36,22 @@ _DEFAULTS = {
     "LALALOC_REQUEST_DEADLINE_S": "60",
     "LALALOC_LOG_LEVEL": "error",
 }
+
+# Size of a panel: width of its picture, height of its heading, and gap between panels.
+_WIDTH, _HEAD, _GAP = 1000, 96, 30
+_COLUMNS = 2
+_JPEG_QUALITY = 88
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Results for one photograph with and without its heading; `picture` is the PNG of `known`."""
+
+    truth: TruePose
+    known: Localisation
+    unknown: Localisation
+    picture: bytes
+    size: tuple[int, int]
 
 
 class StageMissingError(Exception):
@@ -135,6 +152,45 @@ def _line(truth: TruePose, label: str, localisation: Localisation) -> str:
         f"{truth.file:<16} {label:<8} {f'{truth.x_m:.2f}, {truth.y_m:.2f}':>12} {f'{x_m:.2f}, {y_m:.2f}':>12} "
         f"{error_m:>8.3f} {localisation.heading_deg:>12.1f} {confidence:>10} {localisation.room:<12} "
         f"{localisation.timings_ms['total']:>6.0f}"
+    )
+
+
+def draw_demo(panels: Sequence[Panel], path: Path) -> None:
+    """Draw all panels in two columns."""
+    height = max(_WIDTH * panel.size[1] / panel.size[0] for panel in panels)
+    row_height, rows = _HEAD + height + _GAP, -(-len(panels) // _COLUMNS)
+    parts = []
+    for index, panel in enumerate(panels):
+        row, column = divmod(index, _COLUMNS)
+        parts.append(_panel(panel, _GAP + column * (_WIDTH + _GAP), row * row_height))
+    whole = document(_COLUMNS * (_WIDTH + _GAP) + _GAP, rows * row_height, "LaLaLoc", parts)
+    drawn: Image.Image = pixels(whole)
+    # PNG ignores the quality.
+    drawn.save(path, quality=_JPEG_QUALITY)
+
+
+def _panel(panel: Panel, x: float, y: float) -> str:
+    box = (x, y + _HEAD, _WIDTH, _WIDTH * panel.size[1] / panel.size[0])
+    sentences = (
+        _sentence("heading given", panel.truth, panel.known),
+        _sentence("heading not given", panel.truth, panel.unknown),
+    )
+    return "".join(
+        [
+            words(x + 24, y + 40, panel.truth.file, 26, more='font-weight="bold"'),
+            *(words(x + 24, y + 68 + 24 * line, text, 17, fill=MUTED) for line, text in enumerate(sentences)),
+            image(panel.picture, "png", box, 'image-rendering="smooth"'),
+        ]
+    )
+
+
+def _sentence(label: str, truth: TruePose, localisation: Localisation) -> str:
+    x_m, y_m = localisation.position.x_m, localisation.position.y_m
+    error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
+    turn_deg = (localisation.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
+    confidence = "" if localisation.confidence is None else f", confidence {localisation.confidence:.2f}"
+    return (
+        f"{label}: {localisation.room} ({x_m:.2f}, {y_m:.2f}) m, error {error_m:.2f} m and {turn_deg:+.1f}°{confidence}"
     )
 
 
