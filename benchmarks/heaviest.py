@@ -6,7 +6,6 @@ an entry scales with a size, so that the benchmark sends the largest one and the
 
 from __future__ import annotations
 
-import base64
 import itertools
 import json
 import math
@@ -255,18 +254,6 @@ def _batch(caller: Caller, stored: Stored, _size: int) -> None:
     caller.send("POST", "/localise/batch", *form((("floorplan_id", stored.plan_id),), files))
 
 
-def _geopose(caller: Caller, stored: Stored, _size: int) -> None:
-    privacy = {f"data{name}": [] for name in ("Retention", "AcceptableUse", "SanitizationApplied")}
-    privacy["dataSanitizationRequested"] = []
-    reading = {"timestamp": 0, "sensorId": "camera", "privacy": privacy, "sequenceNumber": 0, "imageFormat": "JPG"}
-    orientation = {"mirrored": False, "rotation": 0}
-    picture = base64.b64encode(_panorama()).decode()
-    reading |= {"size": [512, 256], "imageBytes": picture, "imageOrientation": orientation}
-    document = {"id": "request", "timestamp": 0, "type": "geopose", "sensors": [{"type": "camera", "id": "camera"}]}
-    body = _body(document | {"sensorReadings": {"cameraReadings": [reading]}})
-    caller.send("POST", f"/geopose?floorplan_id={stored.plan_id}", body)
-
-
 def _post_venue(caller: Caller, stored: Stored, _size: int) -> None:
     answer = caller.send("POST", "/venues", _venue(stored.member_ids))
     if answer.status == 201:
@@ -499,7 +486,6 @@ LOADS = (
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "bodies that do not arrive", _partial_body, 100_000, connections=60, refusals=_TOO_LATE),
     Load((f"GET {_PLAN}/original",), "answers that are not read", _unread_answer, 2_048, connections=64),
-    Load(("POST /geopose",), VERTICES_PLAN, _geopose),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
     Load(
         ("GET /answers/{answer_id}", "DELETE /answers/{answer_id}"),

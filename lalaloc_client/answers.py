@@ -299,64 +299,6 @@ class BatchAnswer:
 
 
 @dataclass(frozen=True)
-class GeoPoseQuaternion:
-    """A rotation from the camera (x right, y where the panorama's centre looks, z up) to east, north, up."""
-
-    x: float
-    y: float
-    z: float
-    w: float
-
-
-@dataclass(frozen=True)
-class QuaternionGeoPose:
-    """A pose on Earth: OGC GeoPose 1.0, Basic-Quaternion."""
-
-    position: GeoPosePosition
-    quaternion: GeoPoseQuaternion
-
-
-@dataclass(frozen=True)
-class GeoPoseAccuracy:
-    """Expected error of a pose: metres, and degrees about the vertical."""
-
-    position: float
-    orientation: float
-
-
-@dataclass(frozen=True)
-class PlaceInPlan:
-    """Pose of a device in its floor plan; attributes as in `Localisation`."""
-
-    floorplan_id: str
-    level: float | None
-    position: Position
-    heading_deg: float
-    room: str
-    room_id: str
-    confidence: float | None
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class GeoPoseAnswer:
-    """An answer of the OSCP GeoPose protocol.
-
-    Attributes:
-        id: id of the request.
-        timestamp: timestamp of the request.
-        lalaloc: fields outside the protocol.
-    """
-
-    id: str
-    timestamp: float
-    type: str
-    accuracy: GeoPoseAccuracy
-    geopose: QuaternionGeoPose
-    lalaloc: PlaceInPlan
-
-
-@dataclass(frozen=True)
 class SequencePose:
     """Pose of one photograph of a sequence, from all of them jointly; attributes as in `Localisation`.
 

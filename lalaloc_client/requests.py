@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import io
 import json
 import math
 import os
 import re
-import time
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,8 +34,6 @@ _FILE, _PHOTO = "application/octet-stream", "photo"
 _JPEG_QUALITY = 95
 # First bytes of a file of features.
 _FEATURES = b"LLFT"
-# Names of the GeoPose protocol for picture files, by the bytes that the files begin with.
-_IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
 
 
@@ -205,48 +200,6 @@ def film_request(
     return Request("POST", path, headers={"Content-Type": media, "Accept": JSON}, content=body)
 
 
-def geopose_request(
-    photograph: Photograph,
-    params: Mapping[str, Any],
-    latitude: float | None,
-    longitude: float | None,
-    accuracy_m: float | None,
-) -> Request:
-    """Return a request of the OSCP GeoPose protocol.
-
-    Raises:
-        ValueError: only one of latitude and longitude is given, an accuracy is given without them, a number is not
-            finite, or the photograph is not a picture file.
-    """
-    if (latitude is None) != (longitude is None):
-        raise ValueError(f"latitude is {latitude} and longitude is {longitude}; give both or neither")
-    if latitude is None and accuracy_m is not None:
-        raise ValueError(f"accuracy_m is {accuracy_m} without a place; give latitude and longitude as well")
-    _check_finite("latitude", latitude)
-    _check_finite("longitude", longitude)
-    _check_finite("accuracy_m", accuracy_m)
-    now_ms = time.time_ns() // 1_000_000
-    kinds = ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
-    common = {"timestamp": now_ms, "privacy": {f"data{kind}": [] for kind in kinds}}
-    content = picture_file(photograph)
-    camera = {
-        "sensorId": "camera",
-        "sequenceNumber": 0,
-        "imageFormat": _image_format(content),
-        # The file itself states its size.
-        "size": [],
-        "imageBytes": base64.b64encode(content).decode("ascii"),
-    }
-    sensors, readings = [{"id": "camera", "type": "camera"}], {"cameraReadings": [common | camera]}
-    if latitude is not None:
-        place = {"sensorId": "place", "latitude": latitude, "longitude": longitude, "accuracy": accuracy_m or 0.0}
-        sensors.append({"id": "place", "type": "geolocation"})
-        readings["geolocationReadings"] = [common | place]
-    document = {"id": uuid.uuid4().hex, "timestamp": now_ms, "type": "geopose", "sensors": sensors}
-    body = json.dumps(document | {"sensorReadings": readings}).encode()
-    return Request("POST", "/geopose", params, {"Content-Type": JSON}, body)
-
-
 def preview_params(
     x_m: float | None, y_m: float | None, heading_deg: float | None, covariance_m2: Covariance | None
 ) -> dict[str, Any]:
@@ -310,13 +263,6 @@ def picture_file(photograph: Photograph) -> bytes:
     buffer = io.BytesIO()
     photograph.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return buffer.getvalue()
-
-
-def _image_format(content: bytes) -> str:
-    for prefix, name in _IMAGE_FORMATS.items():
-        if content.startswith(prefix):
-            return name
-    raise ValueError(f"the photograph begins with {content[:4]!r}; it must be a JPEG, PNG or WebP file")
 
 
 def _check_finite(name: str, value: object) -> None:

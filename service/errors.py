@@ -169,15 +169,6 @@ class UnmeasuredModelError(ServiceError):
     """The model has no measured errors, which predictions need."""
 
 
-class NoPlanNearbyError(ServiceError):
-    """No floor plan with an anchor lies near a place on Earth."""
-
-    def __init__(self, place: str, within_m: float) -> None:
-        super().__init__(
-            f"no floor plan with an anchor lies within {within_m:g} m of {place}; set floorplan_id or venue_id"
-        )
-
-
 class UploadTooLargeError(ServiceError):
     """The body exceeds its size limit."""
 

@@ -63,7 +63,6 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     errors.TooManyPhotographsError: ProblemKind(507, "too-many-photographs", "Album is full"),
     errors.UnanchoredPlanError: ProblemKind(409, "floorplan-unanchored", "Floor plan has no anchor"),
     errors.UnmeasuredModelError: ProblemKind(501, "model-unmeasured", "Model without measured errors"),
-    errors.NoPlanNearbyError: ProblemKind(404, "no-floorplan-nearby", "No floor plan nearby"),
     errors.UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
     errors.BytesInFlightError: ProblemKind(503, "overloaded", "Overloaded"),
     errors.SpoolFullError: ProblemKind(507, "store-full", "Storage full"),

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import aclosing
 from typing import Unpack
 
-from lalaloc_client.answers import BatchAnswer, GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
+from lalaloc_client.answers import BatchAnswer, Localisation, Readiness, SequenceLocalisation
 from lalaloc_client.asynchronous.backend import run_blocking
 from lalaloc_client.asynchronous.plans import AsyncPlans
 from lalaloc_client.asynchronous.tracker import AsyncTracker
@@ -22,10 +22,8 @@ from lalaloc_client.requests import (
     PictureFormat,
     Request,
     film_request,
-    geopose_request,
     query_request,
     resource_path,
-    text_values,
 )
 from lalaloc_client.tracking import SessionOptions
 
@@ -225,30 +223,6 @@ class AsyncClient(AsyncPlans):
         values = {"floorplan_id": floorplan_id}
         media, params = PICTURE_MEDIA[picture_format], {"picture": picture}
         return await self.query(query_request, "/localise", [panorama], values, options, params=params, accept=media)
-
-    async def geopose(
-        self,
-        panorama: Photograph,
-        *,
-        floorplan_id: str | None = None,
-        venue_id: str | None = None,
-        latitude: float | None = None,
-        longitude: float | None = None,
-        accuracy_m: float | None = None,
-    ) -> GeoPoseAnswer:
-        """Localise a photograph on Earth by the OSCP GeoPose protocol.
-
-        Args:
-            panorama: as for `localise`.
-            floorplan_id: plan to search.
-            venue_id: venue to search. Default: the plans near the place, which is then required.
-            latitude: approximate latitude in degrees.
-            longitude: approximate longitude in degrees.
-            accuracy_m: maximum error of that place. Default: unknown.
-        """
-        params = text_values({"floorplan_id": floorplan_id, "venue_id": venue_id})
-        content = await self.query(geopose_request, panorama, params, latitude, longitude, accuracy_m)
-        return parse(GeoPoseAnswer, content)
 
     async def get_answer(self, answer_id: str) -> Localisation:
         """Return a stored answer by its `answer_id`."""

@@ -35,7 +35,7 @@ EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 BATCH = "/localise/batch"
-_QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose", BATCH})
+_QUERIES = frozenset({"/localise", "/localise/sequence", BATCH})
 _STREAMS, _PHOTOGRAPHS, _ALBUMS = "/events", "/photographs", "/albums/"
 _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.

@@ -14,7 +14,6 @@ from service.schemas import EarthPoint, SessionDocument
 from service.schemas.admin import KeyDocument, RotationDocument, TenantLimitsDocument
 from service.schemas.albums import AlbumDocument, AlbumEvent, PhotographChangeDocument
 from service.schemas.native_plan import FloorPlanDocument
-from service.schemas.oscp import OscpRequest
 from service.schemas.photographs import StatedIntrinsics
 from service.schemas.plan_import import ImportLine
 from service.schemas.problem_details import Problem
@@ -40,7 +39,6 @@ _BY_HAND = (
     FloorPlanDocument,
     ImportLine,
     KeyDocument,
-    OscpRequest,
     PlanEvent,
     PlanPoint,
     Problem,

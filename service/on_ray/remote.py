@@ -27,7 +27,6 @@ from service.query import (
     AlbumOutcome,
     AlbumPhotographQuery,
     AlbumQuery,
-    Nearby,
     PhotographQuery,
     PictureRequest,
     QueryContext,
@@ -186,9 +185,7 @@ class RemoteLocaliser:
 
     async def _call(self, method: str, where: Where, context: QueryContext, *arguments: Any) -> Any:
         """Call a method of the `Localiser` of a search replica."""
-        about = (
-            where if isinstance(where, Nearby) else StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
-        )
+        about = StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
         with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):
                 response = self._search.options(session_id=where.id).call.remote(method, about, *arguments)

@@ -26,7 +26,7 @@ from service.errors import IndexTooLargeError, OverloadedError, UnknownFloorPlan
 from service.on_ray.index_shards import RemoteIndices, Stage
 from service.on_ray.outcome import Success, returning_failures
 from service.on_ray.remote import RemoteLocaliser, RemoteOptimiser, RemotePhotographEncoder, StoredPlace
-from service.query import Nearby, Where
+from service.query import Where
 from service.query_components import Backends, warm_encoder
 from service.runtime import start_runtime
 from service.settings import Settings
@@ -158,7 +158,7 @@ class SearchReplica(_ServiceReplica):
     """Search of plans and venues."""
 
     @returning_failures
-    async def call(self, method: str, about: StoredPlace | Nearby, *arguments: Any) -> Any:
+    async def call(self, method: str, about: StoredPlace, *arguments: Any) -> Any:
         """Return the result of a method of `Localiser`."""
         return await getattr(self._runtime.localiser, method)(await self._where(about), *arguments)
 
@@ -166,9 +166,7 @@ class SearchReplica(_ServiceReplica):
         """Return the revisions of plans whose pose grids are in memory."""
         return frozenset(self._runtime.grids.revisions())
 
-    async def _where(self, about: StoredPlace | Nearby) -> Where:
-        if isinstance(about, Nearby):
-            return about
+    async def _where(self, about: StoredPlace) -> Where:
         runtime, tenant = self._runtime, about.tenant
         if about.is_venue:
             venue = await runtime.reads.run(tenant, runtime.store.venues.get, tenant, about.id)

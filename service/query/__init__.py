@@ -5,7 +5,7 @@ does the same for several photographs and `session_query.py` for the next photog
 albums; `localiser.py` calls them. `photograph_reader.py` decodes and encodes photographs, those of one place as a spot
 (`spots.py`). `grounds.py` waits for the plan or venue of a query and returns its `ground.py`. `executor.py` runs the
 steps, `lpo_pool.py` the refinement in worker processes, and `answers.py` composes the answer. `stated_pose.py` reads
-the fields about the camera, `geopose.py` and `oscp.py` translate answers. `queries.py` has the queries, `backends.py`
+the fields about the camera, `geopose.py` translates answers. `queries.py` has the queries, `backends.py`
 the interfaces of what can run elsewhere.
 """
 
@@ -24,7 +24,6 @@ from service.query.queries import (
     AlbumProgress,
     AlbumQuery,
     Content,
-    Nearby,
     PhotographQuery,
     PictureRequest,
     SequenceQuery,

@@ -9,7 +9,6 @@ import numpy as np
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.schemas import GeoPose, GeoPoseAngles, GeoPosePosition, LocaliseAnswer, SequenceAnswer
-from service.schemas.oscp import OscpGeoPose, OscpQuaternion
 from service.schemas.sessions import TrackedPoseAnswer
 
 # Nine decimals of a degree are a tenth of a millimetre.
@@ -22,7 +21,7 @@ def geopose_at(
     """Return a pose of the plan's frame on Earth; None without an anchor.
 
     The camera's axes are x to its right, y towards its centre column and z up, so the angles of a camera that looks
-    north are zero. The standard leaves the axes open; AR clients of the OSCP GeoPose protocol use these.
+    north are zero. The standard leaves the axes open.
     """
     if anchor is None:
         return None
@@ -40,16 +39,9 @@ def geopose_at(
     )
 
 
-def basic_quaternion(geopose: GeoPose) -> OscpGeoPose:
-    """Return a pose as Basic-Quaternion of OGC GeoPose 1.0: the rotation of Basic-YPR about up as a quaternion."""
-    half = 0.5 * math.radians(geopose.angles.yaw)
-    quaternion = OscpQuaternion(x=0.0, y=0.0, z=round(math.sin(half), 9) + 0.0, w=round(math.cos(half), 9) + 0.0)
-    return OscpGeoPose(position=geopose.position, quaternion=quaternion)
-
-
 def geopose_document(answer: LocaliseAnswer | TrackedPoseAnswer) -> dict[str, Any] | None:
     """Return the pose of an answer as a document of OGC GeoPose 1.0, Basic-Quaternion; None without a geopose."""
-    return None if answer.geopose is None else basic_quaternion(answer.geopose).model_dump(mode="json")
+    return None if answer.geopose is None else _basic_quaternion(answer.geopose)
 
 
 def geopose_documents(answer: SequenceAnswer) -> list[dict[str, Any]] | None:
@@ -57,7 +49,7 @@ def geopose_documents(answer: SequenceAnswer) -> list[dict[str, Any]] | None:
     geoposes = [pose.geopose for pose in answer.poses if pose.geopose is not None]
     if len(geoposes) < len(answer.poses):
         return None
-    return [basic_quaternion(geopose).model_dump(mode="json") for geopose in geoposes]
+    return [_basic_quaternion(geopose) for geopose in geoposes]
 
 
 def geojson_feature(answer: LocaliseAnswer) -> dict[str, Any] | None:
@@ -75,6 +67,13 @@ def geojson_features(answer: SequenceAnswer) -> dict[str, Any] | None:
     common = answer.model_dump(mode="json", exclude={"poses"})
     features = [_feature(pose.geopose, pose.model_dump(mode="json")) for pose in answer.poses if pose.geopose]
     return {"type": "FeatureCollection", "features": features, **common} if features else None
+
+
+def _basic_quaternion(geopose: GeoPose) -> dict[str, Any]:
+    """Return a pose as Basic-Quaternion of OGC GeoPose 1.0: the rotation of Basic-YPR about up as a quaternion."""
+    half = 0.5 * math.radians(geopose.angles.yaw)
+    quaternion = {"x": 0.0, "y": 0.0, "z": round(math.sin(half), 9) + 0.0, "w": round(math.cos(half), 9) + 0.0}
+    return {"position": geopose.position.model_dump(mode="json"), "quaternion": quaternion}
 
 
 def _feature(geopose: GeoPose, properties: dict[str, Any]) -> dict[str, Any]:

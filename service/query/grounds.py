@@ -10,7 +10,6 @@ from time import monotonic
 import numpy as np
 
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Query
@@ -18,11 +17,10 @@ from lalaloc_core.localise.venue.merged_plans import GAP_M
 from service.capacity.admission_control import Slots
 from service.capacity.query_context import QueryContext
 from service.capacity.threads import BoundedReads
-from service.errors import NoPlanNearbyError, PlanFailedError, PlanNotReadyError, VenueUnsearchableError
+from service.errors import PlanFailedError, PlanNotReadyError, VenueUnsearchableError
 from service.grids import GridProvider, check_height_m, grid_height_m
 from service.query.executor import Executor
 from service.query.ground import Ground
-from service.query.queries import Nearby, Where
 from service.query.stated_pose import stated_height, stated_hints
 from service.schemas import SessionDocument
 from service.schemas.query_fields import HeightFields, HintFields
@@ -60,7 +58,7 @@ class Grounds:
 
     async def site(
         self,
-        where: Where,
+        where: PlanRecord | VenueRecord,
         form: HeightFields,
         hinted: HintFields | SessionDocument | None = None,
         *,
@@ -71,7 +69,7 @@ class Grounds:
         """Return the site of a query.
 
         Args:
-            where: the plan, venue or place.
+            where: the plan or venue.
             form: the stated camera height.
             hinted: the stated hints; None for none.
             heights_m: further stated camera heights (m).
@@ -80,12 +78,8 @@ class Grounds:
         """
         if isinstance(where, PlanRecord):
             return PlanSite(self, where, form, hinted, heights_m)
-        anchor = where.anchor if isinstance(where, VenueRecord) else None
-        if isinstance(where, Nearby):
-            # Before the photograph is decoded, because there may be no plan to search.
-            await self.members(where)
-        hints = VenueHints(anchor=anchor) if hinted is None else VenueHints.from_form(hinted, anchor)
-        return VenueSite(self, where, form, hints, anchor, gap_m, max_poses)
+        hints = VenueHints(anchor=where.anchor) if hinted is None else VenueHints.from_form(hinted, where.anchor)
+        return VenueSite(self, where, form, hints, gap_m, max_poses)
 
     async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
         """Check what a request states about a plan or a venue.
@@ -104,14 +98,9 @@ class Grounds:
         if isinstance(form, HintFields | SessionDocument):
             VenueHints.from_form(form, where.anchor).check(members)
 
-    async def members(self, where: VenueRecord | Nearby) -> PlanList:
-        """Return the current row of every plan of a venue or near a place."""
-        if isinstance(where, VenueRecord):
-            return await self._plans.members(where.tenant, where.id)
-        rows = await self._plans.near(where.tenant, where.place, where.within_m)
-        if not rows:
-            raise NoPlanNearbyError(str(where.place), where.within_m)
-        return rows
+    async def members(self, venue: VenueRecord) -> PlanList:
+        """Return the current row of every plan of a venue."""
+        return await self._plans.members(venue.tenant, venue.id)
 
     async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline.
@@ -181,7 +170,7 @@ class PlanSite:
 
 
 class VenueSite:
-    """Plans of a venue, or near a place, that a query is about.
+    """Plans of a venue that a query is about.
 
     Attributes:
         id: id of the venue.
@@ -192,10 +181,9 @@ class VenueSite:
     def __init__(
         self,
         grounds: Grounds,
-        where: VenueRecord | Nearby,
+        where: VenueRecord,
         form: HeightFields,
         hints: VenueHints,
-        anchor: Anchor | None,
         gap_m: float,
         max_poses: int | None,
     ) -> None:
@@ -207,7 +195,7 @@ class VenueSite:
         self._gap_m = gap_m
         self._max_poses = max_poses
         self._warnings: list[str] = []
-        self.north = None if anchor is None else heading_from_degrees(anchor.north_deg)
+        self.north = None if where.anchor is None else heading_from_degrees(where.anchor.north_deg)
         self.ready = PlanList()
 
     @property

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from lalaloc_core.draw.answer import Picture
 from lalaloc_core.photograph import Photograph
 from service.capacity.query_context import QueryContext
-from service.schemas import EarthPoint, LocaliseForm, PhotographForm, SequenceForm, SessionDocument, StoredPose
+from service.schemas import LocaliseForm, PhotographForm, SequenceForm, SessionDocument, StoredPose
 from service.schemas.albums import AlbumDocument
 from service.storage.album_jobs import AlbumPart
 from service.storage.records import PlanRecord, VenueRecord
@@ -20,22 +20,8 @@ SOLVE_S = 900.0
 Content = bytes | UploadedFile | Photograph
 
 
-@dataclass(frozen=True)
-class Nearby:
-    """Anchored plans of a tenant within `within_m` of a place on Earth, which are searched like a venue."""
-
-    tenant: str
-    place: EarthPoint
-    within_m: float
-
-    @property
-    def id(self) -> str:
-        """Name of these plans in answers, instead of a venue's id."""
-        return f"near {self.place}"
-
-
 # Plans that a query searches.
-Where = PlanRecord | VenueRecord | Nearby
+Where = PlanRecord | VenueRecord
 
 
 @dataclass(frozen=True, eq=False)

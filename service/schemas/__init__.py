@@ -13,7 +13,6 @@ localise_answer  its answer
 localisability   photographs of a plan that will be found
 sequence         queries with several photographs
 sessions         sessions of tracked cameras
-oscp             queries of AR clients
 venues           groups of floor plans
 service_state    limits, health, readiness
 admin            API keys, limits of tenants, audit log

@@ -68,7 +68,6 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("POST", "/localise"): Permission.LOCALISE,
     ("POST", "/localise/batch"): Permission.LOCALISE,
     ("POST", "/localise/sequence"): Permission.LOCALISE,
-    ("POST", "/geopose"): Permission.LOCALISE,
     ("POST", "/sessions"): Permission.LOCALISE,
     ("GET", "/sessions/{session_id}"): Permission.LOCALISE,
     ("DELETE", "/sessions/{session_id}"): Permission.LOCALISE,

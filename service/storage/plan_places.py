@@ -8,14 +8,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from sqlalchemy import ColumnElement, and_, or_
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
-from service.storage.tables import FLOORPLANS
-
-# Minimum length (m) of a degree of latitude.
-_DEGREE_M = 110_500.0
 
 
 def place_columns(plan: FloorPlan) -> dict[str, float | None]:
@@ -33,19 +28,6 @@ def place_columns(plan: FloorPlan) -> dict[str, float | None]:
         ((longitude, latitude),) = plan.anchor.to_earth(np.array([[x_m, y_m]]))
         columns |= {"latitude": float(latitude), "longitude": float(longitude)}
     return columns
-
-
-def lies_in_box(latitude: float, longitude: float, within_m: float) -> ColumnElement[bool]:
-    """Return the condition that a plan's centre lies in a box around a place, which covers the circle of `within_m`."""
-    high = within_m / _DEGREE_M
-    near = FLOORPLANS.c.latitude.between(latitude - high, latitude + high)
-    if abs(latitude) + high >= 89.0:
-        # Meridians converge at the poles.
-        return near
-    wide = high / math.cos(math.radians(abs(latitude) + high))
-    own = FLOORPLANS.c.longitude
-    # The box can cross the date line.
-    return and_(near, or_(*(own.between(longitude + turn - wide, longitude + turn + wide) for turn in (-360, 0, 360))))
 
 
 def distances_m(

@@ -12,13 +12,12 @@ from datetime import UTC, datetime
 from typing import Any
 
 from cachetools import LRUCache
-from sqlalchemy import Connection, FromClause, Row, and_, case, delete, distinct, func, literal, or_, select, update
+from sqlalchemy import Connection, Row, and_, case, delete, distinct, func, or_, select, update
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.errors import InvalidRequestError, UnknownVenueError
 from service.storage.album_rows import delete_albums
 from service.storage.database import Database
-from service.storage.plan_places import lies_in_box
 from service.storage.records import Cursor, VenueCounts, VenueMember, VenuePlace, VenueRecord, VenueState
 from service.storage.statements import is_own_grid, newest_first
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
@@ -265,16 +264,6 @@ class Venues:
         with self._database.reading() as connection:
             return [row for part in parts for row in connection.execute(part)]
 
-    def searchable_plans_near(
-        self, tenant: str, latitude: float, longitude: float, within_m: float, model_sha256: str, step_m: float
-    ) -> Sequence[Row[Any]]:
-        """Return rows as `searchable_plans` does, of a tenant's plans near a place and some more, on level 0."""
-        columns = (literal(0.0).label("level"), FLOORPLANS.c.name, *_SEARCH_COLUMNS)
-        near = lies_in_box(latitude, longitude, within_m)
-        query = _with_grids(select(*columns), FLOORPLANS, model_sha256, step_m)
-        with self._database.reading() as connection:
-            return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
-
     def delete(self, tenant: str, venue_id: str, *, expected: str | None = None) -> bool:
         """Delete a venue with its sessions and albums, but none of its plans; False without one."""
 
@@ -315,15 +304,11 @@ def _remove(connection: Connection, venue_id: str, plan_ids: Collection[str], *,
 
 
 def _in_venue(query: Any, venue_id: str, model_sha256: str, step_m: float) -> Any:
-    """Return a query about the plans of a venue, joined as in `_with_grids`."""
+    """Return a query about the plans of a venue, joined with their current revision and, if stored, their own grid."""
     plans = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
-    return _with_grids(query, plans, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
-
-
-def _with_grids(query: Any, plans: FromClause, model_sha256: str, step_m: float) -> Any:
-    """Return a query about plans, joined with their current revision and, if stored, their own grid."""
     joined = plans.join(REVISIONS, REVISIONS.c.id == FLOORPLANS.c.revision_id)
-    return query.select_from(joined.outerjoin(LATENT_GRIDS, is_own_grid(model_sha256, step_m)))
+    joined = joined.outerjoin(LATENT_GRIDS, is_own_grid(model_sha256, step_m))
+    return query.select_from(joined).where(VENUE_PLANS.c.venue_id == venue_id)
 
 
 def _named(ids: Sequence[str]) -> str:

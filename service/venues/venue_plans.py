@@ -20,10 +20,8 @@ from lalaloc_core.localise.venue.prototypes import most_probable
 from service.capacity.bounded_cache import BoundedCache
 from service.capacity.threads import BoundedReads, IdleCores
 from service.grids import GridProvider
-from service.schemas import EarthPoint
 from service.schemas.query_fields import HeightFields
 from service.storage import Store
-from service.storage.plan_places import distances_m
 from service.storage.records import PlanRecord, VenueCounts, VenueState
 from service.venues.plan_list import ROW_BYTES, PlanList
 
@@ -31,9 +29,6 @@ from service.venues.plan_list import ROW_BYTES, PlanList
 # limits the poses of their grids.
 MAX_SEARCHED = 128
 _MAX_COMPARISONS = 8_000_000
-# Maximum radius of the circle around a plan, and maximum number of plans near a place.
-_MAX_REACH_M = 1000.0
-_MAX_NEAR = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +97,6 @@ class VenuePlans:
             return self._store.venues.counts(venue_id, *self._grids.model)
         rows = self._members(tenant, venue_id)
         return VenueCounts(len(rows), len(rows.ready), rows.failed)
-
-    async def near(self, tenant: str, place: EarthPoint, within_m: float) -> PlanList:
-        """Return rows of the tenant's anchored plans within `within_m` of a place, nearest first."""
-        latitude, longitude = place.latitude, place.longitude
-        reach_m = within_m + _MAX_REACH_M
-        near = self._store.venues.searchable_plans_near
-        rows = await self._reads.run(tenant, near, tenant, latitude, longitude, reach_m, *self._grids.model)
-        distance_m = distances_m(rows, None, latitude, longitude)
-        order = np.argsort(distance_m, kind="stable")
-        return PlanList(PlanList.of([rows[int(k)] for k in order if distance_m[k] <= within_m])[:_MAX_NEAR])
 
     def needs_choice(self, ready: PlanList, query: Query) -> bool:
         """Tell whether the plans are too many, or too large, to search all of them in full."""

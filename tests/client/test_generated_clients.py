@@ -23,7 +23,7 @@ DESCRIPTION: dict[str, Any] = yaml.safe_load((ROOT / "openapi.yaml").read_text(e
 NAMES = """
     createFloorplan listFloorplans getFloorplan replaceFloorplan deleteFloorplan getOriginal getExport getPreview
     getMesh getLayout followFloorplan createVenue listVenues getVenue replaceVenue changeVenue deleteVenue
-    listVenuePlans localise localiseBatch localiseSequence createSession getSession deleteSession addPhotograph geopose
+    listVenuePlans localise localiseBatch localiseSequence createSession getSession deleteSession addPhotograph
     getAnswer deleteAnswer getHealth getReadiness getMetrics getLimits getUsage
 """
 OPERATIONS = [operation for operations in DESCRIPTION["paths"].values() for operation in operations.values()]

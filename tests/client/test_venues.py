@@ -98,21 +98,6 @@ def test_venue_query_takes_options(service: Any, panorama: bytes) -> None:
         service.localise_in_venue(venue.id, panorama, level=5)
 
 
-def test_geopose_finds_the_place_on_earth(service: Any, panorama: bytes) -> None:
-    anchor = {"latitude": 51.7546, "longitude": -1.2545}
-    plan = service.upload_floorplan(FLAT | {"anchor": anchor, "north_deg": 0}).id
-    answer = service.geopose(panorama, floorplan_id=plan)
-    assert answer.lalaloc.floorplan_id == plan
-    assert abs(answer.geopose.position.lat - anchor["latitude"]) < 1e-3
-    near = service.geopose(panorama, **anchor, accuracy_m=20.0)
-    assert near.lalaloc.floorplan_id == plan
-    service.delete_floorplan(plan)
-    with pytest.raises(NotFoundError, match="no floor plan with an anchor lies within 100 m"):
-        service.geopose(panorama, latitude=-51.0, longitude=0.0)
-    with pytest.raises(ValueError, match="give both or neither"):
-        service.geopose(panorama, latitude=1.0)
-
-
 def test_malformed_venue_id_is_rejected(service: Any) -> None:
     with pytest.raises(ValueError, match=r"venue_id is '\.\./floorplans'"):
         service.delete_venue("../floorplans")

@@ -324,7 +324,6 @@ def test_every_refusal_says_what_to_do_and_has_an_entry(
         client.get("/limits", headers=held["slow"])
         photo: dict[str, Any] = {"data": plan, "files": {"photo": b"\xff\xd8\xff"}}
         photos = photo | {"files": 2 * [("photo", b"\xff\xd8\xff")]}
-        geopose = {"json": {"sensorReadings": {}}}
         unknown = f"lalaloc_{'0' * 32}_{'x' * 43}"
         table: list[tuple[str, str, dict[str, str], dict[str, Any], int, str, list[str]]] = [
             ("GET", "/limits", {"Authorization": ""}, {}, 401, "unauthenticated", ["Bearer lalaloc_"]),
@@ -337,7 +336,6 @@ def test_every_refusal_says_what_to_do_and_has_an_entry(
             ("GET", "/limits", held["slow"], {}, 429, "rate-limited", ["1 requests per minute", "Retry after"]),
             ("POST", "/localise", {}, photo, 403, "features-required", ["LALALOC_REQUIRE_FEATURES", "lalaloc encode"]),
             ("POST", "/localise/sequence", {}, photos, 403, "features-required", ["LALALOC_REQUIRE_FEATURES"]),
-            ("POST", "/geopose", {}, geopose, 403, "features-required", ["LALALOC_REQUIRE_FEATURES"]),
         ]
         for method, path, headers, body, status, slug, words in table:
             problem = assert_problem(client.request(method, path, headers=headers, **body), status, slug)

@@ -29,7 +29,6 @@ from lalaloc_core.photograph import Photograph, open_photograph
 from service.routes import model_files
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import HOME, StartApp, assert_problem, upload, wait_for
-from tests.service.test_oscp import ANCHOR, NORTH_DEG, oscp_request
 from tests.service.test_process import children
 from tests.service.test_stopping import running_service
 from tests.service.test_telemetry import collector
@@ -242,7 +241,6 @@ def test_service_can_refuse_photographs(start_app: StartApp, tmp_path: Path, dev
             ask(client, "panorama", KITCHEN + bytes(MAX_BYTES), floorplan_id=home),
             ask(client, "photo", KITCHEN, PHONE, path="/localise/sequence", floorplan_id=home),
             client.post(f"/sessions/{session}/photographs", files={"photo": PHONE}),
-            client.post("/geopose", params={"floorplan_id": home}, json=oscp_request(KITCHEN)),
         ]
         for answer in refused:
             assert "on_device" in assert_problem(answer, 403, "features-required")["detail"]
@@ -263,7 +261,7 @@ def test_nothing_of_a_photograph_remains(
         collector() as (endpoint, spans),
         running_service(tiny_view_bundle, tmp_path / "data", OTLP_ENDPOINT=endpoint, **settings) as service,
     ):
-        plan_id = upload(service.client, HOME | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
+        plan_id = upload(service.client, HOME)
         fields = {"floorplan_id": plan_id, "heading_deg": "20"}
         keyed = {"Idempotency-Key": "one"}
         for photo in (photograph, photograph[:-20_000], mark + photograph):
@@ -276,9 +274,8 @@ def test_nothing_of_a_photograph_remains(
         others = [
             service.client.post("/localise/batch", data={"floorplan_id": plan_id}, files=_two(photograph)),
             service.client.post("/localise", data=fields, files={"photo": photograph}, headers={"Accept": "image/png"}),
-            service.client.post("/geopose", params={"floorplan_id": plan_id}, json=oscp_request(photograph)),
         ]
-        assert [answer.status_code for answer in others] == [200, 200, 200]
+        assert [answer.status_code for answer in others] == [200, 200]
         assert service.client.post("/localise", data={"nothing": "1"}, files={"photo": photograph}).status_code == 422
         wait_for(lambda: len(spans) > 10, 20.0)
         traces = [span.SerializeToString() for span in spans]

@@ -16,7 +16,6 @@ from PIL import ExifTags, Image
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload
-from tests.service.test_oscp import oscp_request
 
 Tag = ExifTags.Base
 MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
@@ -178,17 +177,6 @@ def test_venue_picture_and_feature_work(client: httpx.Client, flat: str) -> None
     venue = client.post("/venues", json={"plans": [{"floorplan_id": flat, "level": 0}]}).json()["id"]
     answer = client.post("/localise", data={"venue_id": venue, **QUICK}, files={"photo": photo}).json()
     assert answer["view"]["projection"] == "perspective"
-
-
-def test_camera_of_the_geopose_protocol_is_used(client: httpx.Client, flat: str) -> None:
-    request = oscp_request(jpeg(shown()))
-    (reading,) = request["sensorReadings"]["cameraReadings"]
-    reading["params"] = {"model": "SIMPLE_RADIAL", "modelParams": [480.5, 319.5, 239.5, 0.0]}
-    found = client.post(f"/geopose?floorplan_id={flat}", json=request)
-    assert found.status_code == 200, found.text
-    reading["params"]["modelParams"][0] = 0.0
-    problem = assert_problem(client.post(f"/geopose?floorplan_id={flat}", json=request), 422, "invalid-panorama")
-    assert "intrinsics: fx is 0; it must be positive" in problem["detail"]
 
 
 class TestTurn:

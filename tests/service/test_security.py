@@ -49,7 +49,6 @@ from tests.service.conftest import (
     wait_for,
 )
 from tests.service.postgres import PostgresServer
-from tests.service.test_oscp import oscp_request
 
 ROOT = Path(__file__).parents[2]
 EVERYTHING = tuple(Permission)
@@ -138,10 +137,6 @@ class Guarded:
             body = {"json": content} if method in ("POST", "PATCH") else {}
         elif path in ("/localise", "/localise/batch"):
             body = form
-        elif path == "/geopose":
-            venue = {"plans": [{"floorplan_id": plan_id}], "anchor": {"latitude": 48.0, "longitude": 11.0}}
-            made = self.client.post("/venues", json=venue, headers=bearer(self.key)).json()
-            body = {"json": oscp_request(picture[1]), "params": {"venue_id": made["id"]}}
         elif path == "/localise/sequence":
             body = {"data": {PLAN: plan_id}, "files": [("panorama", picture)] * 2}
         elif path.startswith("/venues"):
