@@ -24,12 +24,10 @@ LAYERS = {
     "lalaloc_core.conventions": 0,
     "lalaloc_core.conditions": 0,
     "lalaloc_core.file_kinds": 0,
-    "lalaloc_core.picture_kinds": 0,
     "lalaloc_core.files": 0,
     "lalaloc_core.model_folder": 0,
     "lalaloc_core.configuration": 1,
     # The query side.
-    "lalaloc_core.floorplan.earth": 0,
     "lalaloc_core.floorplan": 1,
     "lalaloc_core.bundle": 2,
     "lalaloc_core.photograph": 3,
@@ -53,7 +51,6 @@ LAYERS = {
     "lalaloc_core.importers.drawing": 3,
     "lalaloc_core.importers.picture": 4,
     "lalaloc_core.importers.formats": 5,
-    "lalaloc_core.importers.format_table": 3,
     "lalaloc_core.importers": 6,
     # Training.
     "lalaloc_core.learn.dataset_names": 0,

@@ -72,7 +72,7 @@ def _progress_line(name: str) -> Iterator[OnStep | None]:
 def _content(file: Path) -> bytes:
     """Return the bytes of a plan file; of the YAML file of a ROS map, an archive with its picture."""
     if file.suffix.lower() in (".yaml", ".yml"):
-        from lalaloc_core.importers.common.archive import pack
+        from lalaloc_core.importers.common.bounded_files import pack
         from lalaloc_core.importers.formats.ros import map_files
 
         return pack(map_files(file))

@@ -1,20 +1,38 @@
-"""Anchors: conversion between the plan frame and latitude and longitude (WGS84)."""
+"""Anchors: conversion between the plan frame and latitude and longitude (WGS84).
+
+A plan states its origin's latitude and longitude, or two control points.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.json_values import check_keys, is_number, json_kind, read_number_between, read_optional
+from lalaloc_core.floorplan.rooms import Room
 
 if TYPE_CHECKING:
     from pyproj import Transformer
 
 # Number of cached projections.
 _CACHED = 256
+_ORIGIN_KEYS = {"latitude", "longitude", "altitude_m", "north_deg"}
+_CONTROL_KEYS = {"control_points", "altitude_m"}
+_POINT_KEYS = {"x", "y", "latitude", "longitude"}
+_ALTITUDE_M = (-1000.0, 10_000.0)
+# Farther from its origin the projection would stretch a plan by more than a centimetre.
+MAX_FROM_ORIGIN_M = 10_000.0
+# Minimum distance of control points, and largest relative difference of their distances in the plan and on Earth.
+_MIN_APART_M, _MAX_STRETCH = 1.0, 0.02
+# Largest differences between two statements of north: north_deg of plan and anchor, and north_deg and control points.
+_SAME_NORTH_DEG, _SAME_DIRECTION_DEG = 1e-6, 1.0
 
 
 @dataclass(frozen=True)
@@ -116,3 +134,100 @@ def _projection(frame: LocalFrame) -> Transformer:
 def _transform(pipeline: Transformer, points: Float[np.ndarray, "n 2"], *, inverse: bool) -> Float[np.ndarray, "n 2"]:
     x, y = pipeline.transform(points[:, 0], points[:, 1], direction="INVERSE" if inverse else "FORWARD")
     return np.column_stack([x, y])
+
+
+def read_anchor(raw: Any, north_deg: float | None, rooms: Sequence[Room]) -> Anchor | None:
+    """Read the anchor of a plan, None if it has none.
+
+    `raw` is the value of the document's `anchor`, and `north_deg` the plan's own, None if it has none.
+    """
+    if raw is None:
+        return None
+    if not isinstance(raw, Mapping):
+        raise InvalidFloorPlanError(f"anchor must be an object, not {json_kind(raw)}")
+    reach_m = max(float(np.abs(room.polygon_m).max()) for room in rooms)
+    if reach_m > MAX_FROM_ORIGIN_M:
+        raise InvalidFloorPlanError(
+            f"the plan reaches {reach_m:.0f} m from its origin; the limit of anchored plans is "
+            f"{MAX_FROM_ORIGIN_M:.0f} m; move it near its origin"
+        )
+    altitude_m = read_optional(raw.get("altitude_m"), "altitude_m of the anchor", *_ALTITUDE_M, " m")
+    if "control_points" in raw:
+        check_keys(raw, _CONTROL_KEYS, where="anchor: ")
+        anchor = _from_control_points(raw["control_points"], altitude_m)
+        if north_deg is not None and _apart_deg(north_deg, anchor.north_deg) > _SAME_DIRECTION_DEG:
+            raise InvalidFloorPlanError(
+                f"north_deg is {north_deg:g}, but the control points of the anchor give {anchor.north_deg:.1f}; "
+                "remove north_deg or correct the control points"
+            )
+        return anchor
+    check_keys(raw, _ORIGIN_KEYS, where="anchor: ")
+    own_deg = read_optional(raw.get("north_deg"), "north_deg of the anchor", -360.0, 360.0, "")
+    if own_deg is not None:
+        if north_deg is not None and _apart_deg(north_deg, own_deg) > _SAME_NORTH_DEG:
+            raise InvalidFloorPlanError(
+                f"north_deg is {north_deg:g}, but that of the anchor is {own_deg:g}; give one of them"
+            )
+        north_deg = own_deg
+    if north_deg is None:
+        raise InvalidFloorPlanError("an anchor needs north_deg, the azimuth of true north in the plan")
+    latitude, longitude = _place(raw, "anchor")
+    return Anchor(latitude, longitude, altitude_m, north_deg % 360.0)
+
+
+def anchor_document(anchor: Anchor) -> dict[str, float]:
+    """Return an anchor in the native format, without north, which the plan states."""
+    document = {"latitude": anchor.latitude, "longitude": anchor.longitude}
+    return document if anchor.altitude_m is None else document | {"altitude_m": anchor.altitude_m}
+
+
+def _from_control_points(raw: Any, altitude_m: float | None) -> Anchor:
+    """Return the anchor that maps the midpoint of two control points and the direction between them correctly."""
+    if not isinstance(raw, list | tuple) or len(raw) != 2 or not all(isinstance(point, Mapping) for point in raw):
+        raise InvalidFloorPlanError(
+            "control_points of the anchor must be two objects with x, y, latitude and longitude"
+        )
+    places = []
+    for index, point in enumerate(raw):
+        check_keys(point, _POINT_KEYS, where=f"control point {index}: ")
+        if not all(is_number(point.get(key)) for key in ("x", "y")):
+            raise InvalidFloorPlanError(f"control point {index} needs numbers x and y, in metres of the plan")
+        places.append(_place(point, f"control point {index}"))
+    reach_m = MAX_FROM_ORIGIN_M
+    drawn = np.array([[read_number_between(point[key], key, -reach_m, reach_m, " m") for key in "xy"] for point in raw])
+    lon_lat = np.array([[longitude, latitude] for latitude, longitude in places])
+    (dx, dy), (east, north) = drawn[1] - drawn[0], _frame_at(lon_lat[0]).to_local(lon_lat[1:])[0]
+    drawn_m, earth_m = math.hypot(dx, dy), math.hypot(east, north)
+    if not min(drawn_m, earth_m) >= _MIN_APART_M:
+        raise InvalidFloorPlanError(
+            f"the control points are {min(drawn_m, earth_m):.2f} m apart; the minimum is {_MIN_APART_M:g} m"
+        )
+    if not abs(drawn_m / earth_m - 1.0) <= _MAX_STRETCH:
+        raise InvalidFloorPlanError(
+            f"the control points are {drawn_m:.2f} m apart in the plan and {earth_m:.2f} m on Earth; the limit is "
+            f"{_MAX_STRETCH:.0%} difference; check the scale"
+        )
+    # Longitudes have no mean at a pole or across the date line, so the midpoint is that of metres.
+    frame = _frame_at(_frame_at(lon_lat[0]).to_earth(np.array([[0.5 * east, 0.5 * north]]))[0])
+    start, end = frame.to_local(lon_lat)
+    east, north = end - start
+    # Azimuth of the line in the plan, minus its azimuth from north.
+    north_deg = math.degrees(math.atan2(dx, dy) - math.atan2(east, north)) % 360.0
+    middle = Anchor(frame.latitude, frame.longitude, altitude_m, north_deg)
+    x, y = drawn.mean(axis=0)
+    return middle.moved((-float(x), -float(y)))
+
+
+def _frame_at(lon_lat: Float[np.ndarray, "2"]) -> LocalFrame:
+    return LocalFrame(float(lon_lat[0]), float(lon_lat[1]))
+
+
+def _place(raw: Mapping[str, Any], where: str) -> tuple[float, float]:
+    return (
+        read_number_between(raw.get("latitude"), f"latitude of the {where}", -90.0, 90.0, ""),
+        read_number_between(raw.get("longitude"), f"longitude of the {where}", -180.0, 180.0, ""),
+    )
+
+
+def _apart_deg(first: float, second: float) -> float:
+    return abs((first - second + 180.0) % 360.0 - 180.0)

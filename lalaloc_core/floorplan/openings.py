@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.limits import PlanLimits
+from lalaloc_core.floorplan.json_values import PlanLimits
 from lalaloc_core.floorplan.rooms import Room
 
 DEFAULT_OPENING_TOLERANCE_M = 0.35

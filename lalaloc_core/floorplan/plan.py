@@ -16,28 +16,35 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document, read_anchor
-from lalaloc_core.floorplan.checks import check_size, overlap_warnings
-from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.fixtures import Fixture, FixturePlaces, read_fixtures
+from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, Anchor, anchor_document, read_anchor
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
-from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
+from lalaloc_core.floorplan.json_values import (
+    DEFAULT_LIMITS,
+    NO_LIMITS,
+    PlanLimits,
+    check_keys,
+    json_kind,
+    read_json,
+    read_name,
+    read_optional,
+)
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
-from lalaloc_core.floorplan.reading import (
+from lalaloc_core.floorplan.plan_document import (
     DEFAULT_CAMERA_HEIGHT_M,
     MAX_CAMERA_HEIGHT_STD_M,
     TOLERANCES_M,
+    Fixture,
+    FixturePlaces,
     ceiling_warnings,
     read_camera_height,
     read_ceiling,
+    read_fixtures,
     read_opening_trust,
     read_openings,
     read_rooms,
     trust_warnings,
 )
-from lalaloc_core.floorplan.rooms import Room, frozen
-from lalaloc_core.floorplan.values import check_keys, json_kind, read_name, read_optional
+from lalaloc_core.floorplan.rooms import Room, check_size, frozen, overlap_warnings
 
 # Plans with more rooms use a spatial index to find the room of a position.
 _FEW_ROOMS = 32

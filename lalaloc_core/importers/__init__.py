@@ -3,13 +3,13 @@
 `import_plan` and `import_plans` detect a file's format from its bytes. They return a document in the native format
 (docs/reference/plan-format.md) and a report of the layers used and the likely mistakes.
 
-format_table.py  table of all formats
+importing.py     table of all formats, detection, import and export
 formats/         one module per format: reader and writer (DXF: `formats/dxf.py`)
 drawing/         vector drawings of any format: walls, the rooms they enclose, door symbols
 picture/         scans and photographs of drawings
 common/          code that all importers share: options, limits, the sketch, and its conversion to a plan
 
-Begin with `importing.py`, which detects the format and calls its module. `lalaloc_core.floorplan` defines a plan.
+Begin with `importing.py`. `lalaloc_core.floorplan` defines a plan.
 """
 
 from lalaloc_core.floorplan.earth import Anchor
@@ -18,8 +18,11 @@ from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, I
 from lalaloc_core.importers.common.import_options import ImportOptions, KnownDistance
 from lalaloc_core.importers.common.import_report import ImportReport, LayerUse, Trace
 from lalaloc_core.importers.common.sketch import Level
-from lalaloc_core.importers.format_table import EXPORT_FORMATS, FORMATS, ExportFormat, Format
 from lalaloc_core.importers.importing import (
+    EXPORT_FORMATS,
+    FORMATS,
+    ExportFormat,
+    Format,
     begins_with_plans,
     building_name,
     detect_format,

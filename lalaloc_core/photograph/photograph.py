@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.file_kinds import is_drawing
 from lalaloc_core.photograph.bent_lines import bend_warnings
 from lalaloc_core.photograph.cameras import Around, Camera, Perspective, camera_axes
 from lalaloc_core.photograph.exif import ExifLens, read_exif_lens
@@ -39,7 +40,6 @@ from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Sourc
 from lalaloc_core.photograph.spheres import convert_layout, read_layout, read_sphere
 from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
 from lalaloc_core.photograph.turn_angles import Overview
-from lalaloc_core.picture_kinds import is_drawing
 
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480

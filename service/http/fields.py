@@ -12,7 +12,7 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.json_text import read_json
+from lalaloc_core.floorplan.json_values import read_json
 from service.errors import InvalidRequestError
 
 _MAX_SHOWN = 100

@@ -18,7 +18,8 @@ from hypothesis import given, settings
 from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidPhotographError
-from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
+from lalaloc_core.floorplan import FloorPlan, PlanLimits
+from lalaloc_core.floorplan import rooms as room_checks
 from lalaloc_core.floorplan.rooms import interior_point
 from lalaloc_core.photograph.file_segments import check_segments
 from lalaloc_core.photograph.photo_sphere import read_photo_sphere
@@ -116,8 +117,8 @@ def test_crossing_combs_stay_within_the_work_limit(monkeypatch: pytest.MonkeyPat
         intersected.append(len(first.exterior.coords) * len(second.exterior.coords))
         return intersection(first, second)
 
-    monkeypatch.setattr(checks.shapely, "intersection", counted)
-    monkeypatch.setattr(checks, "_MAX_OVERLAPS", 10**6)
+    monkeypatch.setattr(room_checks.shapely, "intersection", counted)
+    monkeypatch.setattr(room_checks, "_MAX_OVERLAPS", 10**6)
     spent = []
     for rooms in (8, 16):
         intersected.clear()
@@ -133,7 +134,7 @@ def test_simple_rooms_are_checked_beside_combs(monkeypatch: pytest.MonkeyPatch) 
         rectangle(2.0, 2.0, corner=(50.0, 0.0)), rectangle(2.0, 2.0, corner=(51.0, 0.0))
     )["rooms"]
     document["rooms"][-2]["name"], document["rooms"][-1]["name"] = "left", "right"
-    monkeypatch.setattr(checks, "_MAX_WORK", 1000)
+    monkeypatch.setattr(room_checks, "_MAX_WORK", 1000)
     assert "rooms 'left' and 'right' overlap by 2.00 m²" in FloorPlan.from_dict(document).warnings
 
 

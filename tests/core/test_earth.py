@@ -14,7 +14,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers import import_plan
-from lalaloc_core.importers.format_table import FORMATS
+from lalaloc_core.importers.importing import FORMATS
 from tests.strategies import plan_document, rectangle
 
 GEOD = pyproj.Geod(ellps="WGS84")

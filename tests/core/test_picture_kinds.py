@@ -12,11 +12,11 @@ from PIL import Image, ImageDraw
 
 from benchmarks.plan_drawing import STYLES, Style, draw_plan
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidPhotographError
+from lalaloc_core.file_kinds import Tones, is_drawing
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.drawing.sketch_drawing import naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.photograph import StatedCamera, open_photograph
-from lalaloc_core.picture_kinds import Tones, is_drawing
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PHOTOGRAPHS = sorted([*EXAMPLES.glob("*.jpg"), *EXAMPLES.glob("real/*.jpg")])

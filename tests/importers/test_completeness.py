@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lalaloc_core.importers import import_plan
-from lalaloc_core.importers.common.completeness import estimate_trust
+from lalaloc_core.importers.common.plausibility import estimate_trust
 
 SIDE_M = 4.0
 

@@ -27,10 +27,10 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from lalaloc_core.importers.common.assemble import assemble
-from lalaloc_core.importers.common.crossings import check_network
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
 from lalaloc_core.importers.drawing import enclosed_rooms
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose
@@ -305,7 +305,7 @@ def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(np.linalg, "norm", counted)
     lines = [shapely.LineString([(0, y), (3, y)]) for k in range(50) for y in (2.0 * k, 2.0 * k + 0.2)]
-    joints = enclosed_rooms._joints(lines, enclosed_rooms.DEFAULT_WALLS)
+    joints = enclosed_rooms._joints(lines, ROOM_BOUNDS.walls)
     # A jamb at both ends of each wall, found from both of its faces.
     assert [joint.length for joint in joints] == pytest.approx([0.2] * 200)
     assert sum(compared) < 5 * 200

@@ -9,8 +9,7 @@ import shapely
 
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
-from lalaloc_core.importers.drawing.scale_guess import Measures, combine, guess_scale
-from lalaloc_core.importers.drawing.stair_treads import tread_spacings
+from lalaloc_core.importers.drawing.scale_guess import Measures, combine, guess_scale, tread_spacings
 from tests.importers.test_lettering import LIMITS, PrintedPlan
 
 

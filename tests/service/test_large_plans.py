@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from lalaloc_core.floorplan import FloorPlan, json_text
+from lalaloc_core.floorplan import FloorPlan, json_values
 from service.plan_files.converter import Converter
 from service.settings import Settings
 from service.stored_plan import LARGE, PackedPlan, PlanDocument
@@ -39,7 +39,7 @@ def no_parsing(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("parsed in the service")
 
     monkeypatch.setattr(FloorPlan, "_read", refuse)
-    monkeypatch.setattr(json_text, "_check_size", refuse)
+    monkeypatch.setattr(json_values, "_check_size", refuse)
 
 
 @pytest.mark.slow
@@ -85,7 +85,7 @@ def test_values_of_venue_documents_are_counted_before_parsing(
     path = "/venues"
     if method != "POST":
         path = client.post("/venues", json={"name": "campus"}).headers["Content-Location"]
-    monkeypatch.setattr(json_text.json, "loads", None)
+    monkeypatch.setattr(json_values.json, "loads", None)
     content = b'{"plans": [' + b"[]," * 1_000_000 + b"[]]}"
     answer = client.request(method, path, content=content, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422, answer.text

@@ -16,16 +16,14 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.reading import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
-from lalaloc_core.importers.common.completeness import estimate_trust
-from lalaloc_core.importers.common.crossings import check_network, distinct
-from lalaloc_core.importers.common.fixtures import place_fixtures, type_rooms
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
+from lalaloc_core.importers.common.fixtures_by_name import place_fixtures, type_rooms
+from lalaloc_core.importers.common.geometry import check_network, distinct, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
-from lalaloc_core.importers.common.plausibility import check_document
+from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
 from lalaloc_core.importers.common.sketch import (
     Level,
     Sketch,

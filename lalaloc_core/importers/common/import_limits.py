@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, PlanLimits
 from lalaloc_core.importers.common.import_report import Trace
+from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
 
 _REMEDY = "export a single storey, or only the layers of walls, doors, windows and rooms"
 
@@ -29,6 +30,8 @@ class ImportLimits:
         max_plan_pixels: pixels of a picture, or of a page that is rendered.
         max_levels: number of storeys with rooms.
         max_import_s: CPU time of an import. It is checked between entities, so a library call can exceed it.
+        plan: limits of the plans in it.
+        rooms: bounds by which rooms are recognised in drawings.
     """
 
     max_plan_bytes: int = 40 * 2**20
@@ -40,6 +43,7 @@ class ImportLimits:
     max_levels: int = 200
     max_import_s: float = 30.0
     plan: PlanLimits = DEFAULT_LIMITS
+    rooms: RoomBounds = ROOM_BOUNDS
 
     @property
     def max_json_values(self) -> int:

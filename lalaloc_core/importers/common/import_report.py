@@ -10,7 +10,7 @@ from typing import Any, Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.completeness import OpeningTrust
+from lalaloc_core.importers.common.plausibility import OpeningTrust
 
 TracePart = Literal["line", "wall line", "door", "window", "passage", "other", "wall", "gap", "room", "no room"]
 # Corners of an area in metres.

@@ -16,9 +16,8 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.crossings import check_network, distinct
-from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
-from lalaloc_core.importers.drawing.wall_areas import WallAreas
+from lalaloc_core.importers.common.geometry import WallAreas, check_network, distinct, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, WallConfig
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
@@ -31,34 +30,6 @@ _MOSTLY_SINGLE, _SMALLEST_COUNTED_M2 = 0.5, 1.0
 _LONG_M, _USUAL, _WIDEST = 10.0, 0.75, 2.5
 # Piers are so much thicker than the usual ends of walls, and shorter than so many times their own thickness.
 _PIER, _PIER_NIB = 1.6, 2.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallConfig:
-    """Dimensions of walls and openings (m).
-
-    Attributes:
-        thickest: largest thickness of a wall; thicker areas are rooms.
-        thinnest: smallest thickness of a wall; shorter ends are rounded corners.
-        widest_gap: largest width of an opening; wider gaps stay open and join the rooms beside them.
-        narrowest_gap: smallest width of an opening.
-        nib: smallest length of a wall that forms a jamb alone; shorter walls need a jamb that faces them.
-        snap: ends of lines nearer than this to another line are joined to it.
-        smallest_room_m2: smallest area of a room; smaller areas are ducts.
-        blunt: largest depth of corners that pixels cut off the ends of walls.
-    """
-
-    thickest: float = 0.55
-    thinnest: float = 0.03
-    widest_gap: float = 1.9
-    narrowest_gap: float = 0.3
-    nib: float = 0.28
-    snap: float = 0.06
-    smallest_room_m2: float = 0.6
-    blunt: float = 0.0
-
-
-DEFAULT_WALLS = WallConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +78,7 @@ def enclose(
     bodies: Sequence[shapely.Polygon],
     lines: Sequence[shapely.LineString],
     closers: Sequence[BaseGeometry] = (),
-    config: WallConfig = DEFAULT_WALLS,
+    config: WallConfig = ROOM_BOUNDS.walls,
     check_time: Callable[[], None] = lambda: None,
     rank: Callable[[Gap], int | None] = rank_by_walls,
 ) -> Enclosed:

@@ -6,7 +6,8 @@ Every kind of part is a clue: a likelihood over the logarithm of the scale. Thei
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +19,6 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, ScaleClue
 from lalaloc_core.importers.common.sketch import Sketch, SketchedFixture
 from lalaloc_core.importers.drawing.drawing_scale import Dimension, areas_of_rooms, values_m
-from lalaloc_core.importers.drawing.stair_treads import tread_spacings
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
 # Logarithms of scales that are compared, around the first one.
@@ -52,6 +52,11 @@ _NAMES: Mapping[str, tuple[str, str]] = {
 }  # fmt: skip
 
 Likelihood = Float[np.ndarray, "n"]
+_MIN_LINES, _MAX_LINES = 6, 5000
+# Largest deviation of distances, and of ends as a share of a line's length.
+_EVEN, _FLUSH = 0.1, 0.05
+# Width of a stair in treads; wider patterns are hatches.
+_WIDE = (2.3, 8.0)
 
 
 @dataclass(frozen=True)
@@ -276,3 +281,43 @@ def _long_side(fixture: SketchedFixture) -> float:
 def _in_words(clue: ScaleClue) -> str:
     one, several = _NAMES[clue.kind]
     return f"the {one}" if clue.kind == "wall" else f"{clue.count} {one if clue.count == 1 else several}"
+
+
+def tread_spacings(lines: Iterable[shapely.LineString]) -> list[float]:
+    """Return the distance of the lines of every flight of stairs along an axis, in units of the drawing."""
+    across: dict[tuple[bool, int, int], list[tuple[float, float]]] = defaultdict(list)
+    for line in list(lines)[:_MAX_LINES]:
+        x0, y0, x1, y1 = line.bounds
+        width, height = x1 - x0, y1 - y0
+        length = max(width, height)
+        if length <= 0.0 or min(width, height) > 0.02 * length:
+            continue
+        is_vertical = height > width
+        first, last, level = (y0, y1, x0) if is_vertical else (x0, x1, y0)
+        # Lines of one flight begin and end at the same places.
+        size = round(np.log(length) / (2.0 * _FLUSH))
+        unit = 2.0 * _FLUSH * np.exp(2.0 * _FLUSH * size)
+        across[is_vertical, size, round((first + last) / unit)].append((level, length))
+    found = []
+    for group in across.values():
+        if len(group) >= _MIN_LINES:
+            found += _flights(sorted(group))
+    return found
+
+
+def _flights(lines: list[tuple[float, float]]) -> list[float]:
+    """Return the spacing of each run of equally spaced lines, given as (level, length)."""
+    levels = np.array([level for level, _ in lines])
+    length = float(np.median([length for _, length in lines]))
+    levels = levels[np.concatenate([[True], np.diff(levels) > 1e-6 * length])]
+    steps = np.diff(levels)
+    found: list[float] = []
+    begin = 0
+    for end in range(1, len(steps) + 1):
+        if end < len(steps) and abs(steps[end] / steps[begin] - 1.0) <= _EVEN:
+            continue
+        spacing = float(np.mean(steps[begin:end]))
+        if end - begin >= _MIN_LINES - 1 and _WIDE[0] <= length / spacing <= _WIDE[1]:
+            found.append(spacing)
+        begin = end
+    return found

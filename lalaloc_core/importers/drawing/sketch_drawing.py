@@ -1,24 +1,27 @@
 """Conversion of a drawing to rooms and openings.
 
-`readings.py` finds the rooms; here they get names, and doors and windows their places.
+`rooms_in_drawing.py` finds the rooms; here they get names, and doors and windows their places. Rooms joined by a
+passage without a symbol that is wider than a door are divided where their names tell them apart.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import opening_line, side_lengths
+from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
+from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
 from lalaloc_core.importers.drawing.door_leaves import (
@@ -29,10 +32,8 @@ from lalaloc_core.importers.drawing.door_leaves import (
     without_leaves,
 )
 from lalaloc_core.importers.drawing.drawing_scale import check_areas, written_dimensions
-from lalaloc_core.importers.drawing.enclosed_rooms import Gap
-from lalaloc_core.importers.drawing.named_rooms import split_named_rooms
-from lalaloc_core.importers.drawing.readings import (
-    SYMBOL_M,
+from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
+from lalaloc_core.importers.drawing.rooms_in_drawing import (
     GapFinder,
     choose_reading,
     clusters,
@@ -58,6 +59,66 @@ _OFF_WALL_M = 0.03
 _TRACED: Mapping[Role | None, TracePart] = {None: "line", "wall": "wall line", "room": "line", "door": "door",
                                             "window": "window", "passage": "passage", "obstacle": "other",
                                             "ignored": "other", "text": "other"}  # fmt: skip
+# Widest passage (m) between rooms with names of their own, and smallest room (m²) that it divides off.
+_WIDEST_M, _SMALLEST_M2 = 5.0, 1.5
+# Gaps of a room that are tried, the narrowest first.
+_MOST_GAPS = 12
+
+
+def split_named_rooms(
+    rooms: Sequence[shapely.Polygon],
+    walls: BaseGeometry,
+    closed: Sequence[Gap],
+    letterings: Sequence[Lettering],
+    check_time: Callable[[], None],
+) -> tuple[list[shapely.Polygon], list[Gap]]:
+    """Divide rooms with several names of rooms at gaps between ends of walls that leave a name on both sides.
+
+    Args:
+        rooms: the rooms.
+        walls: the walls around them.
+        closed: gaps that are closed already.
+        letterings: texts of the drawing.
+        check_time: called between steps; raises an exception to stop.
+
+    Returns:
+        The rooms in the order given, parts beside each other, and the gaps that divide them.
+    """
+    places = [shapely.Point(text.position) for text in letterings if text.room_type is not None]
+    names = shapely.STRtree(places)
+    if all(len(names.query(room, predicate="contains")) < 2 for room in rooms):
+        return list(rooms), []
+    around = shapely.union_all([walls, *(gap.shape for gap in closed)])
+    gaps = find_gaps(around, replace(ROOM_BOUNDS.walls, widest_gap=_WIDEST_M), check_time)
+    parts: list[shapely.Polygon] = []
+    dividing: list[Gap] = []
+    for room in rooms:
+        near = sorted((gap for gap in gaps if gap.shape.intersects(room)), key=lambda gap: gap.width)[:_MOST_GAPS]
+        pieces = [room]
+        # Each division can leave a passage as the only one between two of the pieces.
+        while (found := _division(pieces, near, names, check_time)) is not None:
+            index, sides, group = found
+            pieces[index : index + 1] = sides
+            dividing += group
+            near = [gap for gap in near if gap not in group]
+        parts += pieces
+    return parts, dividing
+
+
+def _division(
+    pieces: Sequence[shapely.Polygon], gaps: Sequence[Gap], names: shapely.STRtree, check_time: Callable[[], None]
+) -> tuple[int, list[shapely.Polygon], tuple[Gap, ...]] | None:
+    """Return the number of a piece with its two sides and the gaps between them; None if no gaps divide names."""
+    # One passage, or two beside a wall that stands free.
+    for group in (*combinations(gaps, 1), *combinations(gaps, 2)):
+        check_time()
+        cut = shapely.union_all([gap.shape for gap in group])
+        for index, piece in enumerate(pieces):
+            sides = polygons_from_geometry(piece.difference(cut))
+            named = [side for side in sides if len(names.query(side, predicate="contains"))]
+            if len(named) == len(sides) == 2 and all(side.area >= _SMALLEST_M2 for side in sides):
+                return index, sides, group
+    return None
 
 
 @contextmanager
@@ -81,7 +142,8 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
     budget.begin("finding doors and walls")
-    marked = marked_rooms(drawing, builder)
+    bounds = budget.limits.rooms
+    marked = marked_rooms(drawing, builder, bounds)
     lines = [stroke for stroke in drawing.strokes if stroke.role in (None, "wall")]
     walls = take_leaves(lines, drawing.swings, drawing.areas)
     others = [stroke for stroke in drawing.strokes if stroke.role not in (None, "wall")]
@@ -93,7 +155,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     if reading.walls is None:
         sketch.inner_walls = _free_standing(drawing, shapes)
         leaves = []
-        report_unused(drawing, shapes, builder)
+        report_unused(drawing, shapes, builder, bounds)
     else:
         drawing = without
         sketch.drawn = reading.walls.envelope
@@ -111,10 +173,11 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
-    finder = GapFinder(gaps)
+    finder = GapFinder(gaps, bounds)
     closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if finder.closed_by(swing) is not None]
-    sketch.openings = [*_symbols(drawing, closing), *_swings([*drawing.swings, *closing], finder, shapes)]
-    sketch.leaves_m = _leaf_widths([*drawing.swings, *closing], finder)
+    swings = [*drawing.swings, *closing]
+    sketch.openings = [*_symbols(drawing, closing, bounds.symbol_m), *_swings(swings, finder, shapes)]
+    sketch.leaves_m = _leaf_widths(swings, finder)
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
     taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
     rooms = shapely.STRtree([room.shape for room in shapes])
@@ -235,7 +298,7 @@ def _is_name(text: str) -> bool:
     return letters >= 2 and letters > digits
 
 
-def _symbols(drawing: Drawing, closing: Sequence[Swing]) -> list[SketchedOpening]:
+def _symbols(drawing: Drawing, closing: Sequence[Swing], symbol_m: float) -> list[SketchedOpening]:
     """Return the openings on layers named after them, one per cluster of shapes, without leaves that close a gap."""
     found = []
     for kind in ("door", "window", "passage"):
@@ -243,8 +306,8 @@ def _symbols(drawing: Drawing, closing: Sequence[Swing]) -> list[SketchedOpening
         swinging = [*drawing.swings, *closing] if kind == "door" else []
         hinges = shapely.MultiPoint([swing.hinge for swing in swinging]) if swinging else None
         shapes += [stroke.line for stroke in drawing.strokes if stroke.role == kind]
-        for cluster in clusters(shapes, SYMBOL_M):
-            if hinges is not None and shapely.distance(cluster, hinges) < SYMBOL_M:
+        for cluster in clusters(shapes, symbol_m):
+            if hinges is not None and shapely.distance(cluster, hinges) < symbol_m:
                 continue  # The swing locates the door more precisely.
             found += _opening_of(kind, cluster)
     return found

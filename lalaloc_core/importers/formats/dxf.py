@@ -32,15 +32,14 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.fixtures import fixture_from_name
+from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import SketchedFixture
+from lalaloc_core.importers.common.sketch import SketchedFixture, name_storeys
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
-from lalaloc_core.importers.drawing.storeys import name_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 

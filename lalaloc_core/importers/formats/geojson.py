@@ -13,7 +13,7 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
-from lalaloc_core.floorplan.values import is_number
+from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
 from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates
 from lalaloc_core.importers.common.import_limits import Budget

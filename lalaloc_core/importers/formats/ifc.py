@@ -33,9 +33,7 @@ from lalaloc_core.importers.common.sketch import (
     SketchedRoom,
 )
 from lalaloc_core.importers.common.vocabulary import role_from_name
-from lalaloc_core.importers.formats.ifc_file import open_model
-from lalaloc_core.importers.formats.ifc_fixtures import FURNISHINGS, fixture_kind
-from lalaloc_core.importers.formats.ifc_place import find_anchor
+from lalaloc_core.importers.formats.ifc_file import FURNISHINGS, find_anchor, fixture_kind, open_model
 
 # Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3

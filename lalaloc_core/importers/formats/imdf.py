@@ -12,9 +12,9 @@ import numpy as np
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.importers.common.archive import pack
+from lalaloc_core.floorplan.json_values import read_json
 from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.bounded_files import pack
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level

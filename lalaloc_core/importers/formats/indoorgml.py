@@ -18,13 +18,13 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.floors import Floor, find_floor, report_floor
 from lalaloc_core.importers.common.geometry import check_coordinates, opening_line, point_xy
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.opening_placement import WallLines
-from lalaloc_core.importers.common.safe_xml import local_name, read_xml
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, Level, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 

@@ -10,7 +10,7 @@ from typing import Any
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.values import is_number
+from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble_levels, clean_name
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions, check_units, check_y_axis

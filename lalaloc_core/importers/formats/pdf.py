@@ -19,7 +19,7 @@ from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import Sketch
+from lalaloc_core.importers.common.sketch import Box, Sketch, choose_storey
 from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
 from lalaloc_core.importers.drawing.scale_guess import (
@@ -31,7 +31,6 @@ from lalaloc_core.importers.drawing.scale_guess import (
     measures_of,
 )
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
-from lalaloc_core.importers.drawing.storeys import Box, choose_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.ink import blank_outside

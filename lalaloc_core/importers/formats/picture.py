@@ -11,10 +11,12 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.file_kinds import Tones
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Box, choose_storey
 from lalaloc_core.importers.drawing.drawing_scale import (
     check_scale,
     drawing_scale,
@@ -24,12 +26,10 @@ from lalaloc_core.importers.drawing.drawing_scale import (
 )
 from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
-from lalaloc_core.importers.drawing.storeys import Box, choose_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.ink import blank_outside, inked_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
-from lalaloc_core.picture_kinds import Tones
 
 _MIN_SIDE_PX = 64
 # A larger picture has a wrong scale.

@@ -18,8 +18,8 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.common.archive import pack
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.bounded_files import pack
 from lalaloc_core.importers.common.geometry import MapFrame
 from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget
 from lalaloc_core.importers.common.import_options import ImportOptions

@@ -20,18 +20,17 @@ import svgelements
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.fixtures import fixture_from_name
+from lalaloc_core.importers.common.bounded_files import local_name, read_xml
+from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.safe_xml import local_name, read_xml
-from lalaloc_core.importers.common.sketch import SketchedFixture
+from lalaloc_core.importers.common.sketch import SketchedFixture, name_storeys
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, sketch_drawing
-from lalaloc_core.importers.drawing.storeys import name_storeys
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     Area,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.bounded_files import local_name
 from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.safe_xml import local_name
 
 _HREF = "{http://www.w3.org/1999/xlink}href"
 _BYTES_PER_ENTITY, _BYTES_PER_SHAPE = 12, 20

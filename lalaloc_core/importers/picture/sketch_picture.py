@@ -15,16 +15,16 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.room_bounds import WallConfig
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, WallConfig, enclose
-from lalaloc_core.importers.drawing.named_rooms import split_named_rooms
+from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
+from lalaloc_core.importers.drawing.sketch_drawing import split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
-from lalaloc_core.importers.picture.gap_content import GapContent, GapReader
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.symbols import Symbol, find_symbols, fixtures_in, is_taken, without_symbols
 from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
-from lalaloc_core.importers.picture.windows_in_walls import windows_in_walls
+from lalaloc_core.importers.picture.wall_symbols import GapContent, GapReader, windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.05)

@@ -1,17 +1,24 @@
-"""Readers for single values of a plan's document; errors name the value in JSON terms."""
+"""Readers for JSON and for single values of a plan's document, within limits; errors name the value in JSON terms.
+
+JSON is parsed strictly, in time linear in the length of the text.
+"""
 
 from __future__ import annotations
 
+import json
+import math
+import re
 import sys
 import unicodedata
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeGuard
 
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.limits import PlanLimits
 
 # Unicode categories that files and drawings cannot hold: control characters and lone surrogates.
 _NOT_TEXT = {"Cc", "Cs"}
@@ -19,6 +26,122 @@ _NOT_TEXT = {"Cc", "Cs"}
 _SHOWN = 50
 # Shorter than any opening or stub of wall, longer than the rounding of a drawing.
 _MIN_SEGMENT_M = 0.01
+_OPENING, _CLOSING = np.frombuffer(b"[{", np.uint8), np.frombuffer(b"]}", np.uint8)
+# An unterminated string matches up to the end of the text: a match that begins never fails, so the time is linear. If
+# the closing quote were required, every quote of such a string would be tried again.
+_JSON_STRING = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
+# No floating-point number has more. Python parses thousands, in time quadratic in their number.
+_MAX_DIGITS = 300
+_DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MAX_DIGITS + 1},}}")
+
+
+def read_json(text: str | bytes, max_depth: int, max_values: int | None = None) -> Any:
+    """Parse a JSON text with at most `max_values` lists, objects and further items (commas).
+
+    Raises:
+        InvalidFloorPlanError: not JSON, nested too deep, too many values, a repeated key in one object, or a number of
+            too many digits.
+    """
+    try:
+        if isinstance(text, bytes):
+            text = text.decode(json.detect_encoding(text), "surrogatepass")
+        structure = _JSON_STRING.sub("", text)
+        _check_size(structure, max_depth, max_values)
+        _check_digits(structure)
+        return json.loads(text, object_pairs_hook=_object)
+    except InvalidFloorPlanError:
+        raise
+    except UnicodeDecodeError as error:
+        raise InvalidFloorPlanError(
+            f"not valid JSON: byte {error.start} of the text is not {error.encoding.upper()}; save it as UTF-8"
+        ) from error
+    except RecursionError as error:
+        raise InvalidFloorPlanError(f"not valid JSON: nested too deep; the limit is {max_depth} levels") from error
+    except ValueError as error:
+        raise InvalidFloorPlanError(f"not valid JSON: {error}") from error
+
+
+def _check_size(structure: str, max_depth: int, max_values: int | None) -> None:
+    """Refuse deep nesting and many values before they are parsed; `structure` is the text without its strings."""
+    characters = np.frombuffer(structure.encode("utf-8", "surrogatepass"), np.uint8)
+    steps = np.isin(characters, _OPENING).astype(np.int8) - np.isin(characters, _CLOSING)
+    depth = int(np.cumsum(steps, dtype=np.int32).max(initial=0))
+    if depth > max_depth:
+        raise InvalidFloorPlanError(f"the JSON is nested {depth} levels deep; the limit is {max_depth}")
+    values = sum(structure.count(mark) for mark in "[{,")
+    if max_values is not None and values > max_values:
+        raise InvalidFloorPlanError(
+            f"the JSON has {values} lists, objects and further items; the limit is {max_values}: simplify it"
+        )
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise InvalidFloorPlanError(f"the key '{key[:50]}' occurs twice in one object; remove one of them")
+        found[key] = value
+    return found
+
+
+def _check_digits(structure: str) -> None:
+    found = _DIGITS.search(structure)
+    if found is not None:
+        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits; the limit is {_MAX_DIGITS}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanLimits:
+    """Limits of a floor plan; a plan outside them is refused with an error that names value and limit.
+
+    Errors name the service's setting (`LALALOC_MAX_ROOMS`) if there is one; in Python, pass a `PlanLimits` instead.
+    A room's vertices are those of its outline and holes, plus one per free-standing wall; `max_plan_vertices` counts
+    all rooms. `max_depth` limits the nesting of objects and lists.
+    """
+
+    max_rooms: int = 10_000
+    max_vertices_per_room: int = 500
+    max_plan_vertices: int = 100_000
+    max_openings: int = 20_000
+    # Opening faces on the walls of one room, and walls that one opening can lie on.
+    max_openings_per_room: int = 100
+    max_walls_per_opening: int = 32
+    # Opening faces on all walls, and comparisons of an opening with a wall near it.
+    max_opening_faces: int = 200_000
+    max_opening_pairs: int = 3_000_000
+    max_extent_m: float = 1000.0
+    max_area_m2: float = 200_000.0
+    # Sum of the bounding boxes of the rooms, which the pose grid is computed over.
+    max_bounds_area_m2: float = 500_000.0
+    # Up to here a double resolves nanometres; a hundred times farther out areas and distances begin to lose metres.
+    max_coordinate_m: float = 1e7
+    max_depth: int = 8
+    max_name_length: int = 200
+    min_room_area_m2: float = 0.2
+    min_ceiling_height_m: float = 1.0
+    min_camera_height_m: float = MIN_CAMERA_HEIGHT_M
+    max_ceiling_height_m: float = 20.0
+    # Rooms that share more floor than this overlap; less is rounding of the drawing.
+    overlap_tolerance_m2: float = 0.01
+
+
+DEFAULT_LIMITS = PlanLimits()
+# For stored plans, which were valid under earlier limits: tighter ones must not make them unreadable.
+NO_LIMITS = PlanLimits(
+    max_rooms=10**9,
+    max_vertices_per_room=10**9,
+    max_plan_vertices=10**9,
+    max_openings=10**9,
+    max_openings_per_room=10**9,
+    max_walls_per_opening=10**9,
+    max_opening_faces=10**9,
+    max_opening_pairs=10**12,
+    max_extent_m=math.inf,
+    max_area_m2=math.inf,
+    max_bounds_area_m2=math.inf,
+    max_coordinate_m=math.inf,
+    min_camera_height_m=0.0,
+)
 
 
 def json_kind(value: Any) -> str:
