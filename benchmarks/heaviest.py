@@ -243,7 +243,7 @@ def _sequence(*, padded: bool, venue: bool = False) -> Work:
     def work(caller: Caller, stored: Stored, size: int) -> None:
         files = _PANORAMAS * (("panorama", _padded_picture(size * 10**5 // _PANORAMAS if padded else 0)),)
         place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
-        caller.send("POST", "/localise/sequence", *form((place,), files))
+        caller.send("POST", "/localise/sequence", *form((place, ("motion", "turn")), files))
 
     return work
 

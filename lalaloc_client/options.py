@@ -77,28 +77,22 @@ class FilmOptions(ViewOptions, total=False):
 
 
 class SequenceOptions(FilmOptions, total=False):
-    """Options of several photographs of one visit. See `FilmOptions` as well.
+    """Options of several photographs from one spot. See `FilmOptions` as well.
 
     Attributes:
-        motion: `turn` for photographs from one spot, else `walk`, the default.
-        relative_heading_deg: for `turn`, headings relative to each other, clockwise, None where unknown. Default: from
+        motion: `turn`, as the photographs are from one spot. Photographs of a walk go to a session or an album.
+        relative_heading_deg: headings relative to each other, clockwise, None where unknown. Default: from
             what the photographs show twice; turn by at most half the field of view between them.
         relative_heading_std_deg: their standard deviation. Default: 2.
-        motions: for `walk`, measurements between consecutive photographs, any of {"distance_m": 2.4,
-            "distance_std_m": 0.1, "turn_deg": 35, "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2}, or
-            None: the turn of the heading, clockwise, and the direction of the motion relative to the first heading.
         headings_deg: heading of each photograph, None where unknown.
         heading_tolerance_deg: maximum error of the headings. Default: 0.
-        camera_heights_m: height of each photograph, None for the common one; all share one relative error.
     """
 
-    motion: Literal["walk", "turn"] | None
+    motion: Literal["turn"]
     relative_heading_deg: Sequence[float | None] | None
     relative_heading_std_deg: float | None
-    motions: Sequence[Mapping[str, float] | None] | None
     headings_deg: Sequence[float | None] | None
     heading_tolerance_deg: float | None
-    camera_heights_m: Sequence[float | None] | None
 
 
 Options: TypeAlias = QueryOptions | SequenceOptions | FilmOptions | ViewOptions

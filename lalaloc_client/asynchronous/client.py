@@ -128,7 +128,7 @@ class AsyncClient(AsyncPlans):
         on_device: bool = False,
         **options: Unpack[SequenceOptions],
     ) -> SequenceLocalisation:
-        """Localise several photographs of one visit jointly.
+        """Localise several photographs of one turn together, with `motion="turn"`.
 
         Args:
             floorplan_id: id of the plan; None with `venue_id`.
@@ -138,7 +138,7 @@ class AsyncClient(AsyncPlans):
             **options: see `SequenceOptions`.
         """
         values = {"floorplan_id": floorplan_id, "venue_id": venue_id}
-        if on_device and options.get("motion") == "turn" and options.get("relative_heading_deg") is None:
+        if on_device and options.get("relative_heading_deg") is None:
             content, _ = await self.localise_turn(panoramas, values, options)
         else:
             content = await self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)

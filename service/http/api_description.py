@@ -18,7 +18,6 @@ from service.schemas.photographs import StatedIntrinsics
 from service.schemas.plan_import import ImportLine
 from service.schemas.problem_details import Problem
 from service.schemas.query_fields import PlanPoint
-from service.schemas.sequence import StatedMotion
 from service.schemas.stored_plans import PlanEvent
 from service.schemas.venues import VenueChangeDocument, VenueDocument
 from service.security import access_control
@@ -45,7 +44,6 @@ _BY_HAND = (
     RotationDocument,
     StatedIntrinsics,
     SessionDocument,
-    StatedMotion,
     TenantLimitsDocument,
     VenueDocument,
     VenueChangeDocument,

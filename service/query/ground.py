@@ -80,10 +80,10 @@ class Ground:
         return cls(record.plan, grid, [record], [record.plan.anchor], [None], hints)
 
     @classmethod
-    def of_venue(cls, loaded: LoadedPlans, stated: VenueHints, camera_height_m: float, gap_m: float) -> Ground:
-        """Return the ground of plans of a venue, `gap_m` apart, for a camera height (m)."""
+    def of_venue(cls, loaded: LoadedPlans, stated: VenueHints, camera_height_m: float) -> Ground:
+        """Return the ground of plans of a venue for a camera height (m)."""
         plans = [record.plan for record in loaded.records]
-        merged = MergedPlans.of(plans, loaded.grids, camera_height_m, gap_m)
+        merged = MergedPlans.of(plans, loaded.grids, camera_height_m)
         partly = loaded.log_mass is not None
         hints = stated.in_merged_plans(loaded.rows, plans, merged, loaded.hint_shares, partly=partly)
         return cls(

@@ -13,12 +13,11 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Query
-from lalaloc_core.localise.venue.merged_plans import GAP_M
 from service.capacity.admission_control import Slots
 from service.capacity.query_context import QueryContext
 from service.capacity.threads import BoundedReads
 from service.errors import PlanFailedError, PlanNotReadyError, VenueUnsearchableError
-from service.grids import GridProvider, check_height_m, grid_height_m
+from service.grids import GridProvider, grid_height_m
 from service.query.executor import Executor
 from service.query.ground import Ground
 from service.query.stated_pose import stated_height, stated_hints
@@ -62,8 +61,6 @@ class Grounds:
         form: HeightFields,
         hinted: HintFields | SessionDocument | None = None,
         *,
-        heights_m: Sequence[float | None] = (),
-        gap_m: float = GAP_M,
         max_poses: int | None = None,
     ) -> Site:
         """Return the site of a query.
@@ -72,14 +69,12 @@ class Grounds:
             where: the plan or venue.
             form: the stated camera height.
             hinted: the stated hints; None for none.
-            heights_m: further stated camera heights (m).
-            gap_m: distance between plans of a venue, which are laid side by side.
             max_poses: limit of the grid poses of a plan of a venue; None for no limit.
         """
         if isinstance(where, PlanRecord):
-            return PlanSite(self, where, form, hinted, heights_m)
+            return PlanSite(self, where, form, hinted)
         hints = VenueHints(anchor=where.anchor) if hinted is None else VenueHints.from_form(hinted, where.anchor)
-        return VenueSite(self, where, form, hints, gap_m, max_poses)
+        return VenueSite(self, where, form, hints, max_poses)
 
     async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
         """Check what a request states about a plan or a venue.
@@ -142,19 +137,11 @@ class PlanSite:
     """
 
     def __init__(
-        self,
-        grounds: Grounds,
-        record: PlanRecord,
-        form: HeightFields,
-        hinted: HintFields | SessionDocument | None,
-        heights_m: Sequence[float | None],
+        self, grounds: Grounds, record: PlanRecord, form: HeightFields, hinted: HintFields | SessionDocument | None
     ) -> None:
         self._grounds = grounds
         self._record = record
         self.north = record.plan.north
-        for height_m in heights_m:
-            if height_m is not None:
-                check_height_m(record, height_m)
         self.height = stated_height(form, record)
         self._hints = NO_HINTS if hinted is None else stated_hints(hinted, record.plan)
 
@@ -179,20 +166,13 @@ class VenueSite:
     """
 
     def __init__(
-        self,
-        grounds: Grounds,
-        where: VenueRecord,
-        form: HeightFields,
-        hints: VenueHints,
-        gap_m: float,
-        max_poses: int | None,
+        self, grounds: Grounds, where: VenueRecord, form: HeightFields, hints: VenueHints, max_poses: int | None
     ) -> None:
         self._grounds = grounds
         self._where = where
         self.id = where.id
         self._form = form
         self._hints = hints
-        self._gap_m = gap_m
         self._max_poses = max_poses
         self._warnings: list[str] = []
         self.north = None if where.anchor is None else heading_from_degrees(where.anchor.north_deg)
@@ -239,7 +219,7 @@ class VenueSite:
             )
             # As `VenueSearch.load`: the photograph whose search compares most.
             height_m = max(choosing, key=lambda query: len(query.roll)).camera_height.height_m
-            merge = partial(Ground.of_venue, loaded, self._hints, height_m, self._gap_m)
+            merge = partial(Ground.of_venue, loaded, self._hints, height_m)
             return await self._grounds.executor.compute(context, merge)
 
 

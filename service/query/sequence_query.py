@@ -1,4 +1,4 @@
-"""Query about several photographs of one visit: photographs, ground, steps, answer."""
+"""Query about several photographs of one turn: photographs, ground, steps, answer."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.query import CameraHeight, KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
-from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence_steps
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
-from lalaloc_core.localise.venue.merged_plans import GAP_M
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.film import Film
 from service.query.answers import compose_answer, compose_sequence_answer, film_answer, timed_poses
@@ -24,32 +21,21 @@ from service.query.queries import SequenceQuery
 from service.query.query_parts import QueryParts
 from service.query.single_query import VENUE_CONFIG
 from service.query.spots import Spot
-from service.query.stated_pose import heights_of
 from service.schemas import LocaliseAnswer, SequenceAnswer, SequenceForm
 from service.schemas.photographs import AssumedAngle
 from service.storage.records import PlanRecord, VenueRecord
 
-# Deviations of a measured motion that are possible.
-_REACH_STD = 5.0
-
 
 class SequenceSearch:
-    """Search of the places of several photographs of one visit."""
+    """Search of the place of several photographs from one spot."""
 
     def __init__(self, parts: QueryParts) -> None:
         self._parts = parts
 
     async def answer(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
-        """Localise photographs jointly."""
+        """Localise photographs, or the frames of a film, together."""
         form, context = query.form, query.context
-        if form.camera_heights_m is not None and not self._parts.encoder.predicts_profile:
-            raise InvalidPoseError(
-                "camera_heights_m needs a model that predicts wall profiles; this one compares latents of one height: "
-                "give camera_height_m"
-            )
-        # Measured motions must not lead from one plan of a venue to its neighbour.
-        gap_m = GAP_M + max(map(_reach_m, form.steps(max(len(query.contents), 2))))
-        site = await self._parts.grounds.site(where, form, heights_m=form.camera_heights_m or (), gap_m=gap_m)
+        site = await self._parts.grounds.site(where, form)
         photographs, linked, film = await self._decode(query)
         count = len(photographs)
         known = [
@@ -57,17 +43,16 @@ class SequenceSearch:
             for index, photograph in enumerate(photographs)
         ]
         await site.wait(context)
-        heights = heights_of(form, site.height, count)
         # A sphere shows all that other photographs from its spot could add.
-        one_query = form.motion == "turn" and not any(photograph.is_sphere for photograph in photographs)
+        one_query = not any(photograph.is_sphere for photograph in photographs)
         turns = form.known_turns if linked is None else linked.turns
         if one_query and turns is not None:
-            ground, joint = await self._search_turn(query, photographs, known, turns, heights[0], site)
+            ground, joint = await self._search_turn(query, photographs, known, turns, site.height, site)
             found = localised_turn(joint, turns)
         else:
-            ground, found = await self._search_sequence(query, photographs, known, heights, site, linked)
+            ground, found = await self._search_sequence(query, photographs, known, site, linked)
             if one_query:
-                _, joint = await self._search_turn(query, photographs, known, found_turns(found), heights[0], ground)
+                _, joint = await self._search_turn(query, photographs, known, found_turns(found), site.height, ground)
                 found = judged_turn(found, joint)
         timings_ms = self._parts.executor.observe(context, found.stage)
 
@@ -97,9 +82,7 @@ class SequenceSearch:
         timings_ms: dict[str, float],
     ) -> list[LocaliseAnswer]:
         """Return the answer for each photograph; one of them has the next step."""
-        spots = _spots(photographs, found, one_spot=form.motion == "turn")
-        # Angles of a turn count from its first photograph; a walk goes on from its last.
-        with_step = 0 if form.motion == "turn" else len(photographs) - 1
+        spots = _spots(photographs, found)
         return [
             compose_answer(
                 picture,
@@ -108,7 +91,8 @@ class SequenceSearch:
                 heading,
                 timings_ms=timings_ms,
                 bundle=self._parts.bundle,
-                with_step=index == with_step,
+                # Its angles count from the first photograph.
+                with_step=index == 0,
             )
             for index, (heading, picture, spot) in enumerate(zip(known, found.pictures, spots, strict=True))
         ]
@@ -119,7 +103,7 @@ class SequenceSearch:
         if query.film is not None:
             film = await reader.film(query.film, form.stated_camera, query.context)
             return list(film.photographs), LinkedTurn.of(film.angles), film
-        if form.motion == "walk" or form.relative_heading_deg is not None:
+        if form.relative_heading_deg is not None:
             return await reader.decode(query.contents, form.stated_camera, query.context), None, None
         photographs, angles = await reader.decode_turn(query.contents, form.stated_camera, query.context)
         return photographs, None if angles is None else LinkedTurn.of(angles), None
@@ -129,14 +113,13 @@ class SequenceSearch:
         query: SequenceQuery,
         photographs: Sequence[Photograph],
         known: Sequence[KnownHeading],
-        heights: Sequence[CameraHeight],
         site: Site,
         linked: LinkedTurn | None,
     ) -> tuple[Ground, SequenceLocalisation]:
         """Search the places of photographs that are linked by motions, or by overlap; return the ground, too."""
         form, context = query.form, query.context
         encoded = await self._parts.reader.encode(
-            [Spot(photograph) for photograph in photographs], known, heights, context
+            [Spot(photograph) for photograph in photographs], known, [site.height] * len(photographs), context
         )
         ground = await site.ground(encoded, context)
         order = range(len(encoded)) if linked is None else linked.order
@@ -189,15 +172,8 @@ class SequenceSearch:
         return ground, await self._parts.executor.run_search(steps, context)
 
 
-def _reach_m(motion: Motion) -> float:
-    """Return the distance that a measured motion hardly exceeds."""
-    return 0.0 if motion.distance_m is None else motion.distance_m + _REACH_STD * motion.distance_std_m
-
-
-def _spots(photographs: Sequence[Photograph], found: SequenceLocalisation, *, one_spot: bool) -> list[Spot]:
-    """Return each photograph of a sequence, together with all others from its spot."""
-    if not one_spot:
-        return [Spot(photograph) for photograph in photographs]
+def _spots(photographs: Sequence[Photograph], found: SequenceLocalisation) -> list[Spot]:
+    """Return each photograph, together with all others from its spot."""
     headings = [photograph_heading(picture.query, picture.candidates[0]) for picture in found.pictures]
     return [
         Spot(
@@ -247,7 +223,7 @@ def _with_relative_headings(
 
 def _angle_warnings(photographs: Sequence[Photograph], form: SequenceForm, linked: LinkedTurn | None) -> list[str]:
     """Return warnings about angles of a turn that were searched."""
-    if form.motion == "walk" or form.relative_heading_deg is not None:
+    if form.relative_heading_deg is not None:
         return []
     if linked is not None:
         return linked.warnings(min(photograph.hfov.value for photograph in photographs))

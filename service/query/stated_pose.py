@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lalaloc_core.errors import InvalidHintError, InvalidPoseError
+from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Hints, Near, rooms_named, stated_pose
+from lalaloc_core.localise.query import CameraHeight, Hints, Near, rooms_named, stated_pose
 from service.grids import check_height_m
-from service.schemas import SequenceForm, SessionDocument
+from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HeightFields, HintFields, PlanPoint
 from service.storage.records import PlanRecord
 
@@ -18,22 +18,6 @@ def stated_height(form: HeightFields, record: PlanRecord) -> CameraHeight:
     if form.camera_height_m is not None:
         check_height_m(record, form.camera_height_m)
     return stated_pose.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
-
-
-def heights_of(form: SequenceForm, common: CameraHeight, photographs: int) -> list[CameraHeight]:
-    """Return the camera height of each photograph of a sequence, `common` where the request states none."""
-    if form.camera_heights_m is None:
-        return photographs * [common]
-    if common.is_unknown:
-        known_m = [height_m for height_m in form.camera_heights_m if height_m is not None]
-        if len(known_m) < photographs:
-            raise InvalidPoseError(
-                "camera_heights_m has null, and no camera height of the plan is known: give all heights, or "
-                "camera_height_m"
-            )
-        std_m = DEFAULT_STD_M if form.camera_height_std_m is None else form.camera_height_std_m
-        common = CameraHeight(known_m[0], std_m)
-    return [common if height_m is None else common.at(height_m) for height_m in form.camera_heights_m]
 
 
 def stated_hints(form: HintFields | SessionDocument, plan: FloorPlan) -> Hints:

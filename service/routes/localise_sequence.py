@@ -1,4 +1,4 @@
-"""Queries with several photographs of one visit."""
+"""Queries with several photographs, or a film, of one turn."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
-from lalaloc_core.errors import InvalidFilmError, InvalidMotionError
+from lalaloc_core.errors import InvalidFilmError
 from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
 from service.http.accept import preferred
 from service.http.multipart import Parts, Repeats
@@ -25,7 +25,7 @@ _MIN_PHOTOGRAPHS = 2
 _FILM_SCHEMA = {
     "type": "string",
     "format": "binary",
-    "description": f"Instead of `{PHOTO}`, for `motion=turn`: a film of one slow turn, once around on the spot: MP4, "
+    "description": f"Instead of `{PHOTO}`: a film of one slow turn, once around on the spot: MP4, "
     "MOV or WebM with H.264, HEVC, VP8 or VP9. Limits: `max_film_bytes`, `max_film_s`, `max_film_pixels`, "
     "`max_film_cpu_s`. "
     "Sharp frames at equal angles become poses.",
@@ -46,7 +46,7 @@ _ON_EARTH = {GEOJSON: geojson_features, GEOPOSE: geopose_documents}
 
 @router.post(
     "/localise/sequence",
-    summary="Localise several photographs of one visit",
+    summary="Localise several photographs from one spot, or a film",
     response_model=SequenceAnswer,
     openapi_extra=body_schema(SequenceForm, _PHOTOS_SCHEMA, film=_FILM_SCHEMA),
     responses={
@@ -57,20 +57,17 @@ _ON_EARTH = {GEOJSON: geojson_features, GEOPOSE: geopose_documents}
             }
         }
     }
-    | problem_responses(
-        InvalidMotionError, InvalidFilmError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS
-    ),
+    | problem_responses(InvalidFilmError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
 )
 async def localise_sequence(call: Call) -> Response:
-    """Localise several photographs of one visit together in a stored floor plan, or in the plans of a venue.
+    """Localise photographs that were taken while turning on one spot in a stored floor plan, or in a venue.
 
-    Measured motions between them resolve places that look alike. Photographs that were taken while turning on one spot
-    (`motion=turn`) are together as certain as one with a wider field of view; their angles follow from their overlap,
-    and a `film` of the turn can be sent instead of them. In a venue, every pose has its `floorplan_id` and `level`.
-    With `Accept: application/geo+json` the answer is a GeoJSON FeatureCollection, one Feature per photograph, with
-    `Accept: application/geopose+json` an array of GeoPoses (Basic-Quaternion), for plans and venues with an `anchor`.
-    The query waits for a plan that is still preparing. If pose refinement (`lpo`) is not done in time, the answer falls
-    back to the best path on the pose grid, with `"stage": "retrieval"`.
+    They are together as certain as one with a wider field of view. Their angles follow from their overlap, and a `film`
+    of the turn can be sent instead of them. Photographs of a walk go to a session or an album. In a venue, every pose
+    has its `floorplan_id` and `level`. With `Accept: application/geo+json` the answer is a GeoJSON FeatureCollection,
+    one Feature per photograph, with `Accept: application/geopose+json` an array of GeoPoses (Basic-Quaternion), for
+    plans and venues with an `anchor`. The query waits for a plan that is still preparing. If pose refinement (`lpo`) is
+    not done in time, the answer falls back to the best pose of the grid, with `"stage": "retrieval"`.
     """
     media = preferred(call.request, (JSON, *_ON_EARTH))
     idempotent = call.idempotent(media)

@@ -189,8 +189,7 @@ class ViewAnswer(ReadView):
         default=None,
         description="The single step with the highest expected confidence, by the posterior and the model's measured "
         "errors. Null where the confidence is null, or 0.5 or more, where no step raises it by 0.02, where the "
-        "photograph is probably of no place of the plan, and for all but the first photograph of a turn and the last "
-        "of a walk.",
+        "photograph is probably of no place of the plan, and for all but the first photograph of a turn.",
     )
     room_types: dict[str, Share] | None = Field(
         description="Probability of each type of room, the most probable first, by recognised objects; types "

@@ -1,4 +1,4 @@
-"""Form fields and answer of a query with several photographs of one visit."""
+"""Form fields and answer of a query with several photographs, or a film, of one turn."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import math
 from dataclasses import replace
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
-from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.measured_motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
+from lalaloc_core.localise.sequence.measured_motion import MIN_ANGLE_STD
 from lalaloc_core.localise.sequence.turn_localisation import EXACT, ON_THE_SPOT
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.form_validators import needs, parse_json, reject_underscores
@@ -21,60 +21,10 @@ from service.schemas.query_fields import CameraFields, PlaceFields
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
 AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
-_UNKNOWN = Motion()
-
-
-class StatedMotion(BaseModel):
-    """Measured motion from one photograph to the next; leave out what was not measured."""
-
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        json_schema_extra={"example": {"distance_m": 2.4, "distance_std_m": 0.12, "turn_deg": 35, "turn_std_deg": 2}},
-    )
-
-    distance_m: Annotated[float, Finite] | None = Field(
-        None, ge=0, le=MAX_DISTANCE_M, description="Straight-line distance between the two places."
-    )
-    distance_std_m: Annotated[float, Finite] = Field(
-        _UNKNOWN.distance_std_m,
-        ge=MIN_DISTANCE_STD_M,
-        le=MAX_DISTANCE_M,
-        description="Standard deviation of `distance_m`.",
-    )
-    turn_deg: Angle | None = Field(
-        None, description="Heading of the second photograph minus that of the first, clockwise seen from above."
-    )
-    turn_std_deg: AngleStd = Field(
-        round(math.degrees(_UNKNOWN.turn_std), 6), description="Standard deviation of `turn_deg`."
-    )
-    direction_deg: Angle | None = Field(
-        None,
-        description="Azimuth from the first place to the second minus the heading of the first photograph. Needs "
-        "`distance_m`.",
-    )
-    direction_std_deg: AngleStd = Field(
-        round(math.degrees(_UNKNOWN.direction_std), 6), description="Standard deviation of `direction_deg`."
-    )
-
-    @field_validator("direction_deg")
-    @classmethod
-    def _check_direction(cls, value: float | None, given: ValidationInfo) -> float | None:
-        if value is not None and given.data.get("distance_m", 0.0) is None:
-            raise ValueError("needs distance_m")
-        return value
-
-    @property
-    def motion(self) -> Motion:
-        """The motion for the core, in radians."""
-        return Motion(
-            distance_m=self.distance_m,
-            distance_std_m=self.distance_std_m,
-            turn=None if self.turn_deg is None else math.radians(self.turn_deg),
-            turn_std=math.radians(self.turn_std_deg),
-            direction=None if self.direction_deg is None else math.radians(self.direction_deg),
-            direction_std=math.radians(self.direction_std_deg),
-        )
+_WALK = (
+    "photographs of a walk are no query of their own: send them to a session (POST /sessions), or to an album "
+    "(POST /albums); photographs from one spot need motion=turn"
+)
 
 
 class StatedHeading(BaseModel):
@@ -84,44 +34,22 @@ class StatedHeading(BaseModel):
     heading_tolerance_deg: float
 
 
-# Fields that do not go with a value of `motion`, and the message about them.
-_WRONG_MOTION = {
-    "camera_heights_m": ("turn", "does not go with motion=turn; send camera_height_m"),
-    "relative_heading_deg": ("walk", "needs motion=turn"),
-    "motions": ("turn", "does not go with motion=turn; send relative_heading_deg"),
-}
-
-
 class SequenceForm(PlaceFields, CameraFields, PhotographFields):
-    """Form fields of a query with several photographs; an empty field counts as left out.
+    """Form fields of a query with several photographs from one spot; an empty field counts as left out.
 
     The fields about the camera hold for all photographs.
     """
 
-    venue_id: str | None = Field(
-        None,
-        min_length=1,
-        description="Id of a venue, to search all its plans. A measured motion links places of one plan.",
-    )
-    motion: Literal["walk", "turn"] = Field(
-        "walk",
-        description="`walk`: each photograph has a place of its own, see `motions`. `turn`: all were taken from one "
-        "spot, see `relative_heading_deg`.",
-    )
+    motion: Literal["turn"] = Field(description="All photographs were taken from one spot.")
     relative_heading_deg: list[Angle | None] | None = Field(
         None,
-        description="For `turn`: headings of all photographs relative to each other, clockwise seen from above, as a "
+        description="Headings of all photographs relative to each other, clockwise seen from above, as a "
         "JSON array with one angle per photograph, such as `[0, 26, 51]` by a gyroscope. Without the list, they follow "
         "from what the photographs show twice: turn by at most half the field of view from one to the next. Null, and "
         "photographs that overlap no other: searched.",
     )
     relative_heading_std_deg: AngleStd = Field(
         2.0, description="Standard deviation of the angle between two photographs by `relative_heading_deg`."
-    )
-    motions: list[StatedMotion | None] | None = Field(
-        None,
-        description="Motions between successive photographs as a JSON array, one fewer than photographs; null for a "
-        "motion that was not measured. Without motions, the photographs share the plan and the camera height only.",
     )
     headings_deg: list[Angle | None] | None = Field(
         None,
@@ -131,65 +59,57 @@ class SequenceForm(PlaceFields, CameraFields, PhotographFields):
     heading_tolerance_deg: Annotated[float, Finite] = Field(
         0.0, ge=0, le=45, description="Tolerance of `headings_deg`. Needs `headings_deg`."
     )
-    camera_heights_m: list[Annotated[float, Finite, Field(ge=MIN_CAMERA_HEIGHT_M)] | None] | None = Field(
-        None,
-        description="Camera heights of all photographs as a JSON array, null for the common one (`camera_height_m`, "
-        "else the plan's). The photographs share one relative error; `camera_height_std_m` is that of the common "
-        "height.",
-    )
+    # Fields of walks in earlier versions, which are refused.
+    motions: SkipJsonSchema[str | None] = None
+    camera_heights_m: SkipJsonSchema[str | None] = None
     refine: Literal["none", "lpo"] = Field(
         "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
     )
 
-    _parse_lists = field_validator(
-        "motions", "headings_deg", "relative_heading_deg", "camera_heights_m", mode="before"
-    )(parse_json("a JSON array", list))
+    _parse_lists = field_validator("headings_deg", "relative_heading_deg", mode="before")(
+        parse_json("a JSON array", list)
+    )
     _check_numbers = field_validator("heading_tolerance_deg", "relative_heading_std_deg", mode="before")(
         reject_underscores
     )
     _check_tolerance = field_validator("heading_tolerance_deg")(needs("headings_deg"))
 
-    @field_validator(*_WRONG_MOTION)
+    @model_validator(mode="before")
     @classmethod
-    def _check_motion(cls, value: object, given: ValidationInfo) -> object:
-        motion, fault = _WRONG_MOTION[given.field_name or ""]
-        if value is not None and given.data.get("motion") == motion:
-            raise ValueError(fault)
+    def _without_motion(cls, fields: dict[str, object]) -> dict[str, object]:
+        # The default of earlier versions.
+        return {"motion": "walk"} | fields
+
+    @field_validator("motion", "motions", "camera_heights_m", mode="before")
+    @classmethod
+    def _refuse_walk(cls, value: object, given: ValidationInfo) -> object:
+        if given.field_name != "motion" or value == "walk":
+            raise ValueError(_WALK)
         return value
 
     def faults(self, photographs: int) -> list[tuple[str, str]]:
         """Return (field, message) for fields that do not fit the number of photographs."""
-        wanted = {
-            "motions": (self.motions, photographs - 1),
-            "headings_deg": (self.headings_deg, photographs),
-            "camera_heights_m": (self.camera_heights_m, photographs),
-            "relative_heading_deg": (self.relative_heading_deg, photographs),
-        }
+        wanted = {"headings_deg": self.headings_deg, "relative_heading_deg": self.relative_heading_deg}
         return [
-            (name, f"has {len(given)} items, {photographs} photographs need {count}")
-            for name, (given, count) in wanted.items()
-            if given is not None and len(given) != count
+            (name, f"has {len(given)} items, {photographs} photographs need {photographs}")
+            for name, given in wanted.items()
+            if given is not None and len(given) != photographs
         ]
 
     def film_faults(self) -> list[tuple[str, str]]:
         """Return (field, message) for fields that do not go with a film."""
-        faults = [] if self.motion == "turn" else [("motion", "is 'walk'; a film needs motion=turn")]
-        names = ("relative_heading_deg", "headings_deg")
-        given = [name for name in names if getattr(self, name) is not None]
-        return faults + [(name, "does not go with a film, whose frames are chosen by the service") for name in given]
+        given = [name for name in ("relative_heading_deg", "headings_deg") if getattr(self, name) is not None]
+        return [(name, "does not go with a film, whose frames are chosen by the service") for name in given]
 
     def steps(self, photographs: int) -> list[Motion]:
-        """Return the motions between the photographs, unknown ones included."""
-        if self.motion == "turn":
-            relative = self.relative_heading_deg or [None] * photographs
-            return [self._turn(*pair) for pair in itertools.pairwise(relative)]
-        given = self.motions or [None] * (photographs - 1)
-        return [_UNKNOWN if motion is None else motion.motion for motion in given]
+        """Return the motions between the photographs."""
+        relative = self.relative_heading_deg or [None] * photographs
+        return [self._turn(*pair) for pair in itertools.pairwise(relative)]
 
     @property
     def known_turns(self) -> list[float] | None:
         """Headings (radians) minus that of the first photograph; None unless all are known well enough to be exact."""
-        given = [] if self.motion == "walk" else self.relative_heading_deg or []
+        given = self.relative_heading_deg or []
         known = [angle for angle in given if angle is not None]
         if not known or len(known) < len(given) or math.radians(self.relative_heading_std_deg) > EXACT:
             return None
@@ -256,20 +176,18 @@ class FilmAnswer(ResponseModel):
 
 
 class SequenceAnswer(ResponseModel):
-    """Poses of the photographs of one visit."""
+    """Poses of the photographs of one turn."""
 
     floorplan_id: str = Field(description="Plan of the first pose.")
     floorplan_revision: str = Field(description="Revision of that plan.")
     venue_id: str | None = Field(default=None, description="Venue in the request; null for a query about one plan.")
     poses: list[SequencePoseAnswer] = Field(description="Poses, one per photograph, in the order sent.")
     confidence: Share | None = Field(
-        description="Probability that all positions are right within 1 m: the probability of the path among all paths, "
-        "times the lowest probability that a photograph shows this plan. Null for a model without confidence."
+        description="Probability that the position is right within 1 m. Null for a model without confidence."
     )
     warnings: list[str] = Field(
-        description="Motions in the request that were ignored, because the photographs contradict them, photographs of "
-        "a turn that do not overlap, plans of a venue that were not searched, and warnings about photographs, such as "
-        "`photo[0]: …`."
+        description="Photographs that do not overlap, plans of a venue that were not searched, and warnings about "
+        "photographs, such as `photo[0]: …`."
     )
     film: FilmAnswer | None = Field(default=None, description="Reading of the film; null for photographs.")
     stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")

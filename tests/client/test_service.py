@@ -231,27 +231,20 @@ def test_readiness(service: Any, app: httpx.Client) -> None:
 
 def test_sequence_is_one_query(service: Any, app: httpx.Client, panorama: bytes) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
-    motions = [{"distance_m": 1.5, "distance_std_m": 0.2, "turn_deg": 20.0}]
     answer = service.localise_sequence(
-        plan_id, [panorama, panorama], motions=motions, headings_deg=[90.0, None], refine="none", top_k=2
+        plan_id, [panorama, panorama], motion="turn", headings_deg=[90.0, None], refine="none", top_k=2
     )
     document = app.post(
         "/localise/sequence",
-        data={
-            "floorplan_id": plan_id,
-            "motions": json.dumps(motions),
-            "headings_deg": "[90, null]",
-            "refine": "none",
-            "top_k": "2",
-        },
+        data={"floorplan_id": plan_id, "motion": "turn", "headings_deg": "[90, null]", "refine": "none", "top_k": "2"},
         files=[("panorama", panorama), ("panorama", panorama)],
     ).json()
     assert len(answer.poses) == 2
     assert json.loads(json.dumps(dataclasses.asdict(answer))) == document | {"timings_ms": dict(answer.timings_ms)}
-    with pytest.raises(InvalidError, match="motions"):
-        service.localise_sequence(plan_id, [panorama, panorama], motions=[])
+    with pytest.raises(InvalidError, match="to a session"):
+        service.localise_sequence(plan_id, [panorama, panorama])
     with pytest.raises(ValueError, match=r"headings_deg\[0\] is nan"):
-        service.localise_sequence(plan_id, [panorama, panorama], headings_deg=[float("nan"), None])
+        service.localise_sequence(plan_id, [panorama, panorama], motion="turn", headings_deg=[float("nan"), None])
 
 
 def test_options_are_sent(service: Any, panorama: bytes) -> None:

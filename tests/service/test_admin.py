@@ -323,7 +323,7 @@ def test_every_refusal_says_what_to_do_and_has_an_entry(
         held = {name: bearer(key["key"]) for name, key in keys.items()}
         client.get("/limits", headers=held["slow"])
         photo: dict[str, Any] = {"data": plan, "files": {"photo": b"\xff\xd8\xff"}}
-        photos = photo | {"files": 2 * [("photo", b"\xff\xd8\xff")]}
+        photos = {"data": plan | {"motion": "turn"}, "files": 2 * [("photo", b"\xff\xd8\xff")]}
         unknown = f"lalaloc_{'0' * 32}_{'x' * 43}"
         table: list[tuple[str, str, dict[str, str], dict[str, Any], int, str, list[str]]] = [
             ("GET", "/limits", {"Authorization": ""}, {}, 401, "unauthenticated", ["Bearer lalaloc_"]),

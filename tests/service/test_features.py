@@ -124,7 +124,7 @@ def test_known_heading_finds_the_place_of_the_photograph(client: httpx.Client, h
 def test_sequences_venues_and_sessions_take_features(client: httpx.Client, home: str, device: Device) -> None:
     features = [device.features(photograph) for photograph in (KITCHEN, PHONE)]
     answers = [
-        ask(client, name, *contents, path="/localise/sequence", floorplan_id=home).json()
+        ask(client, name, *contents, path="/localise/sequence", floorplan_id=home, motion="turn").json()
         for name, contents in (("photo", (KITCHEN, PHONE)), ("features", features))
     ]
     assert same(*answers)
@@ -239,7 +239,7 @@ def test_service_can_refuse_photographs(start_app: StartApp, tmp_path: Path, dev
         refused = [
             ask(client, "photo", PHONE, floorplan_id=home),
             ask(client, "panorama", KITCHEN + bytes(MAX_BYTES), floorplan_id=home),
-            ask(client, "photo", KITCHEN, PHONE, path="/localise/sequence", floorplan_id=home),
+            ask(client, "photo", KITCHEN, PHONE, path="/localise/sequence", floorplan_id=home, motion="turn"),
             client.post(f"/sessions/{session}/photographs", files={"photo": PHONE}),
         ]
         for answer in refused:
@@ -266,7 +266,8 @@ def test_nothing_of_a_photograph_remains(
         keyed = {"Idempotency-Key": "one"}
         for photo in (photograph, photograph[:-20_000], mark + photograph):
             service.client.post("/localise", data=fields, files={"photo": photo}, headers=keyed)
-        sequence = service.client.post("/localise/sequence", data={"floorplan_id": plan_id}, files=_two(photograph))
+        turn = {"floorplan_id": plan_id, "motion": "turn"}
+        sequence = service.client.post("/localise/sequence", data=turn, files=_two(photograph))
         assert sequence.status_code == 200, sequence.text
         session = service.client.post("/sessions", json={"floorplan_id": plan_id}).json()["id"]
         tracked = service.client.post(f"/sessions/{session}/photographs", files={"photo": photograph})

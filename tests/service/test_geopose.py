@@ -224,7 +224,7 @@ def test_answer_as_a_geopose(client: httpx.Client, panorama: bytes) -> None:
 
 def test_sequence_as_geoposes(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields, files = {"floorplan_id": plan_id, "refine": "none"}, [("photo", panorama)] * 2
+    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("photo", panorama)] * 2
     poses = client.post("/localise/sequence", data=fields, files=files).json()["poses"]
     response = client.post("/localise/sequence", data=fields, files=files, headers=AS_GEOPOSE)
     assert response.headers["content-type"] == "application/geopose+json"
@@ -295,7 +295,7 @@ def test_unanchored_venue_has_no_geopose(client: httpx.Client, panorama: bytes) 
 
 def test_sequence_is_a_feature_collection(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields, files = {"floorplan_id": plan_id, "refine": "none"}, [("panorama", panorama)] * 2
+    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("panorama", panorama)] * 2
     answer = client.post("/localise/sequence", data=fields, files=files).json()
     headers = {"Accept": "application/geo+json"}
     response = client.post("/localise/sequence", data=fields, files=files, headers=headers)

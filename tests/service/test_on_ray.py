@@ -91,7 +91,7 @@ def test_ray_answers_like_one_process(
 @pytest.mark.slow
 def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
     files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
-    sequence = on_ray.post("/localise/sequence", data={"floorplan_id": plan_id}, files=files)
+    sequence = on_ray.post("/localise/sequence", data={"floorplan_id": plan_id, "motion": "turn"}, files=files)
     assert sequence.status_code == 200, sequence.text
     venue = on_ray.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 1}]}).json()["id"]
     found = on_ray.post("/localise", data={"venue_id": venue}, files=files[:1])
@@ -129,7 +129,7 @@ def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panora
     files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
 
     def ask() -> httpx.Response:
-        return on_ray.post("/localise/sequence", data={"floorplan_id": plan_id}, files=files)
+        return on_ray.post("/localise/sequence", data={"floorplan_id": plan_id, "motion": "turn"}, files=files)
 
     assert ask().status_code == 200
     wait_for(lambda: ask().json()["stage"] == "lpo", timeout_s=120.0)

@@ -60,7 +60,8 @@ def test_query_reaches_each_stage(
 
 def test_sequence_ends_at_retrieval(client: httpx.Client, panorama: bytes) -> None:
     files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
-    response = client.post("/localise/sequence", data={"floorplan_id": upload(client)}, files=files)
+    fields = {"floorplan_id": upload(client), "motion": "turn"}
+    response = client.post("/localise/sequence", data=fields, files=files)
     assert response.status_code == 200, response.text
     assert response.json()["stage"] == "retrieval"
     assert len(response.json()["poses"]) == 2

@@ -71,7 +71,7 @@ def test_fault_in_a_batch_leaves_other_photographs_their_answers(
 @pytest.mark.parametrize("fault", SOME)
 def test_fault_in_a_sequence_is_named_with_its_photograph(shipped: httpx.Client, home: str, fault: Fault) -> None:
     fields = {name: value for name, value in data_of(fault, home).items() if name in ("floorplan_id", "intrinsics")}
-    response = shipped.post("/localise/sequence", data=fields, files=two_files(fault))
+    response = shipped.post("/localise/sequence", data=fields | {"motion": "turn"}, files=two_files(fault))
     if not fault.is_usable:
         detail = assert_problem(response, 422, "invalid-panorama")["detail"]
         fault.check_refusal(detail)
@@ -112,7 +112,7 @@ def test_damaged_photograph_is_used_with_a_warning_at_the_top(client: httpx.Clie
 
 
 def test_warnings_about_photographs_of_a_sequence_name_them(client: httpx.Client, flat: str) -> None:
-    answer = ask(client, flat, KITCHEN, KITCHEN[:-2], path="/localise/sequence").json()
+    answer = ask(client, flat, KITCHEN, KITCHEN[:-2], path="/localise/sequence", motion="turn").json()
     text = "the file ends before its picture does: the missing part is grey; send the whole file"
     assert f"photo[1]: {text}" in answer["warnings"]
     assert text in answer["poses"][1]["warnings"]

@@ -234,7 +234,7 @@ class TestTurn:
         [
             ({"relative_heading_deg": "[0, 60]"}, "relative_heading_deg", "has 2 items, 3 photographs need 3"),
             ({"motion": "walk", "relative_heading_deg": "[0, 1, 2]"}, "relative_heading_deg", "needs motion=turn"),
-            ({"motions": "[null, null]"}, "motions", "does not go with motion=turn"),
+            ({"motions": "[null, null]"}, "motions", "of a walk"),
             ({"motion": "fly"}, "motion", "'walk' or 'turn'"),
         ],
     )

@@ -138,7 +138,7 @@ class Guarded:
         elif path in ("/localise", "/localise/batch"):
             body = form
         elif path == "/localise/sequence":
-            body = {"data": {PLAN: plan_id}, "files": [("panorama", picture)] * 2}
+            body = {"data": {PLAN: plan_id, "motion": "turn"}, "files": [("panorama", picture)] * 2}
         elif path.startswith("/venues"):
             body = {"json": {"name": "12 Mill Lane"}}
         elif method in ("POST", "PUT"):

@@ -172,8 +172,6 @@ def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -
     desktop.find()
     page.locator("#copy-python").click()
     expect(page.locator("#copied")).to_contain_text("headings_deg=[None,None,40]")
-    together.get_by_label("A walk").check()
-    expect(page.locator("#find")).to_have_text("Find the places")
 
 
 def test_statements_about_the_camera_are_sent(desktop: Visit, tmp_path: Path) -> None:

@@ -144,10 +144,10 @@ def test_photographs_of_a_visit_are_one_query_in_a_venue(browser: Browser, start
             page = visited.open()
             _choose_mill(page)
             page.locator("#photo-file").set_input_files([EXAMPLES / "kitchen.jpg", EXAMPLES / "study.jpg"])
-            page.get_by_label("A walk").check()
+            page.get_by_label("Taken from one spot, turning").check()
             expect(page.locator("#hints")).to_be_hidden()
             with page.expect_response("**/localise/sequence") as received:
-                page.get_by_role("button", name="Find the places").click()
+                visited.find()
             expect(page.locator("#answer-body")).to_contain_text("From 2 photographs together")
             poses = received.value.json()["poses"]
             # Each photograph shows the plan of its pose.
@@ -160,11 +160,8 @@ def test_photographs_of_a_visit_are_one_query_in_a_venue(browser: Browser, start
             _assert_accessible(page)
             assert {"venue_id", "motion"} <= _asked(page).keys()
             assert re.search(
-                r'localise_sequence\(None, \["kitchen.jpg", .*venue_id=".*motion="walk"', _copied(page, "#copy-python")
+                r'localise_sequence\(None, \["kitchen.jpg", .*venue_id=".*motion="turn"', _copied(page, "#copy-python")
             )
-            page.get_by_label("Taken from one spot, turning").check()
-            visited.find()
-            expect(page.locator("#answer-body")).to_contain_text("From 2 photographs together")
 
 
 def test_venue_is_created_and_searched(browser: Browser, start_app: StartApp, tmp_path) -> None:

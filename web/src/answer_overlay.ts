@@ -56,7 +56,7 @@ export function otherPlaces(answer: Answer, planId: string, box: Box, select: (i
   );
 }
 
-/** Draw the places of the other photographs in a plan, and the path of a walk; a click calls `choose`. */
+/** Draw the places of the other photographs in a plan; a click calls `choose`. */
 export function companions(
   photos: readonly Photo[],
   current: Photo | null,
@@ -70,13 +70,9 @@ export function companions(
       ? []
       : [{ photo, answer: photo.answer, number: index + 1 }],
   );
-  const track = asked
-    .map(({ answer: { position } }, index) => `${index === 0 ? "M" : "L"}${position.x_m} ${-position.y_m}`)
-    .join("");
   return s(
     "g",
     { class: "companions" },
-    current?.answer?.together?.motion === "walk" && s("path", { class: "track", d: track }),
     ...asked
       .filter(({ photo }) => photo !== current)
       .map(({ photo, answer, number }) => {

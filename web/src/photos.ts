@@ -87,7 +87,7 @@ export class Photos {
     const motion = this.choice.hidden
       ? ""
       : (this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "");
-    return motion === "turn" || motion === "walk" ? { motion, photos: this.all } : null;
+    return motion === "turn" ? { motion, photos: this.all } : null;
   }
 
   /** Add pictures and choose the first of them; those of examples give way to the user's own. */
@@ -230,7 +230,6 @@ export class Photos {
     this.choice.hidden = this.all.length < 2;
     const group = this.group;
     byId("find-all").hidden = this.all.length < 2 || group !== null;
-    byId("find").textContent = group?.motion === "walk" ? "Find the places" : "Find the place";
     show(
       this.strip,
       ...this.all.map((photo) => {

@@ -51,8 +51,7 @@ export async function askTogether(place: Place, { motion, photos }: Group, signa
   const ask = (more: Record<string, string>): Promise<SequenceAnswer> =>
     device.send(files, { ...fields, ...more }, (pictures, own) => api.localiseSequence(own, pictures, { signal }));
   const directions = photos.map(({ direction }) => direction),
-    told =
-      motion === "turn" && !directions.includes(null) ? { relative_heading_deg: JSON.stringify(directions) } : null;
+    told = !directions.includes(null) ? { relative_heading_deg: JSON.stringify(directions) } : null;
   // Features do not overlap. Photographs tell angles and field of view better than a gyroscope, where they overlap.
   let found = await ask(told !== null && onDevice ? told : {});
   const [first] = found.poses,

@@ -46,7 +46,7 @@ export interface Pose {
 
 /** Photographs that were localised together, and the probability that all of their places are right. */
 export interface Together {
-  motion: "turn" | "walk";
+  motion: "turn";
   photographs: number;
   confidence: number | null;
 }
