@@ -101,8 +101,9 @@ class TestExport:
     def test_empty_batch_gives_no_latents(self, encoders: PhotographEncoder) -> None:
         assert encoders.layouts(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
 
-    def test_exported_files_name_no_local_paths(self, tiny_bundle: Path) -> None:
-        for path in tiny_bundle.iterdir():
+    @pytest.mark.slow
+    def test_exported_files_name_no_local_paths(self, tiny_run: Path) -> None:
+        for path in (tiny_run / "bundle").iterdir():
             content = path.read_bytes()
             assert b"site-packages" not in content, path.name
             assert b"/lalaloc_core/" not in content, path.name
@@ -113,14 +114,16 @@ class TestExport:
         assert large
         assert {t.data_type for t in large} == {onnx.TensorProto.FLOAT16}
 
-    def test_decoder_round_trip(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
-        weights = Checkpoint.load(tiny_bundle.parent / "layout.pt", stage="layout").inference_weights["decoder"]
-        expected = LayoutDecoder(opened_bundle.manifest.latent_size).eval()
+    @pytest.mark.slow
+    def test_decoder_round_trip(self, tiny_run: Path) -> None:
+        bundle = Bundle.open(tiny_run / "bundle")
+        weights = Checkpoint.load(tiny_run / "layout.pt", stage="layout").inference_weights["decoder"]
+        expected = LayoutDecoder(bundle.manifest.latent_size).eval()
         expected.load_state_dict(weights)
-        latent = torch.nn.functional.normalize(torch.randn(3, opened_bundle.manifest.latent_size), dim=1)
+        latent = torch.nn.functional.normalize(torch.randn(3, bundle.manifest.latent_size), dim=1)
         # Half precision has about three digits.
-        torch.testing.assert_close(load_decoder(opened_bundle)(latent), expected(latent), rtol=2e-2, atol=2e-2)
-        stored = safetensors.torch.load(opened_bundle.read(DECODER_WEIGHTS))
+        torch.testing.assert_close(load_decoder(bundle)(latent), expected(latent), rtol=2e-2, atol=2e-2)
+        stored = safetensors.torch.load(bundle.read(DECODER_WEIGHTS))
         assert stored["expand.weight"].dtype == torch.float16
 
     @pytest.mark.slow

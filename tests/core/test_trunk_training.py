@@ -458,9 +458,9 @@ class TestBest:
         assert self.best_of(tmp_path, 0.1, 0.2).step == 2
 
     @pytest.mark.slow
-    def test_export_uses_the_best_or_the_last(self, tiny_bundle: Path, tmp_path: Path) -> None:
+    def test_export_uses_the_best_or_the_last(self, tiny_run: Path, tmp_path: Path) -> None:
         run = tmp_path / "run"
-        shutil.copytree(tiny_bundle.parent, run, ignore=shutil.ignore_patterns("bundle"))
+        shutil.copytree(tiny_run, run, ignore=shutil.ignore_patterns("bundle"))
         last = Checkpoint.load(run / "image.pt")
         last.step -= 3
         last.save(run / "image.best.pt")
