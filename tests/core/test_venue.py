@@ -635,6 +635,12 @@ def test_most_probable_plans_are_searched_within_limits() -> None:
     assert most_probable(log_mass, poses, max_plans=4, max_poses=1000).tolist() == [1, 3]
 
 
+def test_copies_of_a_plan_are_chosen_in_their_order() -> None:
+    rounding = np.array([0.0, 1e-9, -1e-9, 2e-9])
+    for log_mass in (-1.0 + rounding, -1.0 + rounding[::-1]):
+        assert most_probable(log_mass, np.ones(4, np.int64), max_plans=2, max_poses=100).tolist() == [0, 1]
+
+
 def test_plans_left_out_keep_their_share() -> None:
     copies = np.full(10, -2.0)
     assert share_searched(copies, np.arange(10), np.full(10, 0.1)) == 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,7 +25,7 @@ from service.storage.tables import FLOORPLANS, TENANTS
 from service.venues import venue_plans
 from service.venues.plan_indices import Indexed
 from service.venues.venue_plans import VenuePlans
-from tests.service.conftest import FLAT, StartApp, upload
+from tests.service.conftest import FLAT, StartApp, upload, wait_for
 from tests.service.test_venue_queries import STUDIO, ask, venue_of
 
 MODEL, VENUE, TENANT = ("m1", 0.5), "f" * 32, "default"
@@ -170,14 +169,20 @@ def test_first_queries_share_one_index(
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
     built, build = [], PlanIndex.build
+    choosing, needs_choice = [], venue_plans.VenuePlans.needs_choice
 
     def counted(*args: Any, **options: Any) -> PlanIndex:
         built.append(1)
-        # Long enough for the other queries to arrive.
-        time.sleep(1.0)
+        # Others need the index meanwhile.
+        wait_for(lambda: len(choosing) > 1)
         return build(*args, **options)
 
+    def chosen(*args: Any) -> bool:
+        choosing.append(1)
+        return needs_choice(*args)
+
     monkeypatch.setattr(PlanIndex, "build", counted)
+    monkeypatch.setattr(venue_plans.VenuePlans, "needs_choice", chosen)
     with start_app(tmp_path, request_deadline_s=120.0) as client, ThreadPoolExecutor(4) as threads:
         venue_id = venue_of(client, *(upload(client, {**STUDIO, "name": f"{number}"}) for number in range(4)))
         answers = threads.map(lambda _: ask(client, venue_id, panorama, refine="none"), range(4))

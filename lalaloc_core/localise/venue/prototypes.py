@@ -131,9 +131,10 @@ def most_probable(
 ) -> Int[np.ndarray, "m"]:
     """Return the plans to search in full, most probable first: at least one, and none without mass.
 
-    `poses` is the number of grid poses of each plan, and `max_poses` limits their sum.
+    `poses` is the number of grid poses of each plan, and `max_poses` limits their sum. Copies of a plan keep their
+    order: their masses differ by rounding, depending on how the index was put together.
     """
-    order = np.argsort(-log_mass, kind="stable")[:max_plans]
+    order = np.argsort(-np.round(log_mass / _COPY_TOLERANCE), kind="stable")[:max_plans]
     order = order[np.isfinite(log_mass[order])]
     fits = np.cumsum(poses[order]) <= max_poses
     return order[: max(int(fits.sum()), 1)]
