@@ -31,6 +31,8 @@ _HOPELESS_STARTS = 3
 _KILL_S, _JOIN_S = 5.0, 0.2
 # A busy machine may take this many times as long as a time limit for the work that it allows.
 _PATIENCE = 4.0
+# The service has threads, which `fork` does not copy.
+_START_METHOD = "spawn"
 # Looks at a process within its time limit, and the time (s) for which it may do nothing, if the limit is shorter.
 _LOOKS, _MIN_IDLE_S = 4, 1.0
 
@@ -167,7 +169,7 @@ class Supervisor:
             process.join(_KILL_S)
 
     def _launch(self) -> tuple[Connection, BaseProcess]:
-        context = multiprocessing.get_context("spawn")
+        context = multiprocessing.get_context(_START_METHOD)
         ours, theirs = context.Pipe()
         process = context.Process(
             target=self._spec.target,

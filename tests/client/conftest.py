@@ -19,6 +19,7 @@ import pytest
 from lalaloc_client import AsyncClient, Client
 from tests.service.conftest import (
     _clean_environment,
+    _forked_workers,
     app_settings,
     database_of,
     empty_database,
@@ -30,6 +31,7 @@ from tests.service.conftest import client as app
 
 __all__ = [
     "_clean_environment",
+    "_forked_workers",
     "app",
     "app_settings",
     "database_of",

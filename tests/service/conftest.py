@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import multiprocessing
 import os
 import shutil
 import socket
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from itertools import cycle
+from multiprocessing import forkserver
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, Literal
@@ -25,6 +27,7 @@ from PIL import Image
 
 from lalaloc_core.bundle import default_bundle
 from service.app import create_app
+from service.pools import supervisor
 from service.pools.supervisor import Watchdog
 from service.settings import Settings
 from service.storage.statements import CHUNK_BYTES
@@ -66,6 +69,23 @@ def _clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def _skip_per_replica_tests(request: pytest.FixtureRequest) -> None:
     if (_REPLICAS > 1 or _DATABASE == "ray") and request.node.get_closest_marker("one_replica") is not None:
         pytest.skip("tests state of a single replica")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forked_workers() -> Iterator[None]:
+    """Fork workers from a process that has imported what they need, which takes longer than most tests.
+
+    The service spawns them, as tests do that start it as a process of its own.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["pytest", "tests.service.preloaded"])
+    with pytest.MonkeyPatch.context() as patch:
+        # As converters set it before their libraries are read.
+        patch.setenv("OPENCV_FOR_THREADS_NUM", "1")
+        forkserver.ensure_running()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(supervisor, "_START_METHOD", "forkserver")
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -14,10 +14,25 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
 
-from tests.service.conftest import _clean_environment, app_settings, database_of, empty_database, start_app
+from tests.service.conftest import (
+    _clean_environment,
+    _forked_workers,
+    app_settings,
+    database_of,
+    empty_database,
+    start_app,
+)
 from tests.service.conftest import client as service
 
-__all__ = ["_clean_environment", "app_settings", "database_of", "empty_database", "service", "start_app"]
+__all__ = [
+    "_clean_environment",
+    "_forked_workers",
+    "app_settings",
+    "database_of",
+    "empty_database",
+    "service",
+    "start_app",
+]
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DESKTOP = {"width": 1280, "height": 900}
