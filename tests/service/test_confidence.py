@@ -115,10 +115,12 @@ def confidences(answers: list[dict[str, Any]]) -> np.ndarray:
     return np.array([answer["confidence"] for answer in answers])
 
 
+@pytest.mark.slow
 def test_photograph_of_the_home_is_trusted(right: list[dict[str, Any]]) -> None:
     assert np.median(confidences(right)) > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("picture", PICTURES_OF_NO_ROOM.values(), ids=PICTURES_OF_NO_ROOM.keys())
 def test_picture_of_no_room_is_not_trusted(
     shipped: httpx.Client, homes: list[str], given: bool, picture: bytes
@@ -154,6 +156,7 @@ def test_changed_panorama_is_not_trusted(
     assert confidences(answers).mean() < 0.25
 
 
+@pytest.mark.slow
 def test_photograph_of_another_home_is_rarely_trusted(
     shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool
 ) -> None:
@@ -164,6 +167,7 @@ def test_photograph_of_another_home_is_rarely_trusted(
     assert confidences(foreign).mean() < 0.25
 
 
+@pytest.mark.slow
 def test_answer_has_a_covariance(right: list[dict[str, Any]], given: bool) -> None:
     for answer in right:
         covariance = np.array(answer["covariance_m2"])
@@ -173,6 +177,7 @@ def test_answer_has_a_covariance(right: list[dict[str, Any]], given: bool) -> No
     assert np.median([np.sqrt(np.trace(answer["covariance_m2"])) for answer in right]) < 0.5
 
 
+@pytest.mark.slow
 def test_covariance_matches_the_errors(shots: list[Shot], right: list[dict[str, Any]]) -> None:
     distances = []
     for shot, answer in zip(shots, right, strict=True):
@@ -184,6 +189,7 @@ def test_covariance_matches_the_errors(shots: list[Shot], right: list[dict[str, 
     assert 0.15 < np.median(distances) < 10.0
 
 
+@pytest.mark.slow
 def test_compass_heading_is_corrected(shipped: httpx.Client, shots: list[Shot], homes: list[str]) -> None:
     off = []
     for shot, home in list(zip(shots, homes, strict=True))[:6]:
@@ -215,6 +221,7 @@ def copies(plan: dict[str, Any]) -> dict[str, Any]:
     return {**plan, "rooms": rooms, "openings": openings}
 
 
+@pytest.mark.slow
 def test_copies_of_a_home_share_the_probability(shipped: httpx.Client, shots: list[Shot], given: bool) -> None:
     # The first room is so narrow that the grid fits its copies unequally.
     for shot in shots[:3]:
@@ -226,6 +233,7 @@ def test_copies_of_a_home_share_the_probability(shipped: httpx.Client, shots: li
         assert sum(shares) <= 1.0
 
 
+@pytest.mark.slow
 def test_contradicted_heading_is_searched_with_a_warning(
     shipped: httpx.Client, shots: list[Shot], homes: list[str]
 ) -> None:
@@ -240,6 +248,7 @@ def test_contradicted_heading_is_searched_with_a_warning(
     assert warned >= 3
 
 
+@pytest.mark.slow
 def test_right_heading_is_not_doubted(right: list[dict[str, Any]], given: bool) -> None:
     assert sum(bool(answer["warnings"]) for answer in right) <= 1
     if given:

@@ -346,8 +346,7 @@ def test_overtaken_replica_gives_way(open_store: OpenStore, make_grids: MakeGrid
     grids, record = make_grids(store, grid_lease_s=0.2), _add(store, HALL)
     key = grids.key(record.revision_id, 1.5)
     future = _begun(encoders, grids, record)
-    time.sleep(0.3)
-    assert store.leases.claim(key, "another replica", 60.0)
+    wait_for(lambda: store.leases.claim(key, "another replica", 60.0) is not None)
     encoders.go_on.set()
     wait_for(lambda: len(grids._jobs.remote()) == 1)
     assert encoders.embedded < 1521
@@ -561,8 +560,7 @@ def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make
     # An outage is not a failure of the plan.
     assert grids.compute(record, 1.6).result(30.0) is not None
     store.plans.delete("default", "p")
-    time.sleep(1.1)
-    assert _looked_up(known, "default", "p") is None
+    wait_for(lambda: _looked_up(known, "default", "p") is None)
     for opened in (store, elsewhere, without_memory):
         opened.close()
 

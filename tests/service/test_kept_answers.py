@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from time import sleep
 
 import httpx
 import pytest
@@ -11,7 +10,7 @@ from sqlalchemy import func, select
 
 from service.storage.store import Store
 from service.storage.tables import KEPT_ANSWERS
-from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload
+from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
 
 def test_answers_are_not_kept_by_default(client: httpx.Client, panorama: bytes) -> None:
@@ -37,12 +36,12 @@ def test_kept_answer_is_identical_until_deleted(start_app: StartApp, tmp_path: P
 def test_kept_answer_expires(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, keep_answers_s=0.5) as client:
         answer_id = localise(client, upload(client), panorama).json()["answer_id"]
-        sleep(0.6)
+        wait_for(lambda: client.get(f"/answers/{answer_id}").status_code == 404)
         assert_problem(client.get(f"/answers/{answer_id}"), 404, "unknown-answer")
 
 
 def test_oldest_answers_are_dropped(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
-    with start_app(tmp_path) as client:
+    with start_app(tmp_path, sweep_s=3600.0) as client:
         plan_id = upload(client)
         store = Store(database_of(tmp_path))
         ids = [store.answers.add("default", plan_id, lambda answer_id: f"text {answer_id}", limit=2) for _ in range(3)]

@@ -18,7 +18,7 @@ from sqlalchemy import select, update
 from service.storage.grid_format import pack
 from service.storage.store import Store
 from service.storage.tables import GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS
-from tests.service.conftest import OpenStore
+from tests.service.conftest import OpenStore, wait_for
 from tests.service.test_store import _add, _assert_same, _grid, _key, _put, _rows
 
 
@@ -179,8 +179,7 @@ def test_lease_is_exclusive_until_it_expires(open_store: OpenStore) -> None:
     assert not second.leases.claim(key, "two", 0.5)
     assert first.leases.renew(key, "one", 0.5, 0.25)
     assert second.leases.progress("m1", 0.5, [key.revision_id]) == {(key.revision_id, 1500): 0.25}
-    time.sleep(0.6)
-    assert second.leases.progress("m1", 0.5, [key.revision_id]) == {}
+    wait_for(lambda: second.leases.progress("m1", 0.5, [key.revision_id]) == {})
     assert second.leases.claim(key, "two", 60.0)
     assert not first.leases.renew(key, "one", 0.5, 0.5)
     first.leases.release(key, "one")
@@ -226,8 +225,7 @@ def test_missing_grids_exclude_leased_and_failed(store: Store) -> None:
         return [summary.id for summary in store.grids.missing("m1", 0.5, 10)]
 
     assert missing() == ["other height", "missing"]
-    time.sleep(1.1)
-    assert missing() == ["leased", "other height", "missing"]
+    wait_for(lambda: missing() == ["leased", "other height", "missing"])
     store.plans.clear_failures()
     assert [summary.id for summary in store.grids.missing("m1", 0.5, 2)] == ["leased", "failed"]
     assert len(store.grids.missing("m2", 0.5, 10)) == store.grids.count_unprepared("m2", 0.5) == 5

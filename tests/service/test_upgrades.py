@@ -98,7 +98,10 @@ def _rows(url: str) -> dict[str, int]:
     return counts
 
 
-@pytest.mark.parametrize(("kind", "version"), CASES)
+@pytest.mark.parametrize(
+    ("kind", "version"),
+    [pytest.param(*case, marks=[] if case == ("sqlite", VERSIONS[-1]) else [pytest.mark.slow]) for case in CASES],
+)
 def test_rows_of_a_released_version_are_kept(version: str, script: str, url: str) -> None:
     with closing(Store(url)) as store:
         counts, inserted = _rows(url), re.findall(r'^INSERT INTO "(\w+)"', script, re.MULTILINE)

@@ -138,7 +138,7 @@ def test_every_route_has_a_load() -> None:
     assert missing_routes() == []
 
 
-# The work of refused inputs is limited; `tests/core/test_plan_work.py` counts it.
+# The work of refused inputs is limited; `tests/core/test_bounded_work.py` checks it.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "load", [load for load in LOADS if not load.refusals], ids=lambda load: f"{load.routes[0]} {load.title}"

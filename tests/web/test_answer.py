@@ -55,6 +55,7 @@ def _assert_accessible(page: Page) -> None:
     assert messages == [], "\n".join(messages)
 
 
+@pytest.mark.slow
 def test_heat_map_is_as_wide_as_the_answer(desktop: Visit) -> None:
     """The pose grid of 0.5 m blurs the map by 0.2 m; an answer is more accurate."""
     reaches = desktop.open().evaluate(
@@ -164,6 +165,7 @@ def test_keyboard_alone_leads_to_an_answer(desktop: Visit) -> None:
         expect(page.locator("#heading")).to_have_value(heading)
 
 
+@pytest.mark.slow
 def test_late_layout_keeps_the_moved_marker(desktop: Visit) -> None:
     page, held = desktop.page, list[Route]()
     page.route("**/layout*", lambda route: held.append(route))
@@ -180,6 +182,7 @@ def test_late_layout_keeps_the_moved_marker(desktop: Visit) -> None:
     _expect_marker(page, x + 0.05, y)
 
 
+@pytest.mark.slow
 def test_choosing_another_plan_aborts_the_query(desktop: Visit) -> None:
     for name in ("Chosen first", "Chosen second"):
         upload(desktop.client, FLAT | {"name": name})
@@ -229,6 +232,7 @@ def _copied(page: Page, button: str) -> str:
     return page.locator("#copied").inner_text()
 
 
+@pytest.mark.slow
 def test_other_files_than_photographs_are_rejected(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
     (tmp_path / "notes.txt").write_text("no picture")
@@ -261,6 +265,7 @@ def test_dark_mode_has_enough_contrast(browser: Browser, service: httpx.Client) 
         _assert_accessible(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [{"width": 1440, "height": 900}, PHONE])
 def test_answer_is_visible_without_scrolling(browser: Browser, service: httpx.Client, size: dict[str, int]) -> None:
     for visited in visit(browser, service, viewport=size):
@@ -274,6 +279,7 @@ def test_answer_is_visible_without_scrolling(browser: Browser, service: httpx.Cl
         expect(page.locator("#compass-place")).to_contain_text(re.compile(r"found \d+°"))
 
 
+@pytest.mark.slow
 def test_near_candidates_are_one_place_and_all_places_add_up(desktop: Visit) -> None:
     poses = [(1.0, 1.0, 0.31), (1.4, 1.0, 0.37), (5.0, 5.0, 0.2), (5.0, 5.9, 0.003), (8.0, 8.0, 0.004)]
     candidates = [
@@ -311,6 +317,7 @@ def test_answers_to_all_photographs_are_a_table(desktop: Visit) -> None:
     expect(page.locator("#answer .where")).to_contain_text(f"x {float(rows[2]['x_m']):.2f} m")
 
 
+@pytest.mark.slow
 def test_flat_picture_without_webgl(desktop: Visit) -> None:
     desktop.page.add_init_script(
         "HTMLCanvasElement.prototype.getContext = ((original) => function (kind, ...rest) {"
@@ -325,6 +332,7 @@ def test_flat_picture_without_webgl(desktop: Visit) -> None:
     desktop.errors.clear()
 
 
+@pytest.mark.slow
 def test_stored_plan_is_shown_instead_of_the_example(desktop: Visit) -> None:
     desktop.client.post("/floorplans", json=FLAT)
     for plan in desktop.client.get("/floorplans", params={"name": "Example"}).json()["floorplans"]:

@@ -43,6 +43,7 @@ def test_batch_is_answered_line_by_line(desktop: Visit) -> None:
     assert lines[1] == [1, "invalid-panorama"]
 
 
+@pytest.mark.slow
 def test_upload_reports_its_progress(desktop: Visit) -> None:
     plan_id, page = upload(desktop.client, json.loads((EXAMPLES / "flat.json").read_text())), desktop.open()
     progress, answer = run(
@@ -81,6 +82,7 @@ def test_overload_is_retried_a_bounded_number_of_times(desktop: Visit) -> None:
     assert run(page, refused, 3)["max_batch_photographs"] == 100
 
 
+@pytest.mark.slow
 def test_request_ends_at_its_timeout_and_when_it_is_aborted(desktop: Visit) -> None:
     page, held = desktop.open(), list[Route]()
     page.route("**/limits", lambda route: held.append(route))

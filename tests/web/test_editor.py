@@ -119,6 +119,7 @@ def test_dragging_can_be_undone(desktop: Visit) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_form_of_the_whole_plan_is_reachable_again(desktop: Visit, phone: Visit) -> None:
     for visited, name in ((desktop, "Whole"), (phone, "Whole on a phone")):
         page = _editing(visited, name, openings=[{"kind": "door", "line": [[4, 1], [4, 2]]}])
@@ -140,6 +141,7 @@ def test_form_of_the_whole_plan_is_reachable_again(desktop: Visit, phone: Visit)
         expect(whole).to_be_visible()
 
 
+@pytest.mark.slow
 def test_ceiling_of_the_plan_applies_to_all_rooms(desktop: Visit) -> None:
     page = _editing(desktop, "Ceilings")
     expect(page.locator("#plan-form-own-ceilings")).to_contain_text(
@@ -155,6 +157,7 @@ def test_ceiling_of_the_plan_applies_to_all_rooms(desktop: Visit) -> None:
     assert [room["ceiling_height_m"] for room in stored["rooms"]] == [2.7, 2.7]
 
 
+@pytest.mark.slow
 def test_drawn_plan_says_that_its_ceiling_is_assumed(desktop: Visit) -> None:
     page = desktop.open()
     page.get_by_role("button", name="Draw", exact=True).click()
@@ -179,6 +182,7 @@ def _skewed_scan() -> bytes:
     return content.getvalue()
 
 
+@pytest.mark.slow
 def test_picture_of_a_plan_lies_below_it_again(desktop: Visit) -> None:
     file, form = ("Skewed.png", _skewed_scan()), {"metres_per_pixel": "0.01"}
     desktop.client.post("/floorplans", files={"file": file}, data=form).raise_for_status()
@@ -197,6 +201,7 @@ def test_picture_of_a_plan_lies_below_it_again(desktop: Visit) -> None:
     expect(picture).to_have_attribute("transform", re.compile(r"rotate\(1\.[45]"))
 
 
+@pytest.mark.slow
 def test_plan_is_edited_with_the_keyboard_alone(desktop: Visit) -> None:
     page = _editing(desktop, "Typed")
     page.locator("#edit-room-0").focus()
@@ -234,6 +239,7 @@ def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> Non
     assert _stored(desktop, "Contended")["name"] == "Contended, mine"
 
 
+@pytest.mark.slow
 def test_leaving_with_changes_asks_first(desktop: Visit) -> None:
     page = _editing(desktop, "Left")
     page.locator("#plan-form-ceiling").fill("-1")

@@ -80,6 +80,7 @@ def test_view_agrees_with_the_renderer(
     np.testing.assert_array_equal(on_wall, (elevation > low) & (elevation < high))
 
 
+@pytest.mark.slow
 def test_lines_follow_floor_and_ceiling(
     desktop: Visit, flat: FloorPlan, poses: list[tuple[int, float, float, float]]
 ) -> None:

@@ -106,6 +106,7 @@ def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
     wait_until(page, "document.querySelector('#look-dialog video').srcObject === null")
 
 
+@pytest.mark.slow
 def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
     page = _open(phone)
     protocol = page.context.new_cdp_session(page)
@@ -123,6 +124,7 @@ def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
     expect(page.locator("#photo-strip li")).to_have_count(3)
 
 
+@pytest.mark.slow
 def test_refused_sensors_are_asked_for_again_and_used(phone: Visit) -> None:
     # As on iOS: the sensors are silent until they are allowed, and the first event has no angles.
     phone.page.add_init_script(
@@ -178,6 +180,7 @@ def test_only_features_leave_a_phone_with_the_box_ticked(camera: Browser, servic
     assert b"\xff\xd8\xff" not in sent
 
 
+@pytest.mark.slow
 def test_hints_for_walking_and_for_the_dark(phone: Visit) -> None:
     page = _open(phone)
     protocol, hint = page.context.new_cdp_session(page), page.locator("#look-hint")
@@ -203,6 +206,7 @@ def test_hints_for_walking_and_for_the_dark(phone: Visit) -> None:
     expect(page.locator("#look-dialog .primary")).to_have_text(re.compile("\\(1 photo"))
 
 
+@pytest.mark.slow
 def test_camera_stops_with_the_dialog_by_keyboard_alone(phone: Visit) -> None:
     page = phone.open_example()
     page.locator("#look-around").focus()
@@ -220,6 +224,7 @@ def test_camera_stops_with_the_dialog_by_keyboard_alone(phone: Visit) -> None:
     expect(page.locator("#look-around")).to_be_focused()
 
 
+@pytest.mark.slow
 @needs_ffmpeg
 def test_page_without_https_takes_a_film_and_says_why(phone: Visit, tmp_path: Path) -> None:
     page = phone.page
@@ -235,6 +240,7 @@ def test_page_without_https_takes_a_film_and_says_why(phone: Visit, tmp_path: Pa
     expect(page.locator("#answer-body")).to_contain_text("photographs together")
 
 
+@pytest.mark.slow
 def test_link_for_the_phone_opens_the_same_plan_and_has_no_key(desktop: Visit) -> None:
     plan_id = upload(desktop.client, FLAT | {"name": "Flat on a phone"})
     page = desktop.open(f"/#plan={plan_id}")
@@ -249,6 +255,7 @@ def test_link_for_the_phone_opens_the_same_plan_and_has_no_key(desktop: Visit) -
     _no_violations(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("angles", "attitude"),
     [

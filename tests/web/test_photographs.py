@@ -54,6 +54,7 @@ def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_pa
     expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=fault_id)
 def test_photograph_with_a_fault_is_shown_and_what_is_said_about_it(desktop: Visit, fault: Fault) -> None:
     page = desktop.open_example()
@@ -67,6 +68,7 @@ def test_photograph_with_a_fault_is_shown_and_what_is_said_about_it(desktop: Vis
         expect(place.filter(has_text=fault.said.replace("hfov_deg", "“Field of view”"))).to_be_visible()
 
 
+@pytest.mark.slow
 def test_photograph_of_which_half_is_lost_is_shown_from_inside(desktop: Visit, tmp_path: Path) -> None:
     content = (EXAMPLES / "kitchen.jpg").read_bytes()
     (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
@@ -174,6 +176,7 @@ def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -
     expect(page.locator("#copied")).to_contain_text("headings_deg=[None,None,40]")
 
 
+@pytest.mark.slow
 def test_statements_about_the_camera_are_sent(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
     (photograph,) = _phone_photographs(tmp_path, [0.0])

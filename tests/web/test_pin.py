@@ -93,6 +93,7 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
     expect(page.locator(".card")).to_have_count(3)
 
 
+@pytest.mark.slow
 def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -> None:
     page = pin_files(desktop, [grey, FILES[1]])
     _assert_accessible(page)
@@ -117,6 +118,7 @@ def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -
     expect(kitchen).to_contain_text("kitchen, corrected")
 
 
+@pytest.mark.slow
 def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     page = pin_files(desktop, [FILES[1]])
     pin = page.locator("#pin-1")
@@ -157,6 +159,7 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     expect(pin).to_have_attribute("transform", re.compile(f"^{decimals}$"))
 
 
+@pytest.mark.slow
 def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     settings = {"request_deadline_s": 90.0, "sweep_s": 0.2, "max_album_photographs": 2}
     with start_app(tmp_path, bundle=default_bundle(), **settings) as client:
@@ -184,6 +187,7 @@ def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_
             expect(page.locator("#problems")).to_contain_text("An album has at most 2 photographs; left out: 1.")
 
 
+@pytest.mark.slow
 def test_album_of_a_venue_shows_the_plan_of_each_pin(desktop: Visit) -> None:
     rooms = [{**room, "polygon": [[x, y / 2] for x, y in room["polygon"]]} for room in FLAT["rooms"]]
     squeezed = {key: value for key, value in FLAT.items() if key in ("ceiling_height_m", "camera_height_m")}
@@ -206,6 +210,7 @@ def test_album_of_a_venue_shows_the_plan_of_each_pin(desktop: Visit) -> None:
         desktop.client.delete(f"/floorplans/{plan_id}")
 
 
+@pytest.mark.slow
 def test_venue_that_is_chosen_while_the_first_plan_loads_stays(desktop: Visit) -> None:
     plan_id = upload(desktop.client, FLAT | {"name": "Slow"})
     plans = [{"floorplan_id": plan_id, "level": 0}]
@@ -227,6 +232,7 @@ def test_venue_that_is_chosen_while_the_first_plan_loads_stays(desktop: Visit) -
     desktop.client.delete(f"/floorplans/{plan_id}")
 
 
+@pytest.mark.slow
 def test_photographs_stay_on_the_device(browser: Browser, service: httpx.Client) -> None:
     with recorded(service) as (wire, through):
         for visited in visit(browser, through):
@@ -241,6 +247,7 @@ def test_photographs_stay_on_the_device(browser: Browser, service: httpx.Client)
         assert FILES[1].read_bytes()[1000:2000] not in bytes(wire.sent)
 
 
+@pytest.mark.slow
 def test_changed_plan_lists_what_moved(desktop: Visit) -> None:
     plan_id = upload(desktop.client, FLAT | {"name": "Changing"})
     page = pin_files(desktop, FILES[1:2])
@@ -253,6 +260,7 @@ def test_changed_plan_lists_what_moved(desktop: Visit) -> None:
     desktop.client.delete(f"/floorplans/{plan_id}")
 
 
+@pytest.mark.slow
 def test_print_has_the_plan_and_a_page_per_room(desktop: Visit, grey: Path) -> None:
     page = pin_files(desktop, [*FILES, grey])
     page.locator(".card", has_text="grey.jpg").focus()
@@ -265,6 +273,7 @@ def test_print_has_the_plan_and_a_page_per_room(desktop: Visit, grey: Path) -> N
     assert any("kitchen.jpg" in line for text in texts for line in text if text[0] == "kitchen")
 
 
+@pytest.mark.slow
 def test_folders_within_a_folder_are_added(desktop: Visit, tmp_path: Path) -> None:
     folder = tmp_path / "visit"
     (folder / "inner").mkdir(parents=True)

@@ -39,6 +39,7 @@ def test_uploaded_plan_is_drawn_with_its_warnings(desktop: Visit, tmp_path: Path
     expect(page.locator("#plan-warnings")).to_contain_text("overlap")
 
 
+@pytest.mark.slow
 def test_areas_without_a_room_are_marked(phone: Visit) -> None:
     file, form = ("Open hall.png", open_hall()), {"metres_per_pixel": "0.01"}
     phone.client.post("/floorplans", files={"file": file}, data=form).raise_for_status()
@@ -59,6 +60,7 @@ def test_areas_without_a_room_are_marked(phone: Visit) -> None:
     assert page.evaluate(script) < 0.0
 
 
+@pytest.mark.slow
 def test_compass_does_not_cover_the_words_without_a_photograph(phone: Visit) -> None:
     upload(phone.client, FLAT | {"name": "Without a photograph"})
     page = phone.open()
@@ -71,6 +73,7 @@ def test_compass_does_not_cover_the_words_without_a_photograph(phone: Visit) -> 
     assert page.evaluate(script) >= 0.0
 
 
+@pytest.mark.slow
 def test_late_example_does_not_replace_an_upload(desktop: Visit, tmp_path: Path) -> None:
     (tmp_path / "overlap.json").write_text(json.dumps(_overlapping() | {"name": "Early"}))
     page, held = desktop.page, list[Route]()
@@ -174,6 +177,7 @@ def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> No
     expect(page.locator("#plan-error")).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_huge_picture_is_refused_before_its_scale_is_asked(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     Image.new("1", (8000, 5001), 1).save(tmp_path / "huge.png")
@@ -203,6 +207,7 @@ def test_rejected_plan_is_not_shown(desktop: Visit, tmp_path: Path) -> None:
     expect(page.locator("#plan .room")).to_have_count(rooms)
 
 
+@pytest.mark.slow
 def test_plans_menu_closes(desktop: Visit) -> None:
     upload(desktop.client, FLAT | {"name": "Closing"})
     page = desktop.open()
@@ -217,6 +222,7 @@ def test_plans_menu_closes(desktop: Visit) -> None:
     choose_plan(page, "Closing")
 
 
+@pytest.mark.slow
 def test_levels_of_a_file_are_a_list(desktop: Visit, tmp_path: Path) -> None:
     collection = json.loads(export_plan(FloorPlan.from_dict(FLAT), "geojson"))
     floors = [json.loads(json.dumps(collection["features"])) for _ in range(2)]
@@ -244,6 +250,7 @@ def test_levels_of_a_file_are_a_list(desktop: Visit, tmp_path: Path) -> None:
     expect(page.locator("#venue-plan option")).to_have_count(2)
 
 
+@pytest.mark.slow
 def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
     for name in ("Attic of the mill", "Cellar of the mill"):
         upload(desktop.client, FLAT | {"name": name})
@@ -261,6 +268,7 @@ def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
     assert "Attic of the mill" not in names
 
 
+@pytest.mark.slow
 def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, inline_grid_poses=0) as client:
         for visited in visit(browser, client):
@@ -353,6 +361,7 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
             expect(page.locator("#plan-error")).to_contain_text("no answer is kept")
 
 
+@pytest.mark.slow
 def test_link_holds_an_answer_that_the_service_does_not_keep(
     browser: Browser, start_app: StartApp, tmp_path: Path
 ) -> None:
@@ -377,6 +386,7 @@ def test_link_holds_an_answer_that_the_service_does_not_keep(
             expect(page.locator("#plan-error")).to_contain_text("damaged or incomplete")
 
 
+@pytest.mark.slow
 def test_photographed_rooms_are_an_example(desktop: Visit) -> None:
     page = desktop.open()
     for _ in range(2):
@@ -391,6 +401,7 @@ def test_photographed_rooms_are_an_example(desktop: Visit) -> None:
     expect(page.locator("#plan-list button.plan", has_text="Six photographed rooms")).to_have_count(1)
 
 
+@pytest.mark.slow
 def test_search_waits_for_the_plan_that_is_loading(desktop: Visit) -> None:
     page, held = desktop.open(), list[Route]()
     rooms = page.get_by_role("button", name="Photographed rooms", exact=True)

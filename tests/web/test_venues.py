@@ -81,6 +81,7 @@ def test_answer_of_a_venue_names_the_plan(browser: Browser, start_app: StartApp,
             expect(page.locator("#venue-bar")).to_contain_text("Mill")
 
 
+@pytest.mark.slow
 def test_hints_about_a_venue_are_set_and_sent(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         _make_mill(client, anchor={"latitude": 51.75, "longitude": -1.25, "north_deg": 30.0})
@@ -137,6 +138,7 @@ def test_mark_needs_the_place_of_the_plan_on_earth(browser: Browser, start_app: 
             expect(page.locator("#hint-unplaced")).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_photographs_of_a_visit_are_one_query_in_a_venue(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         _make_mill(client)
