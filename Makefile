@@ -7,12 +7,13 @@ BIN := $(VENV)/bin
 # Stamps of the environment: with what serving needs, and with everything.
 SERVING := $(VENV)/.serving
 STAMP := $(VENV)/.everything
+comma := ,
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo serve test ray lint openapi docs neighbours site client web lock notice audit digests clean
+.PHONY: help setup develop demo serve check test test-all ray lint types openapi docs neighbours site client web lock notice audit digests clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(SERVING) ## create .venv and install what serving and the command line need
 
@@ -34,28 +35,41 @@ serve: $(SERVING) ## run the service at http://127.0.0.1:8000 (or PORT=...) with
 	@LALALOC_KEEP_ANSWERS_S=$${LALALOC_KEEP_ANSWERS_S:-86400} LALALOC_LOG_LEVEL=$${LALALOC_LOG_LEVEL:-warning} \
 		$(BIN)/lalaloc-service serve --example --port $(PORT)
 
-# Three processes with one thread each keep two cores busy, as many tests wait; a process without tests takes over those
-# of others. Browsers need an otherwise idle machine, so their tests are last and alone; they run even if others fail.
+# Three processes with one thread each keep two cores busy, as many tests wait; each takes whole files, whose tests share
+# services. Browsers need an otherwise idle machine, so their tests are last and alone; they run even if others fail.
 ALONE := tests/web
-test: $(STAMP) ## lint, build the site, run the tests
-	$(MAKE) --no-print-directory -j 2 lint site
-	@status=0; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist worksteal $(ALONE:%=--ignore=%) || status=1; \
-	$(BIN)/python -m pytest $(ALONE) || status=1; \
+PYTEST := $(BIN)/python -m pytest
+define run_tests
+@status=0; \
+	OMP_NUM_THREADS=1 $(PYTEST) -n 3 --dist loadfile $(ALONE:%=--ignore=%) $(1) || status=1; \
+	$(PYTEST) $(ALONE) $(1) || status=1; \
 	exit $$status
+endef
+
+test: $(STAMP) ## run the tests (about 8 minutes on two cores)
+	$(call run_tests)
+
+# Shapes and types in the core's signatures are checked whenever tests call it.
+test-all: $(STAMP) ## run all tests, those of a release as well, and check types while they run (before a release)
+	$(call run_tests,-m "slow or not slow" --jaxtyping-packages=lalaloc_core$(comma)beartype.beartype)
 
 # A new cluster per file, so that files do not share state.
 ON_RAY := floorplans localise resources idempotency events venues venue_queries sequence albums
 ray: $(STAMP) ## run the tests of Ray, and the API's tests on Ray (about 20 minutes)
-	$(BIN)/python -m pytest -m "slow or not slow" tests/service/test_on_ray.py
-	for file in $(ON_RAY); do TEST_DATABASE=ray $(BIN)/python -m pytest tests/service/test_$$file.py || exit 1; done
+	$(PYTEST) -m "slow or not slow" tests/service/test_on_ray.py
+	for file in $(ON_RAY); do TEST_DATABASE=ray $(PYTEST) tests/service/test_$$file.py || exit 1; done
+
+check: $(STAMP) ## lint, check types, build the documentation site
+	@$(MAKE) --no-print-directory -j 2 types lint site
 
 PRETTIER := web/node_modules/.bin/prettier
-lint: $(STAMP) ## run ruff, pyright and, after `npm ci` in web/, prettier
+lint: $(STAMP) ## run ruff and, after `npm ci` in web/, prettier
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	@if [ -x $(PRETTIER) ]; then npm --prefix web run --silent format:check; \
 		else echo 'lint: prettier is not installed, so TypeScript is not checked: run `npm ci` in web/' >&2; fi
+
+types: $(STAMP) ## run pyright
 	$(BIN)/pyright
 
 openapi: $(STAMP) ## write openapi.yaml from the application
