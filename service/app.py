@@ -80,9 +80,9 @@ def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGI
 
     `FastAPI.add_middleware` would put them inside the layer that answers unexpected errors.
     """
-    # Keys come before admission, because slots are shared between tenants.
-    admitted = HeadMiddleware(AuthorisationMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app))))
     named = [route for route in routes if isinstance(route, Route)]
+    # Keys come before admission, because slots are shared between tenants.
+    admitted = HeadMiddleware(AuthorisationMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app), named)))
     return TelemetryMiddleware(SecurityHeadersMiddleware(CorsMiddleware(FramingMiddleware(admitted))), telemetry, named)
 
 

@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from service.capacity.admission_control import Admission, AdmissionLimits
+from service.capacity.admission_control import Admission
 from service.capacity.cores import usable_cores
 from service.capacity.cpu_accounts import PROBES
 from service.capacity.fair_share import FairSemaphore, with_headroom
@@ -214,10 +214,7 @@ def _admission(settings: Settings, telemetry: Telemetry, store: Store) -> Admiss
     limits = store.tenant_limits
     telemetry.cpu_accounts.share = lambda client: limits.of(client).cpu_share or 1.0
     return Admission(
-        AdmissionLimits.from_settings(settings),
-        telemetry,
-        bytes_limit_of=lambda client: limits.of(client).bytes_in_flight,
-        by_tenant=by_tenant,
+        settings, telemetry, bytes_limit_of=lambda client: limits.of(client).bytes_in_flight, by_tenant=by_tenant
     )
 
 

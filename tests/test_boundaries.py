@@ -96,8 +96,7 @@ FORBIDDEN = {
 }
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
-    "uploaded_file capacity.fair_share capacity.cpu_accounts capacity.cores capacity.single_flight "
-    "capacity.bounded_cache",
+    "uploaded_file capacity.fair_share capacity.cpu_accounts capacity.cores capacity.bounded_cache",
     "settings errors problem_kinds schemas stored_plan",
     "telemetry",
     "capacity",

@@ -22,7 +22,7 @@ from packaging.utils import canonicalize_name
 from lalaloc_core import __version__
 from scripts import install_torch
 from scripts.write_locks import extras_of
-from service.capacity.admission_control import Admission, AdmissionLimits
+from service.capacity.admission_control import Admission
 from service.capacity.cores import share_cores
 from service.routes import ROUTERS
 from service.settings import PREFIX, SETTING_NAMES, Settings
@@ -368,7 +368,7 @@ def test_autoscaler_uses_an_existing_metric() -> None:
     adapter = yaml.safe_load(file.read_text(encoding="utf-8"))
     assert [rule["seriesQuery"].partition("{")[0] for rule in adapter["rules"]["custom"]] == [metric]
     telemetry = Telemetry()
-    Admission(AdmissionLimits.from_settings(Settings()), telemetry)
+    Admission(Settings(), telemetry)
     assert f"\n{metric} " in telemetry.render().decode()
     # The autoscaler adds pods before the running pods refuse requests.
     cores = int(CONTAINER["resources"]["limits"]["cpu"])

@@ -1,7 +1,7 @@
-"""Admission control: slots for each kind of request, and immediate refusal when all are in use.
+"""Admission control: slots for each class of route, and immediate refusal when all are in use.
 
-Every request, except for health and metrics, holds a slot from the end of its head to the end of its answer. An
-uploaded query needs a second slot to be computed, and waits for it in a short queue. All queues are bounded.
+Every request, except for probes, holds a slot from the end of its head to the end of its answer. An uploaded query
+needs a second slot before it is computed, and waits for it in a short queue. All queues are bounded.
 """
 
 from __future__ import annotations
@@ -12,59 +12,73 @@ import threading
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from time import monotonic
-from typing import Any
-from weakref import WeakKeyDictionary
+from typing import Any, Literal, TypeVar
 
-from service.capacity.bytes_in_flight import BytesInFlight
 from service.capacity.cpu_accounts import CpuAccounts
-from service.capacity.fair_share import FairQueue, FairSemaphore, Shares
+from service.capacity.fair_share import MAX_RATIO, FairSemaphore, Shares
 from service.errors import (
+    BytesInFlightError,
     DeadlineExceededError,
     ExpectedTooLateError,
     OverloadedError,
     ShareExceededError,
     StoppingError,
+    UploadTooLargeError,
 )
 from service.settings import Settings
 from service.telemetry import Telemetry
 
-EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
-# Errors of every request whose path is not exempt.
+# Errors of every request that is no probe.
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
-_READING = frozenset({"GET", "HEAD", "OPTIONS"})
-BATCH = "/localise/batch"
-_QUERIES = frozenset({"/localise", "/localise/sequence", BATCH})
-_STREAMS, _PHOTOGRAPHS, _ALBUMS = "/events", "/photographs", "/albums/"
 _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.
 _NEWEST = 0.1
 _MAX_RETRY_AFTER_S = 30
 # Weight of the newest query of a client, and clients whose durations are known.
 _NEWEST_OF_CLIENT, _MAX_PACES = 0.3, 10_000
+# Time (s) that the query of the current task was without its slot.
+_AWAY_S: ContextVar[float] = ContextVar("away_s", default=0.0)
+
+Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
-def is_read(method: str, path: str) -> bool:
-    """Return True for a read-only request other than an event stream."""
-    return method in _READING and not path.endswith(_STREAMS)
+@dataclass(frozen=True)
+class RouteClass:
+    """Treatment of the requests of a route.
+
+    Attributes:
+        slots: kind of the slot that a request holds; None for probes, which need none.
+        is_query: the request localises photographs, so it waits for a second slot before it is computed.
+        in_parts: the answer is sent part by part, and bounds the time of each part.
+    """
+
+    slots: Literal["requests", "reads", "streams"] | None
+    is_query: bool = False
+    in_parts: bool = False
 
 
-def is_query(path: str) -> bool:
-    """Return True for requests that localise photographs."""
-    return path in _QUERIES or path.endswith(_PHOTOGRAPHS)
+PROBE, READ, CHANGE = RouteClass(None), RouteClass("reads"), RouteClass("requests")
+STREAM = RouteClass("streams", in_parts=True)
+QUERY = RouteClass("requests", is_query=True)
+QUERY_IN_PARTS = replace(QUERY, in_parts=True)
 
 
-def is_stream(method: str, path: str) -> bool:
-    """Return True for an event stream."""
-    return method in _READING and path.endswith(_STREAMS)
+def admitted_as(route_class: RouteClass) -> Callable[[Endpoint], Endpoint]:
+    """Declare the class of a route; all others are `READ` or `CHANGE`, by their method."""
+
+    def declare(endpoint: Endpoint) -> Endpoint:
+        endpoint.__dict__["route_class"] = route_class
+        return endpoint
+
+    return declare
 
 
-def bounds_itself(method: str, path: str) -> bool:
-    """Return True for answers that are sent part by part, and bound the time of each part."""
-    if is_stream(method, path) or path == BATCH:
-        return True
-    return method == "POST" and path.startswith(_ALBUMS) and path.endswith(_PHOTOGRAPHS)
+def declared_class(endpoint: Callable[..., Any]) -> RouteClass | None:
+    """Return the class that `admitted_as` declared for a route; None without one."""
+    return getattr(endpoint, "route_class", None)
 
 
 class _Pace:
@@ -98,18 +112,16 @@ class Slots:
     """
 
     def __init__(self, limit: int, max_waiting: int = 0, accounts: CpuAccounts | None = None) -> None:
-        self._shares = Shares(limit)
+        self._limit = limit
+        self._slots = FairSemaphore(limit, accounts or CpuAccounts())
         self._places = Shares(max_waiting)
-        self._waiting: FairQueue[asyncio.Future[None]] = FairQueue(accounts or CpuAccounts())
         self._held_s = 0.0
         self._pace = _Pace()
-        # Time (s) that the query of a task was without its slot.
-        self._away_s: WeakKeyDictionary[asyncio.Task[Any], float] = WeakKeyDictionary()
 
     @property
     def in_use(self) -> int:
         """Number of slots in use."""
-        return self._shares.in_use
+        return self._slots.in_use
 
     @property
     def waiting(self) -> int:
@@ -123,53 +135,59 @@ class Slots:
         Raises:
             OverloadedError: all slots, or the client's share of them, are in use.
         """
-        if not self._shares.may_take(client):
+        if not self._slots.acquire_at_once(client):
             raise self._refusal(client)
-        self._shares.take(client)
         with self._held(client):
             yield
 
     @asynccontextmanager
     async def wait_and_hold(self, client: str, deadline: float) -> AsyncIterator[None]:
-        """Wait for a slot and hold it; the client that used the least CPU time lately is first.
+        """Wait for a slot until `deadline` (`monotonic`) and hold it; raises as `hold` does.
 
-        Args:
-            client: tenant or client address.
-            deadline: end of the wait (`monotonic`).
+        The client that used the least CPU time lately is first.
         """
         begin, others = monotonic(), self._others(client)
         if self._pace.exceeds_deadline(client, others):
             raise ExpectedTooLateError(others, self._retry_after_s())
+        _AWAY_S.set(0.0)
         try:
-            await self._take_turn(client, deadline)
+            await self._wait(client, deadline)
             with self._held(client):
                 yield
         finally:
-            task = asyncio.current_task()
-            spent_s = monotonic() - begin - (self._away_s.pop(task, 0.0) if task is not None else 0.0)
+            spent_s = monotonic() - begin - _AWAY_S.get()
             self._pace.note(client, spent_s / max(deadline - begin, 1e-3), max(others, self._others(client)))
 
     @contextmanager
     def released(self, client: str) -> Iterator[None]:
         """Release the held slot during the block, and take it back afterwards."""
-        self._give_back(client)
-        begin, task = monotonic(), asyncio.current_task()
+        self._slots.release(client)
+        begin = monotonic()
         try:
             yield
         finally:
-            if task is not None:
-                self._away_s[task] = self._away_s.get(task, 0.0) + monotonic() - begin
-            # Taken without a check, so for a while more slots than the limit can be in use.
-            self._shares.take(client)
+            _AWAY_S.set(_AWAY_S.get() + monotonic() - begin)
+            # Without a check, so for a while more slots than the limit can be in use.
+            self._slots.take(client)
 
     def check(self, client: str) -> None:
         """Check that a slot or a place in the queue is free for the client."""
-        if not self._shares.may_take(client) and not self._places.may_take(client):
+        if not self._slots.may_take(client) and not self._places.may_take(client):
             raise self._refusal(client)
 
-    def _others(self, client: str) -> int:
-        """Return the number of queries of a client that hold a slot or wait for one."""
-        return self._shares.held_by(client) + self._places.held_by(client)
+    async def _wait(self, client: str, deadline: float) -> None:
+        if self._slots.acquire_at_once(client):
+            return
+        if not self._places.may_take(client):
+            raise self._refusal(client)
+        self._places.take(client)
+        try:
+            async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
+                await self._slots.acquire(client)
+        except TimeoutError as error:
+            raise self._refusal(client) from error
+        finally:
+            self._places.give_back(client)
 
     @contextmanager
     def _held(self, client: str) -> Iterator[None]:
@@ -178,127 +196,96 @@ class Slots:
             yield
         finally:
             self._held_s += _NEWEST * (monotonic() - begin - self._held_s)
-            self._give_back(client)
+            self._slots.release(client)
 
-    async def _take_turn(self, client: str, deadline: float) -> None:
-        # A client with waiting requests never passes this check, because a free slot goes to them first.
-        if self._shares.may_take(client):
-            self._shares.take(client)
-            return
-        if not self._places.may_take(client):
-            raise self._refusal(client)
-        turn = asyncio.get_running_loop().create_future()
-        self._places.take(client)
-        self._waiting.append(client, turn)
-        try:
-            async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
-                await turn
-        except (TimeoutError, asyncio.CancelledError) as error:
-            self._waiting.drop(lambda waiting: waiting is turn)
-            if turn.done() and not turn.cancelled():
-                # The slot was granted as the wait ended.
-                self._give_back(client)
-            if isinstance(error, TimeoutError):
-                raise self._refusal(client) from error
-            raise
-        finally:
-            self._places.give_back(client)
-
-    def _give_back(self, client: str) -> None:
-        self._shares.give_back(client)
-        while (found := self._waiting.take(self._shares.may_take)) is not None:
-            next_client, turn = found
-            if not turn.done():
-                self._shares.take(next_client)
-                turn.set_result(None)
+    def _others(self, client: str) -> int:
+        """Return the number of requests of a client that hold a slot or wait for one."""
+        return self._slots.held_by(client) + self._places.held_by(client)
 
     def _retry_after_s(self) -> int:
-        rounds = 1.0 + self.waiting / max(self._shares.limit, 1)
+        rounds = 1.0 + self.waiting / max(self._limit, 1)
         return min(max(math.ceil(rounds * self._held_s), 1), _MAX_RETRY_AFTER_S)
 
     def _refusal(self, client: str) -> OverloadedError:
-        retry_after_s = self._retry_after_s()
-        if self.in_use < self._shares.limit:
-            return ShareExceededError(self._shares.held_by(client), self._shares.limit, retry_after_s)
-        return OverloadedError(self._shares.limit, retry_after_s)
+        if self.in_use < self._limit:
+            return ShareExceededError(self._slots.held_by(client), self._limit, self._retry_after_s())
+        return OverloadedError(self._limit, self._retry_after_s())
 
 
-@dataclass(frozen=True)
-class AdmissionLimits:
-    """Limits of requests in progress.
+class BytesInFlight(Shares):
+    """Bytes of request bodies in progress, from their heads to the end of their answers; for one event loop.
 
-    Attributes:
-        requests: uploads and queries, from the end of the head.
-        queries: queries that are computed or wait for a thread.
-        waiting_queries: queries that wait for a slot.
-        reads: read-only requests.
-        streams: event streams.
-        tenant_bytes: bytes of bodies in progress per client, for clients without a limit of their own.
-        total_bytes: bytes of bodies in progress.
-        deadline_s: timeout of every request except streams and batches; other timeouts normally end a request earlier.
+    Args:
+        total_bytes: limit of all clients together.
+        limit_of: returns the limit (bytes) of a client.
     """
 
-    requests: int
-    queries: int
-    waiting_queries: int
-    reads: int
-    streams: int
-    tenant_bytes: int
-    total_bytes: int
-    deadline_s: float
+    def __init__(self, total_bytes: int, limit_of: Callable[[str], int]) -> None:
+        super().__init__(total_bytes)
+        self._limit_of = limit_of
 
-    @classmethod
-    def from_settings(cls, settings: Settings) -> AdmissionLimits:
-        """Return the limits in the settings."""
-        return cls(
-            requests=settings.pending_limit,
-            queries=settings.query_limit,
-            waiting_queries=settings.requests.max_waiting_queries,
-            reads=settings.requests.max_reads,
-            streams=settings.requests.max_streams,
-            tenant_bytes=settings.uploads.tenant_bytes,
-            total_bytes=settings.uploads.total_bytes,
-            # Time for the upload, the query or conversion, and sending the answer to a slow client.
-            deadline_s=settings.uploads.deadline_s
-            + max(settings.sequence_deadline_s, settings.plans.import_deadline_s)
-            + settings.requests.request_deadline_s,
-        )
+    def limit_of(self, client: str) -> int:
+        """Return the limit (bytes) of a client."""
+        return min(self._limit_of(client), self.limit)
+
+    def take(self, client: str, count: int = 1) -> None:
+        """Take some bytes for a client.
+
+        Raises:
+            UploadTooLargeError: one request needs more than the client's limit.
+            BytesInFlightError: the requests in progress leave too few.
+        """
+        held, limit = self.held_by(client), self.limit_of(client)
+        if count > limit:
+            raise UploadTooLargeError("LALALOC_UPLOAD_TENANT_BYTES", limit, count)
+        if held + count > limit:
+            raise BytesInFlightError(count, held, limit, "LALALOC_UPLOAD_TENANT_BYTES")
+        left = self.limit - self.in_use - count
+        if left < 0 or (held and held + count > MAX_RATIO * left):
+            raise BytesInFlightError(count, self.in_use, self.limit, "LALALOC_UPLOAD_TOTAL_BYTES")
+        super().take(client, count)
 
 
 class Admission:
     """Slots of one running app.
 
+    Attributes:
+        reading: permits to compute the answer to a read.
+        deadline_s: timeout of every request whose answer is not sent in parts; others normally end it earlier.
+
     Args:
-        limits: limits of requests in progress.
+        settings: limits of requests in progress.
         telemetry: metrics, and the CPU time of the clients.
+        bytes_limit_of: returns the limit of a client's bytes in flight; None: the one in the settings.
         by_tenant: returns the values of clients as values of tenants.
-        bytes_limit_of: returns the limit of a client's bytes in flight; None: the one in `limits`.
     """
 
     def __init__(
         self,
-        limits: AdmissionLimits,
+        settings: Settings,
         telemetry: Telemetry,
         bytes_limit_of: Callable[[str], int | None] = lambda _client: None,
         by_tenant: Callable[[Mapping[str, float]], Mapping[str, float]] = lambda values: values,
     ) -> None:
+        requests, uploads = settings.requests, settings.uploads
         self.cpu_accounts = telemetry.cpu_accounts
-        self.limits = limits
-        self.requests = Slots(limits.requests)
-        self.queries = Slots(limits.queries, limits.waiting_queries, telemetry.cpu_accounts)
-        self.reads = Slots(limits.reads)
-        self.streams = Slots(limits.streams)
+        self.requests = Slots(settings.pending_limit)
+        self.queries = Slots(settings.query_limit, requests.max_waiting_queries, telemetry.cpu_accounts)
+        self.reads = Slots(requests.max_reads)
+        self.streams = Slots(requests.max_streams)
 
         def limit_of(client: str) -> int:
             own = bytes_limit_of(client)
-            return limits.tenant_bytes if own is None else own
+            return uploads.tenant_bytes if own is None else own
 
-        self.bytes_in_flight = BytesInFlight(limits.total_bytes, limit_of)
+        self.bytes_in_flight = BytesInFlight(uploads.total_bytes, limit_of)
         # More reads at a time would only delay queries, because they share one interpreter. Beside other clients, a
         # client reads one at a time, so that each of their steps waits for one of its steps.
         self.reading = FairSemaphore(_READS_AT_A_TIME, telemetry.cpu_accounts, cores=1)
-        self.draining = False
-        self.stopping = False
+        # Time for the upload, the query or conversion, and sending the answer to a slow client.
+        work_s = max(settings.sequence_deadline_s, settings.plans.import_deadline_s)
+        self.deadline_s = uploads.deadline_s + work_s + requests.request_deadline_s
+        self.draining = self.stopping = False
         self._at_stop: list[Callable[[], None]] = []
         telemetry.tenant_counter(
             "lalaloc_tenant_cpu_seconds",
@@ -340,7 +327,7 @@ class Admission:
         return self.requests.in_use == self.reads.in_use == 0
 
     @contextmanager
-    def slot_for(self, client: str, method: str, path: str) -> Iterator[None]:
+    def slot_for(self, client: str, route_class: RouteClass) -> Iterator[None]:
         """Hold a slot for a request whose head has arrived.
 
         Raises:
@@ -349,14 +336,9 @@ class Admission:
         """
         if self.stopping:
             raise StoppingError()
-        if is_stream(method, path):
-            slots = self.streams
-        elif is_read(method, path):
-            slots = self.reads
-        else:
-            slots = self.requests
-            if is_query(path):
-                # Refuse before the body is read.
-                self.queries.check(client)
+        if route_class.is_query:
+            # Refuse before the body is read.
+            self.queries.check(client)
+        slots = {"requests": self.requests, "reads": self.reads, "streams": self.streams}[route_class.slots or "reads"]
         with slots.hold(client):
             yield

@@ -23,17 +23,17 @@ from service.capacity.cpu_accounts import CpuAccounts
 T = TypeVar("T")
 
 # Largest ratio of the units of a client to the units that stay free.
-_MAX_RATIO = 3
+MAX_RATIO = 3
 
 
 def with_headroom(count: int) -> int:
     """Return the limit at which a client that is alone gets `count` units."""
-    return count + -(-count // _MAX_RATIO)
+    return count + -(-count // MAX_RATIO)
 
 
 def max_per_client(limit: int) -> int:
     """Return the number of units, at least one, that a client alone can hold of `limit`."""
-    return max(limit * _MAX_RATIO // (_MAX_RATIO + 1), 1)
+    return max(limit * MAX_RATIO // (MAX_RATIO + 1), 1)
 
 
 class Shares:
@@ -63,7 +63,7 @@ class Shares:
     def may_take(self, client: str) -> bool:
         """Return True if a client can take one more unit."""
         held, left = self._held[client], self.limit - self.in_use - 1
-        return left >= 0 and (held == 0 or held < _MAX_RATIO * left)
+        return left >= 0 and (held == 0 or held < MAX_RATIO * left)
 
     def take(self, client: str, count: int = 1) -> None:
         """Count more units for a client, without a check."""
@@ -158,16 +158,40 @@ class FairSemaphore:
         """Number of permits that are held."""
         return self._shares.in_use
 
+    def held_by(self, client: str) -> int:
+        """Return the number of permits that a client holds."""
+        return self._shares.held_by(client)
+
+    def may_take(self, client: str) -> bool:
+        """Return True if a client would get a permit at once."""
+        return self._allowed()(client)
+
     async def acquire(self, client: str) -> None:
         """Wait for a permit; the caller must release it."""
         permit = self._queued(client)
         try:
             await asyncio.wrap_future(permit)
         except asyncio.CancelledError:
-            if not permit.cancel():
+            if permit.cancel():
+                with self._lock:
+                    self._waiting.drop(lambda waiting: waiting is permit)
+            else:
                 # The permit was granted as the wait was cancelled.
                 self.release(client)
             raise
+
+    def acquire_at_once(self, client: str) -> bool:
+        """Take a permit if one is free for the client, and return whether it was; the caller must release it."""
+        with self._lock:
+            # A client that waits never passes, because free permits go to the waiting first.
+            if may_take := self.may_take(client):
+                self._shares.take(client)
+        return may_take
+
+    def take(self, client: str) -> None:
+        """Take a permit without a check, so for a while more than the limit can be held."""
+        with self._lock:
+            self._shares.take(client)
 
     @asynccontextmanager
     async def held(self, client: str) -> AsyncIterator[None]:
@@ -220,8 +244,4 @@ class FairSemaphore:
         if active < 2:
             return self._shares.may_take
         most = max(self._cores - active + 1, self._cores // active, 1)
-
-        def may_take(client: str) -> bool:
-            return self._shares.held_by(client) < most and self._shares.may_take(client)
-
-        return may_take
+        return lambda client: self._shares.held_by(client) < most and self._shares.may_take(client)

@@ -9,10 +9,12 @@ import argparse
 import json
 import socket
 import sys
+import uuid
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
 from datetime import datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
@@ -24,13 +26,15 @@ from service.schemas.admin import MAX_LIFETIME_S, MAX_OVERLAP_S, MAX_RATE
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
 from service.settings import Settings
-from service.storage import open_store
-from service.storage.records import ApiKey
+from service.storage import Store, open_store
+from service.storage.records import DEFAULT_TENANT, ApiKey, NewPlan, Original
 from service.telemetry.tracing import otlp_exporter
 
 # Connections that the kernel accepts while the service is busy.
 _BACKLOG = 1024
 _MAX_NAME = 200
+# The page offers it too.
+_EXAMPLE = Path(__file__).resolve().parents[1] / "web" / "example-flat.json"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,10 +87,26 @@ def _check_parts(settings: Settings, *, example: bool) -> None:
     Bundle.open(settings.bundle).check()
     with closing(open_store(settings)) as store:
         if example:
-            # Imported late, as importers are.
-            from service.cli.example_plan import store_example
-
             store_example(store, settings)
+
+
+def store_example(store: Store, settings: Settings) -> str | None:
+    """Store the example plan for callers without API keys, and return its name; None if any plan is stored.
+
+    The service computes its pose grid after the start.
+    """
+    # Imported late, as importers are.
+    from lalaloc_core.importers import import_plan
+    from service.plan_files.convert_worker import report_of
+
+    if store.plans.any_stored():
+        return None
+    content = _EXAMPLE.read_bytes()
+    imported = import_plan(content)
+    plan = imported.plan()
+    new = NewPlan(plan, Original(content, report=report_of(imported)))
+    store.plans.add(DEFAULT_TENANT, uuid.uuid4().hex, new, limit=settings.plans.max_floorplans)
+    return plan.name
 
 
 def _listener(host: str, port: int) -> socket.socket:

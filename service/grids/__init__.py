@@ -4,6 +4,5 @@ Begin with `grid_provider.py`, the interface for all other packages. `builder.py
 queues, under leases, and `sweeper.py` reacts to other replicas.
 """
 
-from service.grids.grid_provider import GridProvider, GridState
-from service.grids.heights import check_height_m, grid_height_m
+from service.grids.grid_provider import GridProvider, GridState, check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper

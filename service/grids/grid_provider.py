@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Self
 
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.render.sampling import grid_size
 from service.capacity.fair_share import FairSemaphore
 from service.errors import OverloadedError, StoppingError
-from service.grids.builder import GridBuilder
+from service.grids.builder import GridBuilder, GridCache
 from service.grids.embedding import RENDERED, check_size, embed, embed_small
-from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob
 from service.schemas.stored_plans import PlanStatus
 from service.settings import Settings
@@ -26,6 +27,39 @@ from service.storage import Store
 from service.storage.grid_format import SortedPrototypes, packed_bytes
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
+
+# Other camera heights are rounded to multiples of this, so that a plan needs few grids.
+HEIGHT_STEP_M = 0.02
+
+
+def check_height_m(record: PlanRecord, height_m: float) -> None:
+    """Check that a camera can have a height (m) in a plan.
+
+    Raises:
+        InvalidPoseError: the height is not below the lowest ceiling, or too low for any camera.
+    """
+    lowest = float(record.plan.ceiling_heights_m.min())
+    if height_m != record.plan.camera_height_m and not MIN_CAMERA_HEIGHT_M <= height_m < lowest:
+        raise InvalidPoseError(
+            f"camera_height_m is {height_m:g}; it must be at least {MIN_CAMERA_HEIGHT_M:g} and below the plan's lowest "
+            f"ceiling ({lowest:g} m)"
+        )
+
+
+def grid_height_m(record: PlanRecord, height_m: float, *, latents_alone: bool) -> float:
+    """Return the camera height (m) of the grid that a query is compared with.
+
+    Wall profiles do not depend on the height, so the plan's own grid serves all queries. Only models that compare
+    latents alone have a grid per height, rounded to 2 cm.
+    """
+    own = record.plan.camera_height_m
+    if not latents_alone or abs(height_m - own) < HEIGHT_STEP_M / 2.0:
+        return own
+    steps = round(height_m / HEIGHT_STEP_M)
+    if steps * HEIGHT_STEP_M >= float(record.plan.ceiling_heights_m.min()):
+        steps -= 1
+    return steps * HEIGHT_STEP_M
+
 
 # Missing grids queued at a time, so that replicas share a backlog.
 _BATCH = 16

@@ -1,10 +1,10 @@
 """HTTP layer between the socket and the routes: uploads, idempotency, events, errors, headers.
 
 `http_protocol.py` parses the bytes of a connection, paced by `paced_parsing.py`; `server.py` runs it.
-Begin with `uploads.py` and `multipart.py`, which read bodies, and `middleware/`, which every request passes.
-Routes check form fields with `fields.py`, handle headers and cursors with `accept.py`, `conditional.py`,
-`cursors.py` and `idempotent_request.py`, and stream with `events.py`; `problems.py` answers errors,
-`api_description.py` describes the app.
+Begin with `uploads.py`, which reads bodies, and `middleware/`, which every request passes.
+Routes check form fields with `fields.py`, choose and send answers with `representations.py`, repeat none with
+`idempotent_request.py`, and stream with `events.py`; `problems.py` answers errors, `api_description.py` describes the
+app.
 """
 
 from service.http.events import ProgressEvents

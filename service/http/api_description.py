@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 
-from service.capacity import admission_control as admission
+from service.capacity.admission_control import PROBE, REFUSALS, declared_class
 from service.http.problems import add_problems
 from service.schemas import EarthPoint, SessionDocument
 from service.schemas.admin import KeyDocument, RotationDocument, TenantLimitsDocument
@@ -71,14 +71,19 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
             schemas |= schema.pop("$defs", {})
             schemas[model.__name__] = schema
         document["components"]["schemas"] = dict(sorted(schemas.items()))
+        probes = {route.path for route in app.routes if isinstance(route, APIRoute) and _is_probe(route)}
         for path, operations in document["paths"].items():
-            if path not in admission.EXEMPT:
+            if path not in probes:
                 for operation in operations.values():
-                    add_problems(operation, *admission.REFUSALS)
+                    add_problems(operation, *REFUSALS)
         _describe_keys(document)
         _sort_properties(document)
         app.openapi_schema = document
     return app.openapi_schema
+
+
+def _is_probe(route: APIRoute) -> bool:
+    return declared_class(route.endpoint) == PROBE
 
 
 def _describe_keys(document: dict[str, Any]) -> None:

@@ -15,7 +15,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import read_json
 from service.errors import InvalidRequestError
 
-_MAX_SHOWN = 100
+# Characters of a value in a message, levels of a JSON text, and faults of an answer.
+_MAX_SHOWN, _MAX_DEPTH, _MAX_FAULTS = 100, 8, 20
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def _number(value: object) -> str:
@@ -62,10 +64,27 @@ def describe_fault(fault: Mapping[str, Any]) -> tuple[str, str]:
     return field, shown + words
 
 
-Model = TypeVar("Model", bound=BaseModel)
+def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
+    """Return the fields of a form as a model; empty fields count as left out.
 
-_MAX_DEPTH = 8
-_MAX_FAULTS = 20
+    Raises:
+        InvalidRequestError: names every faulty field, its value and the limit.
+    """
+    try:
+        return model.model_validate({name: value for name, value in fields.items() if value.strip()}, context=context)
+    except ValidationError as error:
+        raise InvalidRequestError([describe_fault(fault) for fault in error.errors()]) from error
+
+
+def faults_of(
+    model: type[BaseModel], fields: Mapping[str, str], context: Mapping[str, object]
+) -> list[tuple[str, str]]:
+    """Return the faults for which `validate_fields` would raise."""
+    try:
+        validate_fields(model, fields, context)
+    except InvalidRequestError as error:
+        return error.faults
+    return []
 
 
 def parse_document(model: type[Model], content: bytes, max_values: int) -> Model:

@@ -22,11 +22,11 @@ from starlette.responses import Response
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidHintError, InvalidPhotographError, InvalidPoseError
 from service import errors
 from service.capacity.threads import BoundedReads
-from service.http.multipart import Parts
 from service.http.problems import problem_answer
+from service.http.uploads import Parts
 from service.pools import JobLostError
 from service.security.access_control import routed_path
-from service.storage.idempotency_keys import IdempotencyKeys
+from service.storage.kept_answers import IdempotencyKeys
 from service.storage.records import Claimed, Conflict, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 

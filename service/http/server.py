@@ -21,7 +21,7 @@ from fastapi import FastAPI
 from starlette.types import Receive, Scope, Send
 
 from lalaloc_core.errors import ConfigError
-from service.capacity.admission_control import Admission, AdmissionLimits
+from service.capacity.admission_control import Admission
 from service.http.http_protocol import bounded_protocol
 from service.settings import Settings
 from service.telemetry import LOGGER_NAME
@@ -75,9 +75,8 @@ def bound_uvicorn(app: FastAPI, settings: Settings) -> None:
 
 def _bound(config: uvicorn.Config, settings: Settings) -> type[asyncio.Protocol]:
     """Bound connections, heads and events; return the protocol."""
-    limits = AdmissionLimits.from_settings(settings)
     # More than all slots, so that this service's refusals come before the server's own.
-    least = limits.requests + limits.reads + limits.streams + 1
+    least = settings.pending_limit + settings.requests.max_reads + settings.requests.max_streams + 1
     max_connections = max_connections_of(max(settings.requests.max_connections, least), settings)
     protocol = config.http = bounded_protocol(_HEAD_DEADLINE_S, max_connections)
     # Idle connections make room first; this applies if all of them have a request in progress.

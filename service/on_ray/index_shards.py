@@ -28,7 +28,7 @@ from lalaloc_core.localise.venue.index_search import (
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import DeadlineExceededError
-from service.on_ray.outcome import Failure, Success
+from service.on_ray.remote import Failure, Success
 from service.settings import Settings
 from service.venues.plan_list import ROW_BYTES, PlanList
 

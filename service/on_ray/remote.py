@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from time import monotonic
-from typing import Any, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from ray.exceptions import RayError
 from ray.serve.exceptions import BackPressureError
 from ray.serve.handle import DeploymentHandle
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError, OverloadedError
-from service.on_ray.outcome import Failure, Success
 from service.pools import LostReason, PoolState
 from service.query import (
     SOLVE_S,
@@ -40,6 +41,59 @@ from service.schemas.query_fields import HeightFields
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
+
+P = ParamSpec("P")
+S = TypeVar("S")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Success(Generic[T]):
+    """Answer."""
+
+    value: T
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Error for the caller.
+
+    Exceptions are not sent themselves: unpickling calls their constructors with the message, which most of them do not
+    accept.
+    """
+
+    kind: type[LaLaLocError]
+    text: tuple[Any, ...]
+    attributes: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, error: LaLaLocError) -> Failure:
+        """Return the failure for an error."""
+        return cls(type(error), error.args, dict(error.__dict__))
+
+    @property
+    def error(self) -> LaLaLocError:
+        """The original error."""
+        error = self.kind.__new__(self.kind)
+        error.args = self.text
+        error.__dict__.update(self.attributes)
+        return error
+
+
+def returning_failures(
+    method: Callable[Concatenate[S, P], Awaitable[T]],
+) -> Callable[Concatenate[S, P], Coroutine[Any, Any, Success[T] | Failure]]:
+    """Make a replica's method return its answer or the `LaLaLocError` that it raises as an outcome."""
+
+    @wraps(method)
+    async def wrapper(self: S, *args: P.args, **kwargs: P.kwargs) -> Success[T] | Failure:
+        try:
+            return Success(await method(self, *args, **kwargs))
+        except LaLaLocError as error:
+            return Failure.of(error)
+
+    return wrapper
+
 
 # Requests store nothing, so they are retried if a replica dies.
 _ATTEMPTS = 2

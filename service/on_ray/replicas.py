@@ -24,8 +24,14 @@ from lalaloc_core.photograph import Photograph
 from service.app import create_app
 from service.errors import IndexTooLargeError, OverloadedError, UnknownFloorPlanError, UnknownVenueError
 from service.on_ray.index_shards import RemoteIndices, Stage
-from service.on_ray.outcome import Success, returning_failures
-from service.on_ray.remote import RemoteLocaliser, RemoteOptimiser, RemotePhotographEncoder, StoredPlace
+from service.on_ray.remote import (
+    RemoteLocaliser,
+    RemoteOptimiser,
+    RemotePhotographEncoder,
+    StoredPlace,
+    Success,
+    returning_failures,
+)
 from service.query import Where
 from service.query_components import Backends, warm_encoder
 from service.runtime import start_runtime

@@ -53,32 +53,38 @@ class PlanFile:
 
 def seems_native(file: UploadedFile) -> bool:
     """Return whether a file looks like a small native plan, which needs no worker."""
-    return len(file) <= LARGE and _seems_native(file.read())
-
-
-def _seems_native(content: bytes) -> bool:
-    is_small = len(content) <= LARGE and not begins_with_plans(content)
-    return is_small and is_json(content) and describe_file(content) is None
+    if len(file) > LARGE:
+        return False
+    content = file.read()
+    return is_json(content) and not begins_with_plans(content) and describe_file(content) is None
 
 
 @dataclass(frozen=True)
 class PlanReader:
-    """Reader of uploaded plan files; its calls block.
+    """Reader of an uploaded plan file; its calls block.
 
     Attributes:
+        content: the file.
+        options: options of its import.
+        is_native: result of `seems_native`; a worker still reads JSON of other formats.
+        client: client whose file it is.
         converter: workers for files that are not in the native format.
         settings: the settings.
-        permits: permits to compute in this process.
+        cores: cores to compute in this process.
+        on_step: as for `Converter.read`.
     """
 
+    content: bytes
+    options: ImportOptions
+    is_native: bool
+    client: str
     converter: Converter
     settings: Settings
-    permits: FairSemaphore
+    cores: FairSemaphore
+    on_step: OnStep | None = None
 
-    def read(
-        self, content: bytes, options: ImportOptions, name: str | None, client: str, on_step: OnStep | None = None
-    ) -> PlanFile:
-        """Return the only plan of a client's file; `name` is for a plan without, `on_step` as for `Converter.read`.
+    def read(self, name: str | None) -> PlanFile:
+        """Return the only plan of the file; `name` is for a plan without.
 
         Raises:
             InvalidFloorPlanError: the file is invalid or exceeds a limit.
@@ -89,44 +95,36 @@ class PlanReader:
             ConverterNotReadyError: no worker is running.
             StoppingError: the service is shutting down.
         """
-        if (native := self._read_native(content, options, name, client)) is not None:
-            return native
-        (imported,) = self.converter.read(content, options, client, building=name, on_step=on_step)
-        return self._plan_file(imported, client)
+        (plan,) = self._read(name, every_level=False)
+        return plan
 
-    def read_levels(
-        self, content: bytes, options: ImportOptions, building: str, client: str, on_step: OnStep | None = None
-    ) -> list[PlanFile]:
-        """Return the plans of the levels of a client's file, lowest first.
+    def read_levels(self, name: str) -> list[PlanFile]:
+        """Return the plans of the levels of the file, lowest first; raises as `read` does.
 
-        `building` is the name for plans that have none, and for those of several levels, unless the options have one.
-        `on_step` is as for `Converter.read`.
+        `name` is for plans that have none, and for those of several levels, unless the options have one.
         """
-        if (native := self._read_native(content, options, building, client)) is not None:
-            return [native]
-        read = self.converter.read
-        levels = read(content, options, client, every_level=True, building=building, on_step=on_step)
-        return [self._plan_file(imported, client) for imported in levels]
+        return self._read(name, every_level=True)
 
-    def _read_native(self, content: bytes, options: ImportOptions, name: str | None, client: str) -> PlanFile | None:
-        """Read a small native plan; None leaves other files, of formats that are supported, to the workers."""
-        if not content.strip():
-            raise InvalidFloorPlanError("the body is empty; send a plan file")
+    def _read(self, name: str | None, *, every_level: bool) -> list[PlanFile]:
         limits = self.settings.plans.import_limits
-        if _seems_native(content):
-            with self.permits.hold(client):
-                imported = import_if_native(content, options, limits, building=name)
+        if not self.content.strip():
+            raise InvalidFloorPlanError("the body is empty; send a plan file")
+        if self.is_native:
+            with self.cores.hold(self.client):
+                imported = import_if_native(self.content, self.options, limits, building=name)
                 if imported is not None:
-                    return PlanFile(
-                        imported.plan(limits.plan), report_of(imported), detect_media_type(content, "native")
-                    )
-        elif not is_json(content):
+                    media_type = detect_media_type(self.content, "native")
+                    return [PlanFile(imported.plan(limits.plan), report_of(imported), media_type)]
+        elif not is_json(self.content):
             # Reject unsupported formats before they take a worker.
-            detect_format(content, limits)
-        return None
+            detect_format(self.content, limits)
+        levels = self.converter.read(
+            self.content, self.options, self.client, every_level=every_level, building=name, on_step=self.on_step
+        )
+        return [self._plan_file(level) for level in levels]
 
-    def _plan_file(self, imported: Imported, client: str) -> PlanFile:
-        with self.permits.hold(client):
+    def _plan_file(self, imported: Imported) -> PlanFile:
+        with self.cores.hold(self.client):
             plan = imported.plan.plan()
         return PlanFile(
             plan, imported.report, imported.media_type, imported.level, imported.document, imported.description

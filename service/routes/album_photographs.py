@@ -14,20 +14,24 @@ from lalaloc_core.draw.plan import HEAT_PLACE
 from lalaloc_core.errors import InvalidCorrectionError, InvalidFeaturesError
 from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
 from service import errors
-from service.albums.album_corrections import correction_document, stored_correction
-from service.albums.album_files import pins_csv, pins_geojson, pins_svg
-from service.http.accept import preferred
-from service.http.conditional import expected_revision, not_modified, revision_etag, tagged_answer
-from service.http.cursors import cursor_text, parse_venue_cursor
+from service.albums.album_documents import correction_document, pins_csv, pins_geojson, pins_svg, stored_correction
+from service.capacity.admission_control import QUERY_IN_PARTS, admitted_as
 from service.http.fields import parse_document
-from service.http.multipart import Repeats
-from service.http.piecewise import NDJSON, LinesResponse
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, JSON, MULTIPART
+from service.http.representations import (
+    NDJSON,
+    LinesResponse,
+    expected_revision,
+    not_modified,
+    preferred,
+    revision_etag,
+    tagged_answer,
+)
+from service.http.uploads import GEOJSON, JSON, MULTIPART, Repeats
 from service.query import AlbumPhotographQuery, Content, QueryContext
 from service.routes.albums import album_of
 from service.routes.batch_lines import BatchLines
-from service.routes.dependencies import After, ApiCall, Call, is_id
+from service.routes.dependencies import After, ApiCall, Call, cursor_text, is_id, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
     CONDITIONAL,
@@ -101,6 +105,7 @@ _BODY = {
         errors.StoreFullError,
     ),
 )
+@admitted_as(QUERY_IN_PARTS)
 async def add_album_photographs(album_id: str, call: Call) -> Response:
     """Add photographs, whose pins are then found with all others of the album.
 

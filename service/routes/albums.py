@@ -11,12 +11,12 @@ from fastapi.responses import StreamingResponse
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.encode.features import gives_features
 from service import errors
-from service.http.conditional import not_modified, revision_etag, tagged_answer
+from service.capacity.admission_control import STREAM, admitted_as
 from service.http.events import EventStream
 from service.http.fields import parse_document
-from service.http.multipart import Parts
 from service.http.problems import problem_responses
-from service.http.uploads import JSON
+from service.http.representations import not_modified, revision_etag, tagged_answer
+from service.http.uploads import JSON, Parts
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
 from service.routes.descriptions import (
     BODY_ERRORS,
@@ -123,6 +123,7 @@ def get_album(album_id: str, call: Call) -> Response:
         **_ALBUM_RESPONSES,
     },
 )
+@admitted_as(STREAM)
 async def follow_album(album_id: str, call: Call) -> Response:
     """Stream server-sent events about the solution of an album.
 

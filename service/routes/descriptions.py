@@ -17,8 +17,8 @@ from lalaloc_core.errors import (
 )
 from service import errors
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
-from service.http.piecewise import NDJSON
 from service.http.problems import problem_responses
+from service.http.representations import NDJSON
 from service.http.uploads import JSON
 
 Errors = tuple[type[Exception], ...]

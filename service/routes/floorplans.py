@@ -11,8 +11,8 @@ from starlette.concurrency import run_in_threadpool
 from lalaloc_core.importers import OnStep
 from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.grids import GridState
-from service.http.conditional import not_modified, revision_etag, tagged_answer
 from service.http.problems import problem_responses
+from service.http.representations import not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON
 from service.plan_files.plan_description import describe, state_of_description, with_head
 from service.plan_files.plan_file import PlanFile
@@ -28,7 +28,7 @@ from service.routes.descriptions import (
     import_lines,
 )
 from service.routes.import_lines import answer_import
-from service.routes.plan_uploads import UPLOAD_BODY, prepare_plan, read_upload
+from service.routes.plan_uploads import UPLOAD_BODY, PlanUpload, prepare_plan, read_upload
 from service.schemas.stored_plans import FloorPlanAnswer, FloorPlanList, FloorPlanSummary
 from service.storage.records import PlanRecord, PlanSummary
 from service.stored_plan import Rendition
@@ -55,26 +55,22 @@ async def create_floorplan(call: Call) -> Response:
     """
     idempotent = call.idempotent()
     uploaded = await read_upload(call)
+    return await answer_import(call, idempotent, uploaded, partial(_create, call, uploaded))
+
+
+def _create(call: ApiCall, uploaded: PlanUpload, token: str, on_step: OnStep | None) -> Response:
     plans, grids = call.store.plans, call.runtime.grids
-
-    def store(token: str, on_step: OnStep | None) -> Response:
-        new, file = prepare_plan(uploaded, call, on_step)
-        record = plans.add(call.tenant, token, new, limit=call.settings.plans.max_floorplans)
-        if record.plan is new.plan:
-            grids.on_plan_stored(record, new.grid)
-            # Not read back, so that a stored plan is confirmed even if the database fails now.
-            state = GridState.after_upload(new.grid)
-        else:
-            # Stored by an earlier attempt, and possibly replaced since.
-            grids.on_plan_stored(record, None)
-            state = grids.states([call.plan(record.id)])[0]
-        return _change_answer(call, record, file, state, created=True)
-
-    async def run(on_step: OnStep | None) -> Response:
-        # One call from claim to answer, so that a disconnect does not interrupt it.
-        return await uploaded.store(call, idempotent.run, uploaded.parts, partial(store, on_step=on_step))
-
-    return await answer_import(call, run)
+    new, file = prepare_plan(uploaded, call, on_step)
+    record = plans.add(call.tenant, token, new, limit=call.settings.plans.max_floorplans)
+    if record.plan is new.plan:
+        grids.on_plan_stored(record, new.grid)
+        # Not read back, so that a stored plan is confirmed even if the database fails now.
+        state = GridState.after_upload(new.grid)
+    else:
+        # Stored by an earlier attempt, and possibly replaced since.
+        grids.on_plan_stored(record, None)
+        state = grids.states([call.plan(record.id)])[0]
+    return _change_answer(call, record, file, state, created=True)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(*READ_ERRORS))
@@ -125,18 +121,18 @@ async def replace_floorplan(floorplan_id: str, call: Call) -> Response:
     current = await call.upload(call.plan, floorplan_id)
     expected = call.expected_revision(current)
     uploaded = await read_upload(call)
+    return await uploaded.on_thread(call, _replace, call, uploaded, current, expected)
+
+
+def _replace(call: ApiCall, uploaded: PlanUpload, current: PlanSummary, expected: str | None) -> Response:
     plans, grids = call.store.plans, call.runtime.grids
-
-    def store() -> Response:
-        new, file = prepare_plan(uploaded, call)
-        keep = call.settings.plans.max_revisions
-        record = plans.add_revision(call.tenant, current.id, new, keep=keep, expected=expected)
-        # Before the new grid starts. The old grid stays in memory for queries in progress.
-        grids.cancel(current.revision_id)
-        grids.on_plan_stored(record, new.grid)
-        return _change_answer(call, record, file, GridState.after_upload(new.grid), created=False)
-
-    return await uploaded.store(call, store)
+    new, file = prepare_plan(uploaded, call)
+    keep = call.settings.plans.max_revisions
+    record = plans.add_revision(call.tenant, current.id, new, keep=keep, expected=expected)
+    # Before the new grid starts. The old grid stays in memory for queries in progress.
+    grids.cancel(current.revision_id)
+    grids.on_plan_stored(record, new.grid)
+    return _change_answer(call, record, file, GridState.after_upload(new.grid), created=False)
 
 
 @router.delete(

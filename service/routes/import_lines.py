@@ -7,47 +7,49 @@ import json
 import logging
 from collections.abc import AsyncGenerator, Callable, Coroutine
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from fastapi import Response
 
 from lalaloc_core.errors import LaLaLocError
-from lalaloc_core.importers import ImportStep, OnStep
+from lalaloc_core.importers import ImportStep
 from service import errors
-from service.http.accept import preferred
-from service.http.idempotent_request import REPLAYED
-from service.http.piecewise import NDJSON, LinesResponse
+from service.http.idempotent_request import REPLAYED, IdempotentRequest
 from service.http.problems import problem_document
+from service.http.representations import NDJSON, LinesResponse, preferred
 from service.http.uploads import JSON
 from service.routes.dependencies import ApiCall
+from service.routes.plan_uploads import PlanUpload
 from service.telemetry import LOGGER_NAME
 
 # A step that goes on is sent again after this time (s): proxies and clients end connections that stand still.
 _REPEAT_S = 10.0
 _WAITING = ImportStep("waiting for a worker")
 
-# Runs an import, which calls the given function with its steps, and returns the answer.
-Import = Callable[[OnStep | None], Coroutine[Any, Any, Response]]
+# Stores an import under a token, with a function that is told its steps (`on_step`), and returns the answer.
+Store = Callable[..., Response]
 
 
-async def answer_import(call: ApiCall, run: Import) -> Response:
+async def answer_import(call: ApiCall, idempotent: IdempotentRequest, uploaded: PlanUpload, store: Store) -> Response:
     """Answer an import in JSON, or in lines with its steps if the request prefers them.
 
-    The refusals of `run` are the last line then: the answer has begun, with status 200.
+    Refusals are the last line then: the answer has begun, with status 200.
     """
+    # On a thread as one call from claim to answer, so that a disconnect does not interrupt it.
+    run = partial(uploaded.on_thread, call, idempotent.run, uploaded.parts)
     if preferred(call.request, (JSON, NDJSON)) == JSON:
-        return await run(None)
-    return LinesResponse(_lines(call, run), call.settings.requests.request_deadline_s)
+        return await run(partial(store, on_step=None))
+    return LinesResponse(_lines(call, run, store), call.settings.requests.request_deadline_s)
 
 
-async def _lines(call: ApiCall, run: Import) -> AsyncGenerator[str]:
+async def _lines(
+    call: ApiCall, run: Callable[[Callable[[str], Response]], Coroutine[Any, Any, Response]], store: Store
+) -> AsyncGenerator[str]:
     latest = _LatestStep(asyncio.get_running_loop())
-
-    async def answer() -> Response:
-        # A task is not part of the request's own steps.
-        return await call.runtime.admission.cpu_accounts.charged_steps(call.client, run(latest.put))
-
-    task = asyncio.create_task(answer())
+    answer = run(partial(store, on_step=latest.put))
+    # A task is not part of the request's own steps.
+    task = asyncio.ensure_future(call.runtime.admission.cpu_accounts.charged_steps(call.client, answer))
     task.add_done_callback(lambda _task: latest.wake())
     step = _WAITING
     try:

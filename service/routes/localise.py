@@ -8,9 +8,10 @@ from fastapi import APIRouter, Query, Response
 
 from lalaloc_core.draw.answer import Picture
 from lalaloc_core.errors import InvalidHintError
+from service.capacity.admission_control import QUERY, admitted_as
 from service.errors import InvalidRequestError, UnanchoredPlanError
-from service.http.accept import preferred
 from service.http.problems import problem_responses
+from service.http.representations import preferred
 from service.http.uploads import GEOJSON, GEOPOSE, JSON
 from service.query import PhotographQuery, PictureRequest
 from service.query.geopose import geojson_feature, geopose_document
@@ -67,6 +68,7 @@ _ON_EARTH = {GEOJSON: geojson_feature, GEOPOSE: geopose_document}
     }
     | problem_responses(InvalidHintError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
 )
+@admitted_as(QUERY)
 async def localise(
     call: Call,
     picture: Annotated[

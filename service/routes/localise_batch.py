@@ -8,10 +8,10 @@ from fastapi import APIRouter, Response
 
 from lalaloc_core.errors import InvalidHintError
 from service import errors
-from service.capacity.admission_control import BATCH
-from service.http.multipart import Repeats
-from service.http.piecewise import NDJSON, LinesResponse
+from service.capacity.admission_control import QUERY_IN_PARTS, admitted_as
 from service.http.problems import problem_responses
+from service.http.representations import NDJSON, LinesResponse
+from service.http.uploads import Repeats
 from service.query import Content, PhotographQuery, QueryContext
 from service.routes.batch_lines import BatchLines
 from service.routes.dependencies import Call
@@ -34,7 +34,7 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
 
 
 @router.post(
-    BATCH,
+    "/localise/batch",
     summary="Localise many photographs, one by one",
     status_code=200,
     response_class=LinesResponse,
@@ -45,6 +45,7 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
         InvalidHintError, errors.RateLimitedError, errors.UnknownVenueError, errors.UnknownFloorPlanError, *QUERY_ERRORS
     ),
 )
+@admitted_as(QUERY_IN_PARTS)
 async def localise_batch(call: Call) -> Response:
     """Localise many photographs, each by itself, in a stored floor plan or in the plans of a venue.
 

@@ -7,11 +7,11 @@ from typing import Any
 from fastapi import APIRouter, Response
 
 from lalaloc_core.errors import InvalidFilmError
+from service.capacity.admission_control import QUERY, admitted_as
 from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
-from service.http.accept import preferred
-from service.http.multipart import Parts, Repeats
 from service.http.problems import problem_responses
-from service.http.uploads import GEOJSON, GEOPOSE, JSON, Settable
+from service.http.representations import preferred
+from service.http.uploads import GEOJSON, GEOPOSE, JSON, Parts, Repeats, Settable
 from service.query import Content, QueryContext, SequenceQuery
 from service.query.geopose import geojson_features, geopose_documents
 from service.routes.dependencies import ApiCall, Call
@@ -59,6 +59,7 @@ _ON_EARTH = {GEOJSON: geojson_features, GEOPOSE: geopose_documents}
     }
     | problem_responses(InvalidFilmError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
 )
+@admitted_as(QUERY)
 async def localise_sequence(call: Call) -> Response:
     """Localise photographs that were taken while turning on one spot in a stored floor plan, or in a venue.
 

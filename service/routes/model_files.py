@@ -16,10 +16,9 @@ from starlette.concurrency import run_in_threadpool
 from lalaloc_core.bundle import MANIFEST_NAME
 from lalaloc_core.localise.encode.features import DEVICE_FILES, device_manifest
 from service.errors import ChangedModelFileError, InvalidRequestError, RangeError, UnknownModelFileError
-from service.http.conditional import byte_range, digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.problems import problem_responses
-from service.http.request_end import on_request_end
-from service.http.uploads import JSON
+from service.http.representations import byte_range, digest_etag, not_modified, tagged_answer, tagged_stream
+from service.http.uploads import JSON, on_request_end
 from service.routes.dependencies import ApiCall, Call
 from service.routes.descriptions import PARTIAL, PARTIAL_CONTENT, file_response
 

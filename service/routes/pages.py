@@ -14,7 +14,7 @@ from mimetypes import guess_type
 from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
-from service.http.conditional import digest_etag, not_modified, tagged_answer
+from service.http.representations import digest_etag, not_modified, tagged_answer
 
 router = APIRouter(include_in_schema=False)
 

@@ -16,6 +16,7 @@ from lalaloc_core.conditions import HeadingState, Photograph, condition_of
 from lalaloc_core.draw.plan import HEAT_PLACE, Bounds, Marker, svg_around
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
+from service.capacity.admission_control import STREAM, admitted_as
 from service.errors import (
     ConverterNotReadyError,
     InvalidRequestError,
@@ -23,9 +24,9 @@ from service.errors import (
     UnknownFloorPlanError,
     UnmeasuredModelError,
 )
-from service.http.conditional import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
 from service.http.events import EventStream
 from service.http.problems import problem_responses
+from service.http.representations import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
 from service.http.uploads import JSON
 from service.routes.dependencies import ApiCall, Call, Revision
 from service.routes.descriptions import (
@@ -239,6 +240,7 @@ async def get_layout(floorplan_id: str, call: Call, revision: Revision = None) -
         **PLAN_RESPONSES,
     },
 )
+@admitted_as(STREAM)
 async def follow_floorplan(floorplan_id: str, call: Call) -> Response:
     """Stream server-sent events about the plan's pose grid.
 

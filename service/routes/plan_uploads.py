@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ParamSpec
+from typing import Any, ParamSpec, TypeVar
 
 from fastapi import Response
 from pydantic import BaseModel
@@ -12,8 +12,7 @@ from pydantic import BaseModel
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, OnStep, building_name
 from service.errors import InvalidRequestError
-from service.http.multipart import Parts, read_parts
-from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_body
+from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
 from service.routes.dependencies import ApiCall
 from service.routes.descriptions import json_body
@@ -24,6 +23,7 @@ from service.stored_plan import PlanDocument
 from service.uploaded_file import UploadedFile
 
 P = ParamSpec("P")
+T = TypeVar("T")
 _FILE = "file"
 # Levels of a venue, as in requests.
 _MAX_LEVEL = 1000.0
@@ -68,31 +68,52 @@ LEVELS_FORM: dict[str, Any] = {"schema": _form_schema(LevelsForm)}
 
 @dataclass(frozen=True)
 class PlanUpload:
-    """Uploaded file with its options."""
+    """Uploaded file with its options.
+
+    Attributes:
+        file: the file.
+        options: options of its import.
+        parts: the parts that identify the request for idempotency.
+        is_native: see `PlanReader`.
+    """
 
     file: UploadedFile
     options: ImportOptions
-    fields: Mapping[str, str]
+    parts: Parts
+    is_native: bool
 
-    @property
-    def parts(self) -> Parts:
-        """The parts that identify the request for idempotency."""
-        return Parts(dict(self.fields), {_FILE: self.file})
-
-    async def store(self, call: ApiCall, work: Callable[P, Response], *args: P.args, **kwargs: P.kwargs) -> Response:
-        """Read and store it on a thread; files that wait for a worker have threads of their own."""
-        threads = call.runtime.uploads if seems_native(self.file) else call.runtime.file_uploads
+    async def on_thread(
+        self, call: ApiCall, work: Callable[P, Response], *args: P.args, **kwargs: P.kwargs
+    ) -> Response:
+        """Run work on the file on a thread; files that wait for a worker have threads of their own."""
+        threads = call.runtime.uploads if self.is_native else call.runtime.file_uploads
         return await threads.run(call.client, work, *args, **kwargs)
+
+    def reader(self, call: ApiCall, on_step: OnStep | None) -> PlanReader:
+        """Return the reader of the file."""
+        runtime = call.runtime
+        return PlanReader(
+            self.file.read(),
+            self.options,
+            self.is_native,
+            call.client,
+            runtime.converter,
+            runtime.settings,
+            runtime.permits,
+            on_step,
+        )
 
 
 async def read_upload(call: ApiCall, form: type[BaseModel] = ImportForm) -> PlanUpload:
     """Read the file in a request, with its options, the fields of a form."""
     limits = UploadLimits.of(call.settings, "max_plan_bytes")
     if media_type(call.request, (MULTIPART, *_FILES)) != MULTIPART:
-        return PlanUpload(await read_body(call.request, limits), ImportOptions(), {})
-    known = set(form.model_fields)
-    parts = await read_parts(call.request, limits, files={_FILE}, fields=known, check=_faults)
-    return PlanUpload(parts.files[_FILE], ImportOptions.from_text(parts.fields), parts.fields)
+        parts = Parts({}, {_FILE: await read_body(call.request, limits)})
+    else:
+        known = set(form.model_fields)
+        parts = await read_parts(call.request, limits, files={_FILE}, fields=known, check=_faults)
+    file = parts.files[_FILE]
+    return PlanUpload(file, ImportOptions.from_text(parts.fields), parts, seems_native(file))
 
 
 def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
@@ -116,12 +137,11 @@ def prepare_plan(uploaded: PlanUpload, call: ApiCall, on_step: OnStep | None = N
 
     `on_step` is as for `Converter.read`.
     """
-    content, runtime = uploaded.file.read(), call.runtime
-    name = building_name(uploaded.file.name)
-    file = _reader(call).read(content, uploaded.options, name, call.client, on_step)
-    runtime.grids.check_size(file.plan)
-    original = Original(content, file.media_type, file.report)
-    return _new_plan(file, original, runtime.grids.prepare(file.plan, call.client), 0.0, call), file
+    reader, grids = uploaded.reader(call, on_step), call.runtime.grids
+    file = reader.read(building_name(uploaded.file.name))
+    grids.check_size(file.plan)
+    original = Original(reader.content, file.media_type, file.report)
+    return _new_plan(file, original, grids.prepare(file.plan, call.client), 0.0, call), file
 
 
 def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnStep | None = None) -> list[NewPlan]:
@@ -129,21 +149,17 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnSt
 
     `on_step` is as for `Converter.read`.
     """
-    content, runtime = uploaded.file.read(), call.runtime
-    files = _reader(call).read_levels(content, uploaded.options, name, call.client, on_step)
+    reader, provider = uploaded.reader(call, on_step), call.runtime.grids
+    files = reader.read_levels(name)
     limit = call.settings.plans.max_venue_plans
     if len(files) > limit:
         fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"
         raise InvalidRequestError([("file", fault)])
     for file in files:
-        runtime.grids.check_size(file.plan, None if file.level is None else file.level.name)
-    grids = runtime.grids.prepare_all([file.plan for file in files], call.client)
-    originals = [_original(file, content if len(files) == 1 else None) for file in files]
+        provider.check_size(file.plan, None if file.level is None else file.level.name)
+    grids = provider.prepare_all([file.plan for file in files], call.client)
+    originals = [_original(file, reader.content if len(files) == 1 else None) for file in files]
     return [_new_plan(*values, call) for values in zip(files, originals, grids, _level_numbers(files), strict=True)]
-
-
-def _reader(call: ApiCall) -> PlanReader:
-    return PlanReader(call.runtime.converter, call.settings, call.runtime.permits)
 
 
 def _new_plan(file: PlanFile, original: Original, grid: ComputedGrid | None, level: float, call: ApiCall) -> NewPlan:

@@ -15,17 +15,18 @@ from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
 from lalaloc_core.localise.search.pipeline import StageClock
 from service import errors
-from service.http.multipart import Parts, Repeats, read_parts
+from service.http.fields import faults_of, validate_fields
 from service.http.uploads import (
     GEOJSON,
     GEOPOSE,
     JSON,
     MULTIPART,
+    Parts,
+    Repeats,
     Settable,
     UploadLimits,
-    faults_of,
     media_type,
-    validate_fields,
+    read_parts,
 )
 from service.query import Content, QueryContext
 from service.routes.dependencies import ApiCall

@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Response, status
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from service.capacity.admission_control import PROBE, admitted_as
 from service.capacity.fair_share import max_per_client
 from service.errors import StoreUnavailableError
 from service.http.problems import problem_responses
@@ -28,6 +29,7 @@ router = APIRouter(tags=["operations"])
 
 
 @router.get("/healthz", summary="Check liveness")
+@admitted_as(PROBE)
 async def get_health() -> HealthAnswer:
     """Return `ok` while the process runs."""
     return HealthAnswer(status="ok")
@@ -43,6 +45,7 @@ async def get_health() -> HealthAnswer:
         }
     },
 )
+@admitted_as(PROBE)
 async def get_readiness(runtime: Running, response: Response) -> ReadyAnswer:
     """Return 200 once the model and all workers are ready, and 503 before that and while the service stops.
 
@@ -68,6 +71,7 @@ async def get_readiness(runtime: Running, response: Response) -> ReadyAnswer:
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
+@admitted_as(PROBE)
 async def get_metrics(runtime: Running) -> Response:
     """Return all metrics in Prometheus' text format."""
     # A coroutine, because it takes milliseconds and must work when every thread is busy.

@@ -12,11 +12,11 @@ from fastapi import APIRouter, Response, status
 from lalaloc_core.errors import InvalidHintError, InvalidMotionError, InvalidPoseError
 from lalaloc_core.render.sampling import grid_size
 from service import errors
-from service.http.accept import preferred
+from service.capacity.admission_control import QUERY, admitted_as
 from service.http.fields import parse_document
-from service.http.multipart import Parts
 from service.http.problems import problem_responses
-from service.http.uploads import GEOPOSE, JSON, MULTIPART, media_type
+from service.http.representations import preferred
+from service.http.uploads import GEOPOSE, JSON, MULTIPART, Parts, media_type
 from service.query import MAX_POSES, TrackQuery
 from service.query.geopose import geopose_document
 from service.routes.dependencies import ApiCall, Call, is_id
@@ -132,6 +132,7 @@ def delete_session(session_id: str, call: Call) -> None:
         *IDEMPOTENCY_ERRORS,
     ),
 )
+@admitted_as(QUERY)
 async def add_photograph(session_id: str, call: Call) -> Response:
     """Follow the camera to its next photograph.
 

@@ -18,13 +18,11 @@ from service.errors import (
     TooManyVenuesError,
     UnknownVenueError,
 )
-from service.http.conditional import not_modified, revision_etag, tagged_answer
-from service.http.cursors import parse_venue_cursor
 from service.http.fields import Model, parse_document
-from service.http.multipart import Parts
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, media_type
-from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
+from service.http.representations import not_modified, revision_etag, tagged_answer
+from service.http.uploads import JSON, MULTIPART, Parts, media_type
+from service.routes.dependencies import ApiCall, Call, Name, Page, is_id, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
     CONDITIONAL,
@@ -39,7 +37,7 @@ from service.routes.descriptions import (
     json_body,
 )
 from service.routes.import_lines import answer_import
-from service.routes.plan_uploads import LEVELS_FORM, prepare_levels, read_upload
+from service.routes.plan_uploads import LEVELS_FORM, PlanUpload, prepare_levels, read_upload
 from service.schemas.plan_import import LevelsForm
 from service.schemas.venues import (
     VenueAnchorAnswer,
@@ -86,21 +84,7 @@ async def create_venue(call: Call) -> Response:
     idempotent, limits = call.idempotent(), call.settings.plans
     if media_type(call.request, (JSON, MULTIPART)) == MULTIPART:
         uploaded = await read_upload(call, LevelsForm)
-
-        def store_levels(token: str, on_step: OnStep | None) -> Response:
-            name = uploaded.options.name or building_name(uploaded.file.name) or _DEFAULT_NAME
-            plans = prepare_levels(uploaded, call, name, on_step)
-            record, stored = call.store.venue_imports.add(
-                call.tenant, token, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
-            )
-            _announce(plans, stored, call)
-            return _change_answer(call, record, created=True)
-
-        async def run(on_step: OnStep | None) -> Response:
-            work = partial(store_levels, on_step=on_step)
-            return await uploaded.store(call, idempotent.run, uploaded.parts, work)
-
-        return await answer_import(call, run)
+        return await answer_import(call, idempotent, uploaded, partial(_create_of_levels, call, uploaded))
     content = await call.read_json()
 
     def store(token: str) -> Response:
@@ -111,6 +95,17 @@ async def create_venue(call: Call) -> Response:
         return _change_answer(call, record, created=True)
 
     return await call.upload(idempotent.run, Parts({}, {"body": content}), store)
+
+
+def _create_of_levels(call: ApiCall, uploaded: PlanUpload, token: str, on_step: OnStep | None) -> Response:
+    limits = call.settings.plans
+    name = uploaded.options.name or building_name(uploaded.file.name) or _DEFAULT_NAME
+    plans = prepare_levels(uploaded, call, name, on_step)
+    record, stored = call.store.venue_imports.add(
+        call.tenant, token, name, plans, max_plans=limits.max_floorplans, max_venues=limits.max_venues
+    )
+    _announce(plans, stored, call)
+    return _change_answer(call, record, created=True)
 
 
 @router.get("", summary="List venues", responses=problem_responses(*READ_ERRORS))
@@ -263,7 +258,7 @@ async def _add_levels(venue_id: str, call: ApiCall) -> Response:
         _announce(plans, stored, call)
         return _change_answer(call, record, created=False)
 
-    return await uploaded.store(call, idempotent.run, uploaded.parts, store)
+    return await uploaded.on_thread(call, idempotent.run, uploaded.parts, store)
 
 
 def _announce(plans: list[NewPlan], records: list[PlanRecord], call: ApiCall) -> None:

@@ -1,11 +1,9 @@
 """Access control: API keys, tokens, scopes, rate limits, the audit log, and the rules while keys are off.
 
-access_control  checks of a request: exposure, key or token, rate, scope, in this order
+access_control  checks of a request: exposure, key or token, rate limit, scope, in this order
 ├── exposure        without keys: local requests only, unless configured otherwise
-├── keys            creating, hashing and parsing keys
-├── key_cache       valid keys, cached for a few seconds
+├── keys            creating, hashing and parsing keys; valid keys, cached for a few seconds
 ├── oidc            tokens of an OpenID Connect issuer, with the keys that it publishes
-├── rate_limits     requests per key, and invalid keys per client address
 └── permissions     scopes, the scope of each route, the caller of a request
 audit           entries of the audit log: changes at once, refusals counted per minute
 

@@ -28,7 +28,7 @@ from service.security.permissions import Caller, Permission, permissions_needed,
 from service.storage.audit_log import AuditLog
 from service.storage.records import ANONYMOUS, DONE, AuditEntry
 from service.telemetry import LOGGER_NAME
-from service.telemetry.log_fields import log_fields_of
+from service.telemetry.logs import log_fields_of
 
 # Refusals that are audited, besides those of changes.
 AUDITED_REFUSALS = tuple(error for error in REFUSALS if error is not StoreUnavailableError)

@@ -21,5 +21,4 @@ Begin with `store.py`, then `plans.py`. Indented rows are deleted with the row t
 is one statement. `migrations` creates the tables; `tables.py` describes their current state.
 """
 
-from service.storage.plan_lookup import PlanLookup
-from service.storage.store import Store, open_store
+from service.storage.store import PlanLookup, Store, open_store

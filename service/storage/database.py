@@ -350,3 +350,25 @@ def _identity(path: str | None) -> tuple[int, int] | None:
 def _tells_damage(error: BaseException | None) -> bool:
     """Return True for an error of SQLite about the file itself."""
     return (getattr(error, "sqlite_errorname", None) or "").startswith(_DAMAGED)
+
+
+# Duration (s) without calls after a failure.
+_OPEN_S = 1.0
+
+
+class CircuitBreaker:
+    """Switch that is open for a moment after the database failed; safe to share between threads."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Create a closed circuit breaker with a clock (s)."""
+        self._clock = clock
+        self._open_until_s = -float("inf")
+
+    @property
+    def is_open(self) -> bool:
+        """True shortly after a failure of the database."""
+        return self._clock() < self._open_until_s
+
+    def trip(self) -> None:
+        """Open the circuit breaker, because the database failed."""
+        self._open_until_s = self._clock() + _OPEN_S

@@ -16,8 +16,8 @@ from lalaloc_core.localise.query import DEFAULT_STD_M
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_places import place_columns
-from service.storage.records import GridKey, NewPlan, Original, PlanRecord
-from service.storage.statements import write_all_chunks, write_chunks
+from service.storage.records import JSON, GridKey, NewPlan, Original, PlanRecord
+from service.storage.statements import damaged, read_chunks, write_all_chunks, write_chunks
 from service.storage.stored_bytes import ROW_BYTES, StoredBytes
 from service.storage.stored_grids import grid_bytes, insert_grid, insert_grids
 from service.storage.tables import FLOORPLANS, ORIGINAL_CHUNKS, REVISIONS
@@ -142,3 +142,45 @@ def _height_std_m(plan: FloorPlan) -> float | None:
     if plan.camera_height_std_m is not None:
         return plan.camera_height_std_m
     return DEFAULT_STD_M if plan.states_camera_height else None
+
+
+@dataclass(frozen=True)
+class OriginalFile:
+    """Uploaded file of a revision, without its content."""
+
+    media_type: str
+    size_bytes: int
+
+
+class Originals:
+    """Uploaded files of all tenants. Callers check access first."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def digest(self, revision_id: str) -> str | None:
+        """Return the SHA-256 digest of a revision's file."""
+        with self._database.reading() as connection:
+            return connection.scalar(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
+
+    def checked(self, revision_id: str) -> OriginalFile | None:
+        """Compare a revision's file with its digest, and return the file."""
+        columns = REVISIONS.c
+        query = select(columns.plan_id, columns.original_sha256, columns.original_media_type)
+        digest, size_bytes = hashlib.sha256(), 0
+        with self._database.reading() as connection:
+            row = connection.execute(query.where(columns.id == revision_id)).one_or_none()
+            if row is None:
+                return None
+            for chunk in read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": revision_id}):
+                digest.update(chunk)
+                size_bytes += len(chunk)
+        if digest.hexdigest() != row.original_sha256:
+            raise damaged("original", row.plan_id, revision_id)
+        return OriginalFile(row.original_media_type or JSON, size_bytes)
+
+    def chunk(self, revision_id: str, number: int) -> bytes | None:
+        """Return one chunk of a revision's file; None after the last, and if the revision was deleted."""
+        own, place = ORIGINAL_CHUNKS.c.revision_id == revision_id, ORIGINAL_CHUNKS.c.number == number
+        with self._database.reading() as connection:
+            return connection.scalar(select(ORIGINAL_CHUNKS.c.content).where(own, place))

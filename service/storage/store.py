@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from time import monotonic
 
 from alembic.migration import MigrationContext
 from alembic.operations import Operations
@@ -16,21 +17,22 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lalaloc_core.errors import ConfigError
+from service.capacity.threads import BoundedReads
+from service.errors import StoreBusyError, StoreUnavailableError
 from service.settings import Settings
 from service.storage.album_jobs import AlbumJobs
 from service.storage.albums import Albums
-from service.storage.api_keys import ApiKeys
+from service.storage.api_keys import ApiKeys, TenantLimits, Tenants
 from service.storage.audit_log import AuditLog
-from service.storage.database import Database, State
-from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
-from service.storage.kept_answers import KeptAnswers
-from service.storage.originals import Originals
+from service.storage.database import CircuitBreaker, Database, State
+from service.storage.kept_answers import MIN_LEASE_S, IdempotencyKeys, KeptAnswers
 from service.storage.plan_cache import PlanCache
+from service.storage.plan_rows import Originals
 from service.storage.plans import Plans
+from service.storage.records import PlanRecord
 from service.storage.sessions import Sessions
 from service.storage.stored_bytes import StorageQuota
 from service.storage.stored_grids import GridLeases, StoredGrids
-from service.storage.tenants import TenantLimits, Tenants
 from service.storage.venue_imports import VenueImports
 from service.storage.venues import Venues
 
@@ -209,3 +211,52 @@ def _migrate(database: Database) -> None:
             for step in steps:
                 step.module.upgrade()
                 context.stamp(script, step.revision)
+
+
+class PlanLookup:
+    """Lookup of plans for queries; safe to share between threads."""
+
+    def __init__(self, store: Store, *, max_age_s: float) -> None:
+        """Create the lookup.
+
+        Args:
+            store: the store.
+            max_age_s: maximum age (s) of a plan in memory since it was last read or stored.
+        """
+        self._store = store
+        self._max_age_s = max_age_s
+        self._breaker = CircuitBreaker()
+
+    async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
+        """Return a plan at its current revision, or at the last known one while the database is unavailable.
+
+        Args:
+            tenant: owner of the plan.
+            plan_id: id of the plan.
+            reads: threads for reads of the database, which may be silent.
+
+        Raises:
+            StoreUnavailableError: the database is unavailable, and the plan was not read recently; or too many reads
+                wait already.
+            StoreBusyError: all connections are in use.
+        """
+        if self._breaker.is_open and (known := self._recent(tenant, plan_id)) is not None:
+            return known
+        begin_s = monotonic()
+        try:
+            found = await reads.run(tenant, self._store.plans.find, tenant, plan_id)
+        except StoreUnavailableError as error:
+            if isinstance(error, StoreBusyError) or self._store.answered_since(begin_s):
+                # The database answers, so the plan may have been deleted.
+                raise
+            self._breaker.trip()
+            if (known := self._recent(tenant, plan_id)) is None:
+                raise
+            return known
+        if found is None or found.is_parsed:
+            return None if found is None else self._store.plans.record(found)
+        # On a thread of the tenant.
+        return await reads.process(tenant, self._store.plans.record, found)
+
+    def _recent(self, tenant: str, plan_id: str) -> PlanRecord | None:
+        return self._store.plan_cache.recent(tenant, plan_id, self._max_age_s)

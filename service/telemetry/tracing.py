@@ -11,8 +11,7 @@ from time import perf_counter, time_ns
 from typing import TYPE_CHECKING
 
 from lalaloc_core.errors import ConfigError
-from service.telemetry.log_fields import RequestLogFields
-from service.telemetry.trace_context import TraceContext
+from service.telemetry.logs import RequestLogFields, TraceContext
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace.export import SpanExporter

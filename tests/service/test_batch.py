@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.http.piecewise import LinesResponse
+from service.http.representations import LinesResponse
 from service.storage.store import Store
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.test_security import bearer, make_key

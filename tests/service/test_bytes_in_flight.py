@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from starlette.requests import Request
 from starlette.types import Message
 
-from service.capacity.bytes_in_flight import BytesInFlight
+from service.capacity.admission_control import BytesInFlight
 from service.errors import BytesInFlightError, UploadTooLargeError
-from service.http.multipart import read_parts
-from service.http.request_end import ending_request
-from service.http.uploads import UploadLimits, read_body
+from service.http.uploads import UploadLimits, ending_request, read_body, read_parts
 from service.uploaded_file import UploadedFile
 from tests.service.conftest import FLAT, StartApp, assert_problem, wait_for
 from tests.service.test_uploads import open_body

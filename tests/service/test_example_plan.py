@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from examples.truth import PLAN_PATH
-from service.cli.example_plan import store_example
+from service.cli.entry_point import store_example
 from service.settings import Settings
 from service.storage import open_store
 

@@ -40,13 +40,11 @@ from service.errors import (
 from service.grids import builder
 from service.grids.embedding import embed, grid_bytes
 from service.grids.grid_jobs import MAX_ON_DEMAND
-from service.grids.grid_provider import GridProvider
-from service.grids.heights import check_height_m, grid_height_m
+from service.grids.grid_provider import GridProvider, check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper
 from service.settings import Settings
-from service.storage.plan_lookup import PlanLookup
 from service.storage.records import NewPlan, Original, PlanRecord
-from service.storage.store import Store
+from service.storage.store import PlanLookup, Store
 from service.telemetry import Telemetry
 from tests.service.conftest import FLAT, DatabaseOf, OpenStore, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer

@@ -11,14 +11,13 @@ from starlette.requests import Request
 from starlette.types import Message
 
 from lalaloc_core.errors import LaLaLocError
-from service.http.conditional import expected_revision
-from service.http.cursors import parse_cursor
 from service.http.idempotent_request import _key_of
-from service.http.multipart import read_parts
-from service.http.uploads import UploadLimits
+from service.http.representations import expected_revision
+from service.http.uploads import UploadLimits, read_parts
+from service.routes.dependencies import parse_cursor
 from service.security.exposure import is_allowed_host
 from service.security.keys import parse_authorization
-from service.telemetry.trace_context import parse_traceparent
+from service.telemetry.logs import parse_traceparent
 from tests.growth import assert_no_worse_than_linear
 
 # Slightly more than the maximum size of a request's head.

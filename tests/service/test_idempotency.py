@@ -29,9 +29,9 @@ from service.errors import (
     UploadTimeoutError,
 )
 from service.http.idempotent_request import IdempotentRequest, parts_sha256
-from service.http.multipart import Parts
+from service.http.uploads import Parts
 from service.pools.job_queue import JobLostError
-from service.storage.idempotency_keys import IdempotencyKeys
+from service.storage.kept_answers import IdempotencyKeys
 from service.storage.records import Claimed, NewPlan, Original
 from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids

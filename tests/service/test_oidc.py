@@ -26,7 +26,7 @@ from joserfc.jwt import JWTClaimsRegistry
 
 from lalaloc_core.errors import ConfigError
 from service.errors import IssuerUnavailableError, UnauthenticatedError
-from service.security import oidc, rate_limits
+from service.security import access_control, oidc
 from service.security.oidc import TokenVerifier
 from service.security.permissions import Identity, Permission
 from service.settings import Settings
@@ -458,7 +458,7 @@ def test_unsafe_settings_are_refused(settings: dict[str, Any], reason: str) -> N
 def test_invalid_tokens_are_limited_and_events_end_with_the_token(
     start_app: StartApp, tmp_path: Path, issuer: AnyIssuer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 5)
+    monkeypatch.setattr(access_control, "REFUSED_KEYS_PER_MINUTE", 5)
     later_s = 0
 
     def registry(now: int, **options: Any) -> JWTClaimsRegistry:

@@ -28,7 +28,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c co
 from ray import serve  # noqa: E402
 
 from service.on_ray import app  # noqa: E402
-from service.on_ray.outcome import Failure, Success, returning_failures  # noqa: E402
+from service.on_ray.remote import Failure, Success, returning_failures  # noqa: E402
 from tests.service.ray_cluster import NAME  # noqa: E402
 from tests.service.test_venue_queries import ask, venue_of  # noqa: E402
 

@@ -13,7 +13,7 @@ from PIL import Image
 from starlette.requests import Request
 
 from lalaloc_client import Client
-from service.http.accept import preferred
+from service.http.representations import preferred
 from tests.service.conftest import assert_problem, upload
 
 JSON, PNG, SVG = "application/json", "image/png", "image/svg+xml"

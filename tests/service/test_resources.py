@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors import InvalidRequestError
-from service.http.cursors import cursor_text, parse_cursor
+from service.routes.dependencies import cursor_text, parse_cursor
 from service.storage.records import Cursor
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer

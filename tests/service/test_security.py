@@ -26,12 +26,11 @@ from starlette.types import Receive, Scope, Send
 from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.errors import StoreBusyError, StoreUnavailableError, TooManyRefusedKeysError
-from service.security import rate_limits
+from service.security import access_control
+from service.security.access_control import RateLimits
 from service.security.exposure import check_address, is_local
-from service.security.key_cache import KeyCache
-from service.security.keys import PresentedKey, hash_of, key_text, new_secret, parse_authorization
+from service.security.keys import KeyCache, PresentedKey, hash_of, key_text, new_secret, parse_authorization
 from service.security.permissions import NEEDED, OPEN_PATHS, PAGES, Permission
-from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.records import ApiKey
 from service.storage.store import Store
@@ -154,7 +153,7 @@ def guarded(
     data_dir = tmp_path_factory.mktemp("data")
     rates = {"rate_per_minute": 0, "rate_burst": 0}
     with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
-        patch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 10**6)
+        patch.setattr(access_control, "REFUSED_KEYS_PER_MINUTE", 10**6)
         client = stack.enter_context(start_app(data_dir, api_keys=True, key_cache_s=0.1, keep_answers_s=600.0, **rates))
         store = Store(database_of(data_dir))
         key = make_key(store)
@@ -453,7 +452,7 @@ def test_bytes_of_reads_count_as_requests(start_app: StartApp, database_of: Data
         store = Store(database_of(tmp_path))
         key = make_key(store)
         client.headers.update(bearer(key))
-        content = json.dumps(FLAT).encode() + b" " * 5 * rate_limits.BYTES_PER_REQUEST
+        content = json.dumps(FLAT).encode() + b" " * 5 * access_control.BYTES_PER_REQUEST
         headers = {"Content-Type": "application/json"}
         url = client.post("/floorplans", content=content, headers=headers).headers["location"]
         # Six requests each, after one upload. A minute that ends during the test allows some more.
@@ -480,7 +479,7 @@ def test_burst_is_limited(start_app: StartApp, database_of: DatabaseOf, tmp_path
 def test_many_invalid_keys_do_not_block_valid_ones(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 5)
+    monkeypatch.setattr(access_control, "REFUSED_KEYS_PER_MINUTE", 5)
     with start_app(tmp_path, api_keys=True, key_cache_s=0.0) as client:
         store = Store(database_of(tmp_path))
         key = make_key(store)
@@ -501,7 +500,7 @@ def test_many_invalid_keys_do_not_block_valid_ones(
 
 
 def test_address_counters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 1)
+    monkeypatch.setattr(access_control, "REFUSED_KEYS_PER_MINUTE", 1)
 
     async def count() -> int:
         rates = RateLimits(Settings())
@@ -752,7 +751,7 @@ def test_public_address_without_keys_is_refused(host: str, settings: dict[str, A
         check_address(host, Settings(**settings))
 
 
-@pytest.mark.parametrize("command", [["service"], ["service.cli", "serve"]], ids=" ".join)
+@pytest.mark.parametrize("command", [["service"]], ids=" ".join)
 def test_service_does_not_start_publicly_without_keys(command: list[str], tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", *command, "--host", "0.0.0.0", "--port", "0"],

@@ -15,7 +15,7 @@ import pytest
 from sqlalchemy import update
 
 from service.errors import StoreUnavailableError
-from service.storage.idempotency_keys import IdempotencyKeys
+from service.storage.kept_answers import IdempotencyKeys
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.venues import venue_plans

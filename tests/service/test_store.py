@@ -26,8 +26,8 @@ from service.errors import (
     UnknownFloorPlanError,
 )
 from service.storage import database
-from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
-from service.storage.originals import OriginalFile
+from service.storage.kept_answers import KEPT_FOR, IdempotencyKeys
+from service.storage.plan_rows import OriginalFile
 from service.storage.plans import PlanDocument
 from service.storage.records import (
     Claimed,

@@ -29,8 +29,7 @@ from opentelemetry.trace import SpanContext
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.localise.search.pipeline import StageClock
 from service.telemetry import LOGGER_NAME, RequestLogFields
-from service.telemetry.logs import JsonFormatter
-from service.telemetry.trace_context import TraceContext, child_of, parse_traceparent
+from service.telemetry.logs import JsonFormatter, TraceContext, child_of, parse_traceparent
 from service.telemetry.tracing import Tracing, otlp_exporter
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 

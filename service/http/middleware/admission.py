@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from typing import Any, cast
 
 from starlette.datastructures import Headers
 from starlette.requests import Request
+from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.capacity.admission_control import EXEMPT, Admission, bounds_itself, is_query, is_read
-from service.capacity.bytes_in_flight import BodyBudget
+from service.capacity.admission_control import CHANGE, PROBE, READ, Admission, BytesInFlight, RouteClass, declared_class
 from service.capacity.cpu_accounts import PROBES, CpuAccounts
 from service.capacity.fair_share import FairSemaphore
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
 from service.http.problems import problem_answer
-from service.http.request_end import ending_request
+from service.http.uploads import ending_request
 from service.security.access_control import routed_path
 from service.security.permissions import caller_of
 
@@ -25,13 +25,24 @@ from service.security.permissions import caller_of
 _FREE_BYTES, _RECEIVING_S = 8 * 2**20, 5e-9
 # CPU time (s) of a refused query that is not measured: of its connection, head and key.
 _REFUSED_S = 1e-3
+# Budget that a body of unknown length takes at a time.
+_STEP_BYTES = 2**20
+_READING = frozenset({"GET", "HEAD", "OPTIONS"})
+_SCOPE_KEY = "lalaloc.read_permit"
 
 
 class AdmissionMiddleware:
-    """Middleware that holds a slot for a request, or refuses it before its body is read."""
+    """Middleware that holds a slot for a request, or refuses it before its body is read.
 
-    def __init__(self, app: ASGIApp) -> None:
+    Args:
+        app: the app.
+        routes: routes, of which some declare the class of their requests (`admitted_as`).
+    """
+
+    def __init__(self, app: ASGIApp, routes: Sequence[Route]) -> None:
         self._app = app
+        classes = [(route, declared_class(route.endpoint)) for route in routes]
+        self._declared = [(route, declared) for route, declared in classes if declared is not None]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
@@ -40,35 +51,42 @@ class AdmissionMiddleware:
         if scope["type"] != "http" or admission is None:
             await self._app(scope, receive, send)
             return
-        path = routed_path(scope)
-        if path in EXEMPT:
-            # They have no key, and need no slot.
+        route_class = self._class_of(scope)
+        if route_class == PROBE:
+            # Without a key.
             await _Rests(admission.cpu_accounts, PROBES, query=False).take()
             handled = cast(Coroutine[Any, Any, None], self._app(scope, receive, send))
             await admission.cpu_accounts.charged_steps(PROBES, handled, rests=True)
             return
         try:
             client = caller_of(scope).client
-            with admission.slot_for(client, scope["method"], path):
-                await self._handle(admission, client, scope, receive, send)
+            with admission.slot_for(client, route_class):
+                await self._handle(admission, route_class, client, scope, receive, send)
         except (OverloadedError, StoppingError) as error:
             await problem_answer(Request(scope), error)(scope, receive, send)
 
-    async def _handle(self, admission: Admission, client: str, scope: Scope, receive: Receive, send: Send) -> None:
-        path = routed_path(scope)
-        semaphore = admission.reading if is_read(scope["method"], path) else None
+    def _class_of(self, scope: Scope) -> RouteClass:
+        method, path = scope["method"], routed_path(scope)
+        for route, declared in self._declared:
+            if method in (route.methods or ()) and route.path_regex.match(path):
+                return declared
+        return READ if method in _READING else CHANGE
+
+    async def _handle(
+        self, admission: Admission, route_class: RouteClass, client: str, scope: Scope, receive: Receive, send: Send
+    ) -> None:
+        rests = _Rests(admission.cpu_accounts, client, query=route_class.is_query)
+        permit = scope[_SCOPE_KEY] = _ReadPermit(admission.reading, client, rests)
         stated = Headers(scope=scope).get("content-length", "")
-        body = BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
-        rests = _Rests(admission.cpu_accounts, client, query=is_query(path))
-        connection = _Connection(receive, send, body, rests)
-        limit_s = None if bounds_itself(scope["method"], path) else admission.limits.deadline_s
+        body = _BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
+        connection = _Connection(receive, send, body, rests, on_answer=permit.end)
+        limit_s = None if route_class.in_parts else admission.deadline_s
         try:
-            async with asyncio.timeout(limit_s), connection, _Permit(semaphore, client, rests) as permit:
-                connection.on_answer = permit.end
+            async with asyncio.timeout(limit_s), connection, permit.until_the_answer(needed=route_class == READ):
                 with ending_request(scope):
                     handled = cast(Coroutine[Any, Any, None], self._app(scope, connection.receive, connection.send))
                     steps = admission.cpu_accounts.charged_steps(
-                        client, handled, rests=not is_query(path), spend=rests.spend
+                        client, handled, rests=not route_class.is_query, spend=rests.spend
                     )
                     await steps
         except asyncio.CancelledError:
@@ -78,11 +96,17 @@ class AdmissionMiddleware:
             await problem_answer(Request(scope), StoppingError())(scope, receive, send)
         except TimeoutError:
             if not connection.answered:
-                error = DeadlineExceededError(admission.limits.deadline_s)
+                error = DeadlineExceededError(admission.deadline_s)
                 await problem_answer(Request(scope), error)(scope, receive, send)
         finally:
-            if is_query(path) and 400 <= connection.status < 500:
+            if route_class.is_query and 400 <= connection.status < 500:
                 admission.cpu_accounts.refuse(client, _REFUSED_S + rests.spent_s)
+
+
+def reading(scope: Scope) -> AbstractAsyncContextManager[None]:
+    """Return a block in which a request holds a permit to read, for answers that are read part by part."""
+    permit: _ReadPermit = scope[_SCOPE_KEY]
+    return permit.for_a_part()
 
 
 class _Rests:
@@ -124,49 +148,90 @@ class _Rests:
         await self.take()
 
 
-class _Permit:
-    """Permit to compute an answer, held until the answer begins to be sent."""
+class _ReadPermit:
+    """Permit to compute the answer to a read, of which a request holds at most one."""
 
-    def __init__(self, semaphore: FairSemaphore | None, client: str, rests: _Rests) -> None:
+    def __init__(self, semaphore: FairSemaphore, client: str, rests: _Rests) -> None:
         self._semaphore = semaphore
         self._client = client
         self._rests = rests
-        self._held = False
+        self._is_held = False
 
-    async def __aenter__(self) -> _Permit:
+    @asynccontextmanager
+    async def until_the_answer(self, *, needed: bool) -> AsyncIterator[None]:
+        """Rest, and hold the permit until the answer begins to be sent if it is `needed`."""
         await self._rests.take()
-        if self._semaphore is None:
-            return self
-        await self._semaphore.acquire(self._client)
-        while self._rests.left_s > 0.0:
-            # Other clients can have the permit meanwhile.
-            self._semaphore.release(self._client)
-            await self._rests.take()
+        if needed:
             await self._semaphore.acquire(self._client)
-        self._held = True
-        return self
+            while self._rests.left_s > 0.0:
+                # Other clients can have the permit meanwhile.
+                self._semaphore.release(self._client)
+                await self._rests.take()
+                await self._semaphore.acquire(self._client)
+            self._is_held = True
+        try:
+            yield
+        finally:
+            self.end()
 
-    async def __aexit__(self, *_error: object) -> None:
-        self.end()
+    @asynccontextmanager
+    async def for_a_part(self) -> AsyncIterator[None]:
+        """Hold the permit during the block, which is no wait while the request holds it already."""
+        if self._is_held:
+            yield
+            return
+        async with self._semaphore.held(self._client):
+            yield
 
     def end(self) -> None:
         """Give the permit back, once."""
-        if self._held and self._semaphore is not None:
-            self._held = False
+        if self._is_held:
+            self._is_held = False
             self._semaphore.release(self._client)
+
+
+class _BodyBudget:
+    """Budget of one request's body, which takes the stated length, or one step after the other."""
+
+    def __init__(self, budget: BytesInFlight, client: str, stated_bytes: int | None) -> None:
+        self._budget = budget
+        self._client = client
+        self._first_bytes = _STEP_BYTES if stated_bytes is None else stated_bytes
+        self._taken = self._received = 0
+
+    def begin(self) -> None:
+        """Take budget before the body is read; raises as `BytesInFlight.take` does."""
+        self._take(self._first_bytes)
+
+    def receive(self, count: int) -> None:
+        """Count received bytes, and take the next step if they exceed what was taken; raises as `begin` does."""
+        self._received += count
+        while self._received > self._taken:
+            self._take(_STEP_BYTES)
+
+    def end(self) -> None:
+        """Give everything back."""
+        self._budget.give_back(self._client, self._taken)
+        self._taken = 0
+
+    def _take(self, count: int) -> None:
+        self._budget.take(self._client, count)
+        self._taken += count
 
 
 class _Connection:
     """Connection of a request. Once the body is read, a disconnect cancels the work on the answer."""
 
-    def __init__(self, receive: Receive, send: Send, body: BodyBudget, rests: _Rests) -> None:
+    def __init__(
+        self, receive: Receive, send: Send, body: _BodyBudget, rests: _Rests, *, on_answer: Callable[[], None]
+    ) -> None:
         self._body = body
         self._rests = rests
+        self._on_answer = on_answer
         self._begun = False
         self.answered = False
         # Of the answer; 0 before it begins.
         self.status = 0
-        self.on_answer: Callable[[], None] = lambda: None
         self._receive = receive
         self._send = send
         self._gone = asyncio.Event()
@@ -209,7 +274,7 @@ class _Connection:
         """Send a part of the answer."""
         self.answered = True
         self.status = message.get("status", self.status)
-        self.on_answer()
+        self._on_answer()
         await self._send(message)
 
     async def _wait_for_disconnect(self) -> None:

@@ -13,10 +13,15 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.telemetry.log_fields import RequestLogFields, attach_log_fields, current_log_fields
-from service.telemetry.logs import LOGGER_NAME
+from service.telemetry.logs import (
+    LOGGER_NAME,
+    RequestLogFields,
+    attach_log_fields,
+    child_of,
+    current_log_fields,
+    parse_traceparent,
+)
 from service.telemetry.metrics import Telemetry
-from service.telemetry.trace_context import child_of, parse_traceparent
 from service.telemetry.tracing import OpenSpan
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}

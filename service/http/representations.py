@@ -1,4 +1,4 @@
-"""Conditional requests (RFC 9110): entity tags, and the answers that depend on them.
+"""Representations in answers (RFC 9110): the media type by `Accept`, entity tags and conditions, and bodies in pieces.
 
 All tags are strong: equal tags mean equal bytes. The tag of a plan is `"<revision id>.<digest>"`, because status and
 progress change within a revision; the digest is that of all that the bytes depend on, so that a tag is compared before
@@ -8,17 +8,147 @@ of the current revision, and the plain `"<revision id>"`. Venues have tags of th
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from starlette.requests import Request
 from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
 
 from lalaloc_core import __version__
 from service.errors import InvalidRequestError, RangeError, RevisionMismatchError
-from service.http.piecewise import Part, Parts, PartsResponse
+
+
+def preferred(request: Request, offered: tuple[str, ...]) -> str:
+    """Return the offered media type that the request prefers; the first one if several tie or none is accepted."""
+    accepted = ",".join(request.headers.getlist("accept"))
+    ranges = [_range(part) for part in accepted.split(",") if part.strip()]
+    if not ranges:
+        return offered[0]
+    return max(offered, key=lambda media: _quality(media, ranges))
+
+
+def _range(text: str) -> tuple[str, float]:
+    """Return a media range and its weight; other parameters are ignored."""
+    media, *parameters = (part.strip().lower() for part in text.split(";"))
+    for parameter in parameters:
+        name, _, value = parameter.partition("=")
+        if name.strip() == "q":
+            try:
+                return media, min(max(float(value), 0.0), 1.0)
+            except ValueError:
+                return media, 0.0
+    return media, 1.0
+
+
+def _quality(media: str, ranges: list[tuple[str, float]]) -> float:
+    """Return the weight of the most specific range that contains a media type."""
+    kind = media.split("/")[0]
+    for pattern in (media, f"{kind}/*", "*/*"):
+        found = [weight for accepted, weight in ranges if accepted == pattern]
+        if found:
+            return max(found)
+    return 0.0
+
+
+NDJSON = "application/x-ndjson"
+# Other requests take turns after each piece, and a slow client has no more than some of them in memory.
+_PIECE_BYTES = 256 * 1024
+
+Part = bytes | memoryview
+Parts = Sequence[Part] | AsyncIterator[Part]
+
+
+class PartsResponse(Response):
+    """Answer whose body is given in parts, which are not copied together.
+
+    Args:
+        parts: the body.
+        size_bytes: length of the body.
+        media_type: media type of the body.
+        headers: headers of the answer, without the length.
+        status: HTTP status.
+    """
+
+    def __init__(
+        self, parts: Parts, size_bytes: int, media_type: str, headers: Mapping[str, str], status: int = 200
+    ) -> None:
+        super().__init__(None, status, {**headers, "Content-Length": str(size_bytes)}, media_type)
+        self._parts = parts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the answer."""
+        await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+        async for part in _in_order(self._parts):
+            for first in range(0, len(part), _PIECE_BYTES):
+                piece = bytes(part[first : first + _PIECE_BYTES])
+                await send({"type": "http.response.body", "body": piece, "more_body": True})
+                await asyncio.sleep(0)
+        await send({"type": "http.response.body", "body": b""})
+
+
+async def _in_order(parts: Parts) -> AsyncIterator[Part]:
+    if isinstance(parts, AsyncIterator):
+        async for part in parts:
+            yield part
+    else:
+        for part in parts:
+            yield part
+
+
+class LinesResponse(Response):
+    """Answer of lines that ends, and ends their computation, as soon as its client leaves or stops reading.
+
+    Args:
+        lines: the lines, without line breaks.
+        patience_s: time (s) in which the client must take a line.
+    """
+
+    media_type = NDJSON
+
+    def __init__(self, lines: AsyncGenerator[str], patience_s: float) -> None:
+        # Proxies must not hold lines back.
+        super().__init__(None, 200, {"X-Accel-Buffering": "no"})
+        del self.headers["content-length"]
+        self._lines = lines
+        self._patience_s = patience_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the answer."""
+        gone = asyncio.ensure_future(_disconnect(receive))
+        try:
+            await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+            while (line := await self._next_unless(gone)) is not None:
+                async with asyncio.timeout(self._patience_s):
+                    await send({"type": "http.response.body", "body": f"{line}\n".encode(), "more_body": True})
+            if not gone.done():
+                await send({"type": "http.response.body", "body": b""})
+        except TimeoutError:
+            # Without its end the answer is incomplete, which the client sees if it reads on.
+            pass
+        finally:
+            gone.cancel()
+            await self._lines.aclose()
+
+    async def _next_unless(self, gone: asyncio.Future[None]) -> str | None:
+        """Wait for the next line; None at the end, or if the client has left."""
+        line = asyncio.ensure_future(anext(self._lines, None))
+        try:
+            await asyncio.wait({line, gone}, return_when=asyncio.FIRST_COMPLETED)
+            return line.result() if line.done() else None
+        finally:
+            if not line.done():
+                line.cancel()
+                await asyncio.wait({line})
+
+
+async def _disconnect(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
 
 # Private, and revalidated each time: keys can be revoked and plans replaced.
 _CACHED = {"Cache-Control": "private, no-cache"}
