@@ -12,7 +12,7 @@ from contextlib import ExitStack, asynccontextmanager
 from functools import partial
 
 from fastapi import Depends, FastAPI
-from starlette.routing import BaseRoute, Route
+from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
@@ -69,21 +69,22 @@ def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACK
     install_problem_handlers(app)
     for router in ROUTERS:
         app.include_router(router)
-    app.openapi = partial(describe_api, app)
-    routes = [route for router in ROUTERS for route in router.routes]
+    routes = [route for router in ROUTERS for route in router.routes if isinstance(route, Route)]
+    app.openapi = partial(describe_api, app, routes)
     app.build_middleware_stack = partial(_layers, app, telemetry, routes)
     return app
 
 
-def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGIApp:
+def _layers(app: FastAPI, telemetry: Telemetry, routes: list[Route]) -> ASGIApp:
     """Return the app with its middlewares, outermost first: log, headers, CORS, framing, HEAD, keys, admission.
 
     `FastAPI.add_middleware` would put them inside the layer that answers unexpected errors.
     """
-    named = [route for route in routes if isinstance(route, Route)]
     # Keys come before admission, because slots are shared between tenants.
-    admitted = HeadMiddleware(AuthorisationMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app), named)))
-    return TelemetryMiddleware(SecurityHeadersMiddleware(CorsMiddleware(FramingMiddleware(admitted))), telemetry, named)
+    admitted = HeadMiddleware(AuthorisationMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app), routes)))
+    return TelemetryMiddleware(
+        SecurityHeadersMiddleware(CorsMiddleware(FramingMiddleware(admitted))), telemetry, routes
+    )
 
 
 # Allocations before a collection of the youngest objects, and collections of each age before one of the next age. With

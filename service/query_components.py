@@ -18,16 +18,7 @@ from service.decoding.decoder import Decoder
 from service.grids import GridProvider
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
-from service.query import (
-    Executor,
-    Grounds,
-    Localiser,
-    LocaliserBackend,
-    LpoPool,
-    OptimiserBackend,
-    PhotographReader,
-    QueryParts,
-)
+from service.query import Executor, Grounds, Localiser, LocalLocaliser, LpoPool, Optimiser, PhotographReader, QueryParts
 from service.schemas import ModelAnswer
 from service.settings import Settings
 from service.storage import Store
@@ -65,9 +56,9 @@ class Backends:
         indices: builds the source of the indices of venues; None: they are in this process.
     """
 
-    optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore, bool], OptimiserBackend]
+    optimiser: Callable[[Bundle, Settings, Telemetry, FairSemaphore, bool], Optimiser]
     encoder: Callable[[Bundle, Settings], PhotographEncoder]
-    localiser: Callable[[ModelAnswer, Settings, Telemetry], LocaliserBackend] | None = None
+    localiser: Callable[[ModelAnswer, Settings, Telemetry], Localiser] | None = None
     indices: Callable[[Settings], IndexSource] | None = None
 
 
@@ -92,7 +83,7 @@ class QueryComponents:
     store: Store
     encoder: PhotographEncoder
     grids: GridProvider
-    optimiser: OptimiserBackend
+    optimiser: Optimiser
     decoder: Decoder
     admission: Admission
     reads: BoundedReads
@@ -138,7 +129,7 @@ class QueryComponents:
             idle_cores=idle_cores,
         )
 
-    def localiser(self, plans: VenuePlans, indices: IndexSource) -> Localiser:
+    def localiser(self, plans: VenuePlans, indices: IndexSource) -> LocalLocaliser:
         """Build the localiser."""
         executor = Executor(self.settings, self.optimiser, self.telemetry, self.permits)
         queries, tolerance_deg = self.admission.queries, self.settings.photographs.compass_tolerance_deg
@@ -160,7 +151,7 @@ class QueryComponents:
             executor=executor,
         )
         albums = Threads("albums", 1, self.telemetry.cpu_accounts)
-        return Localiser(parts, queries, albums, self.permits)
+        return LocalLocaliser(parts, queries, albums, self.permits)
 
     def venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""

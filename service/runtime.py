@@ -25,7 +25,7 @@ from service.grids import GridProvider, Sweeper
 from service.http.events import ALBUM_ENDS, PLAN_ENDS, ProgressEvents, album_look, heartbeat_s, plan_look
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
-from service.query import LocaliserBackend, OptimiserBackend
+from service.query import Localiser, Optimiser
 from service.query_components import LOCAL_BACKENDS, Backends, QueryComponents, closed_at_end, store_reads
 from service.schemas.albums import AlbumEvent
 from service.schemas.stored_plans import PlanEvent
@@ -72,10 +72,10 @@ class Runtime:
     store: Store
     grids: GridProvider
     plan_lookup: PlanLookup
-    optimiser: OptimiserBackend
+    optimiser: Optimiser
     decoder: Decoder
     converter: Converter
-    localiser: LocaliserBackend
+    localiser: Localiser
     admission: Admission
     access_control: AccessControl
     audit_trail: AuditTrail
@@ -132,7 +132,7 @@ def start_runtime(
     streams = _event_streams(settings, components, cleanup)
     plans, plan_indices = components.venue_plans(), closed_at_end(cleanup, components.plan_indices())
     indices: IndexSource = plan_indices if backends.indices is None else backends.indices(settings)
-    localiser: LocaliserBackend = closed_at_end(cleanup, components.localiser(plans, indices))
+    localiser: Localiser = closed_at_end(cleanup, components.localiser(plans, indices))
     if backends.localiser is not None:
         localiser = backends.localiser(localiser.model, settings, telemetry)
     lookup = PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S)

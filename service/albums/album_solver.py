@@ -15,7 +15,7 @@ from lalaloc_core.errors import InvalidInputError
 from service import errors
 from service.capacity.query_context import QueryContext
 from service.capacity.threads import BoundedReads
-from service.query import AlbumProgress, AlbumQuery, LocaliserBackend
+from service.query import AlbumProgress, AlbumQuery, Localiser
 from service.schemas.albums import AlbumDocument
 from service.settings import Settings
 from service.storage import PlanLookup, Store
@@ -58,7 +58,7 @@ class AlbumSolver:
         self,
         store: Store,
         plans: PlanLookup,
-        localiser: LocaliserBackend,
+        localiser: Localiser,
         reads: BoundedReads,
         settings: Settings,
         telemetry: Telemetry,
@@ -188,7 +188,7 @@ class AlbumSolver:
             progress=progress,
         )
         try:
-            outcome = await self._localiser.solve_album(place, query)
+            outcome = await self._localiser.answer(place, query)
         except _FINAL as error:
             reason = error.reason if isinstance(error, errors.PlanFailedError) else str(error)
             await self._finish(job, place.revision_id, failure=reason)

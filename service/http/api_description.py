@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
+from starlette.routing import Route
 
 from service.capacity.admission_control import PROBE, REFUSALS, declared_class
 from service.http.problems import add_problems
@@ -59,8 +61,8 @@ def operation_id(route: APIRoute) -> str:
     return first + "".join(word.title() for word in rest)
 
 
-def describe_api(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document of the app; it is built once."""
+def describe_api(app: FastAPI, routes: Sequence[Route]) -> dict[str, Any]:
+    """Return the OpenAPI document of the app with these routes; it is built once."""
     if app.openapi_schema is None:
         document = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes, servers=_SERVERS
@@ -71,7 +73,7 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
             schemas |= schema.pop("$defs", {})
             schemas[model.__name__] = schema
         document["components"]["schemas"] = dict(sorted(schemas.items()))
-        probes = {route.path for route in app.routes if isinstance(route, APIRoute) and _is_probe(route)}
+        probes = {route.path for route in routes if declared_class(route.endpoint) == PROBE}
         for path, operations in document["paths"].items():
             if path not in probes:
                 for operation in operations.values():
@@ -80,10 +82,6 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
         _sort_properties(document)
         app.openapi_schema = document
     return app.openapi_schema
-
-
-def _is_probe(route: APIRoute) -> bool:
-    return declared_class(route.endpoint) == PROBE
 
 
 def _describe_keys(document: dict[str, Any]) -> None:

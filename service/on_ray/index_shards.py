@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, UInt64
-from ray.exceptions import RayError
 from ray.serve.handle import DeploymentHandle
 
 from lalaloc_core.localise.venue.index_search import (
@@ -28,12 +27,11 @@ from lalaloc_core.localise.venue.index_search import (
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import DeadlineExceededError
-from service.on_ray.remote import Failure, Success
+from service.on_ray.remote import Failure, Success, result_of
 from service.settings import Settings
 from service.venues.plan_list import ROW_BYTES, PlanList
 
-# A shard stores nothing, so calls are repeated if its replica dies.
-_ATTEMPTS = 2
+_MISSED = "the plans were not searched"
 
 Stage = Literal["scan", "compare", "align"]
 
@@ -132,7 +130,7 @@ class RemoteShard:
                 self._hold()
                 found = self._waited(begin)
             if found is None:
-                raise self._missed()
+                raise DeadlineExceededError(self._deadline_s, _MISSED)
             return found
 
         return result
@@ -145,23 +143,11 @@ class RemoteShard:
         return held
 
     def _waited(self, begin: Callable[[], Any]) -> Any:
-        """Return the result of a call, which is begun again if the replica dies."""
-        for _ in range(_ATTEMPTS):
-            response = begin()
-            try:
-                outcome: Success[Any] | Failure = response.result(timeout_s=self._deadline_s)
-            except TimeoutError:
-                response.cancel()
-                break
-            except RayError:
-                continue
-            if isinstance(outcome, Failure):
-                raise outcome.error
-            return outcome.value
-        raise self._missed()
-
-    def _missed(self) -> DeadlineExceededError:
-        return DeadlineExceededError(self._deadline_s, "the plans were not searched")
+        """Return the result of a call."""
+        outcome: Success[Any] | Failure = result_of(begin, self._deadline_s, _MISSED)
+        if isinstance(outcome, Failure):
+            raise outcome.error
+        return outcome.value
 
 
 def _bytes(plans: PlanList, index: DividedIndex) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from time import monotonic
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
@@ -22,24 +22,11 @@ from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError, OverloadedError
 from service.pools import LostReason, PoolState
-from service.query import (
-    SOLVE_S,
-    AlbumEntry,
-    AlbumOutcome,
-    AlbumPhotographQuery,
-    AlbumQuery,
-    PhotographQuery,
-    PictureRequest,
-    QueryContext,
-    SequenceQuery,
-    TrackOutcome,
-    TrackQuery,
-    Where,
-)
+from service.query import SOLVE_S, AlbumQuery, AnyQuery, PictureQuery, QueryContext, Where
 from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
 from service.schemas.query_fields import HeightFields
 from service.settings import Settings
-from service.storage.records import PlanRecord, VenueRecord
+from service.storage.records import VenueRecord
 from service.telemetry import Telemetry
 
 P = ParamSpec("P")
@@ -95,12 +82,26 @@ def returning_failures(
     return wrapper
 
 
-# Requests store nothing, so they are retried if a replica dies.
+# Calls store nothing, so they are repeated if a replica dies.
 _ATTEMPTS = 2
 # Extra time for the answer of the remote service, whose own timeout error is more specific.
 _ON_THE_WAY_S = 1.0
 
-AnswerT = TypeVar("AnswerT", LocaliseAnswer, SequenceAnswer)
+AnswerT = TypeVar("AnswerT")
+
+
+def result_of(begin: Callable[[], Any], deadline_s: float, missed: str) -> Any:
+    """Return the result of a call, which is begun again if the replica dies; blocks, so call it from a thread."""
+    for _ in range(_ATTEMPTS):
+        response = begin()
+        try:
+            return response.result(timeout_s=deadline_s)
+        except TimeoutError:
+            response.cancel()
+            break
+        except RayError:
+            continue
+    raise DeadlineExceededError(deadline_s, missed)
 
 
 @dataclass(frozen=True)
@@ -135,16 +136,8 @@ class RemotePhotographEncoder(PhotographEncoder):
             InvalidPhotographError: see `PhotographEncoder.query`.
         """
         self.check(photograph)
-        for _ in range(_ATTEMPTS):
-            response = self._encoder.query.remote(photograph, heading, camera_height, heading_tolerance, others)
-            try:
-                return response.result(timeout_s=self._deadline_s)
-            except TimeoutError:
-                response.cancel()
-                break
-            except RayError:
-                continue
-        raise DeadlineExceededError(self._deadline_s, "the photograph was not encoded")
+        begin = partial(self._encoder.query.remote, photograph, heading, camera_height, heading_tolerance, others)
+        return result_of(begin, self._deadline_s, "the photograph was not encoded")
 
 
 class RemoteOptimiser:
@@ -197,7 +190,7 @@ class RemoteOptimiser:
 
 
 class RemoteLocaliser:
-    """Remote `Localiser`; queries about the same plan or venue go to the same search replica."""
+    """Localisation by search replicas; queries about the same plan or venue go to the same one."""
 
     def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
         self.model = model
@@ -205,44 +198,27 @@ class RemoteLocaliser:
         self._settings = settings
         self._telemetry = telemetry
 
-    async def localise(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
-        """See `Localiser.localise`, for the errors as well."""
-        return self._count(await self._call("localise", where, query.context, query))
+    async def answer(self, where: Where, query: AnyQuery[AnswerT]) -> AnswerT:
+        """See `Localiser.answer`."""
+        context = query.context.with_time(SOLVE_S) if isinstance(query, AlbumQuery) else query.context
+        found = await self._call("answer", where, context, query)
+        answer = found[0] if isinstance(query, PictureQuery) else found
+        if isinstance(answer, LocaliseAnswer | SequenceAnswer):
+            # The metrics of this process are scraped.
+            self._telemetry.observe_answer(answer.timings_ms.model_dump(exclude_none=True), answer.stage)
+        return found
 
-    async def localise_and_draw(
-        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
-    ) -> tuple[LocaliseAnswer, bytes]:
-        """See `Localiser.localise_and_draw`."""
-        found, drawn = await self._call("localise_and_draw", record, query.context, query, request)
-        return self._count(found), drawn
-
-    async def localise_sequence(self, where: PlanRecord | VenueRecord, query: SequenceQuery) -> SequenceAnswer:
-        """See `Localiser.localise_sequence`."""
-        return self._count(await self._call("localise_sequence", where, query.context, query))
-
-    async def track(self, where: PlanRecord | VenueRecord, query: TrackQuery) -> TrackOutcome:
-        """See `Localiser.track`."""
-        return await self._call("track", where, query.context, query)
-
-    async def album_entry(self, where: PlanRecord | VenueRecord, query: AlbumPhotographQuery) -> AlbumEntry:
-        """See `Localiser.album_entry`."""
-        return await self._call("album_entry", where, query.context, query)
-
-    async def solve_album(self, where: PlanRecord | VenueRecord, query: AlbumQuery) -> AlbumOutcome:
-        """See `Localiser.solve_album`."""
-        return await self._call("solve_album", where, query.context.with_time(SOLVE_S), query)
-
-    async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
+    async def check(self, where: Where, form: HeightFields) -> None:
         """See `Localiser.check`."""
         context = QueryContext.starting(where.tenant, self._settings.requests.request_deadline_s)
         await self._call("check", where, context, form)
 
-    async def _call(self, method: str, where: Where, context: QueryContext, *arguments: Any) -> Any:
-        """Call a method of the `Localiser` of a search replica."""
+    async def _call(self, method: str, where: Where, context: QueryContext, argument: Any) -> Any:
+        """Call a method of the localiser of a search replica."""
         about = StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
         with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):
-                response = self._search.options(session_id=where.id).call.remote(method, about, *arguments)
+                response = self._search.options(session_id=where.id).call.remote(method, about, argument)
                 try:
                     async with asyncio.timeout(max(context.left_s + _ON_THE_WAY_S, 0.0)):
                         outcome: Success[Any] | Failure = await response
@@ -257,8 +233,3 @@ class RemoteLocaliser:
                     raise outcome.error
                 return outcome.value
         raise DeadlineExceededError(self._settings.requests.request_deadline_s)
-
-    def _count(self, answer: AnswerT) -> AnswerT:
-        """Count an answer in the metrics of this process, which are scraped; return it."""
-        self._telemetry.observe_answer(answer.timings_ms.model_dump(exclude_none=True), answer.stage)
-        return answer

@@ -5,15 +5,13 @@ does the same for several photographs and `session_query.py` for the next photog
 albums; `localiser.py` calls them. `photograph_reader.py` decodes and encodes photographs, those of one place as a spot
 (`spots.py`). `grounds.py` waits for the plan or venue of a query and returns its `ground.py`. `executor.py` runs the
 steps, `lpo_pool.py` the refinement in worker processes, and `answers.py` composes the answer. `stated_pose.py` reads
-the fields about the camera, `geopose.py` translates answers. `queries.py` has the queries, `backends.py`
-the interfaces of what can run elsewhere.
+the fields about the camera, `geopose.py` translates answers. `queries.py` has the queries.
 """
 
 from service.capacity.query_context import QueryContext
-from service.query.backends import LocaliserBackend, OptimiserBackend
-from service.query.executor import Executor
+from service.query.executor import Executor, Optimiser
 from service.query.grounds import Grounds
-from service.query.localiser import Localiser
+from service.query.localiser import Localiser, LocalLocaliser
 from service.query.lpo_pool import LpoPool
 from service.query.photograph_reader import PhotographReader
 from service.query.queries import (
@@ -23,9 +21,10 @@ from service.query.queries import (
     AlbumPhotographQuery,
     AlbumProgress,
     AlbumQuery,
+    AnyQuery,
     Content,
     PhotographQuery,
-    PictureRequest,
+    PictureQuery,
     SequenceQuery,
     TrackOutcome,
     TrackQuery,

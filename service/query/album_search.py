@@ -52,7 +52,7 @@ class AlbumSearch:
         # Found by an earlier solve of the same album; a solve takes it out, as two must not share it.
         self._memories = BoundedCache[str, AlbumMemory](_MEMORY_BYTES, _size_of)
 
-    async def entry(self, query: AlbumPhotographQuery) -> AlbumEntry:
+    async def entry(self, where: Where, query: AlbumPhotographQuery) -> AlbumEntry:
         """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
         content, document, context = query.content, query.document, query.context
         with context.clock.stage("decode"):

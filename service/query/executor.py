@@ -10,16 +10,15 @@ import logging
 from collections.abc import Callable, Generator
 from functools import partial
 from time import monotonic
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult, refine_walls, refined_by_walls
 from lalaloc_core.localise.search.pipeline import next_step
-from lalaloc_core.localise.sequence import SequenceJob
+from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.capacity.fair_share import FairSemaphore, with_headroom
 from service.capacity.query_context import QueryContext
 from service.capacity.threads import Threads
-from service.pools import LostReason
-from service.query.backends import OptimiserBackend
+from service.pools import LostReason, PoolState
 from service.settings import Settings, work_factor
 from service.telemetry import LOGGER_NAME, Telemetry
 
@@ -31,6 +30,29 @@ FoundT = TypeVar("FoundT")
 SearchSteps = Generator[RefinementJob | SequenceJob | None, Any, T]
 
 
+class Optimiser(Protocol):
+    """Pose refinement (LPO), by worker processes (`LpoPool`) or elsewhere."""
+
+    @property
+    def state(self) -> PoolState:
+        """Numbers of workers, all and warm."""
+        ...
+
+    def start(self) -> None:
+        """Start the workers and return at once."""
+        ...
+
+    async def refine(
+        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
+    ) -> RefinementResult | SequenceResult | None:
+        """Return the result of a client's job; None if it failed or took longer than `timeout_s`."""
+        ...
+
+    def close(self, drain_s: float = 0.0) -> None:
+        """Stop the workers; running jobs have `drain_s` (s) to finish."""
+        ...
+
+
 def finish_with(steps: SearchSteps[FoundT], complete: Callable[[FoundT], T]) -> SearchSteps[T]:
     """Return the steps of a search that end with `complete(result)`, on the thread of the search."""
     return complete((yield from steps))
@@ -39,9 +61,7 @@ def finish_with(steps: SearchSteps[FoundT], complete: Callable[[FoundT], T]) -> 
 class Executor:
     """Compute threads of queries."""
 
-    def __init__(
-        self, settings: Settings, optimiser: OptimiserBackend, telemetry: Telemetry, permits: FairSemaphore
-    ) -> None:
+    def __init__(self, settings: Settings, optimiser: Optimiser, telemetry: Telemetry, permits: FairSemaphore) -> None:
         self._lpo_deadline_s = settings.lpo.deadline_s
         self._optimiser = optimiser
         self._telemetry = telemetry
@@ -91,7 +111,7 @@ class Executor:
 class StepRunner:
     """Runner of steps up to a pause, to a job for an LPO worker, or to the result."""
 
-    def __init__(self, optimiser: OptimiserBackend, telemetry: Telemetry) -> None:
+    def __init__(self, optimiser: Optimiser, telemetry: Telemetry) -> None:
         self._optimiser = optimiser
         self._telemetry = telemetry
 

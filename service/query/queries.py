@@ -1,14 +1,23 @@
-"""Queries as they are after the upload."""
+"""Queries as they are after the upload; each names the type of its answer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from lalaloc_core.draw.answer import Picture
 from lalaloc_core.photograph import Photograph
 from service.capacity.query_context import QueryContext
-from service.schemas import LocaliseForm, PhotographForm, SequenceForm, SessionDocument, StoredPose
+from service.schemas import (
+    LocaliseAnswer,
+    LocaliseForm,
+    PhotographForm,
+    SequenceAnswer,
+    SequenceForm,
+    SessionDocument,
+    StoredPose,
+)
 from service.schemas.albums import AlbumDocument
 from service.storage.album_jobs import AlbumPart
 from service.storage.records import PlanRecord, VenueRecord
@@ -18,14 +27,19 @@ from service.uploaded_file import UploadedFile
 SOLVE_S = 900.0
 # Photograph of a query: a file, or a photograph that was encoded on its device (`localise.encode.features`).
 Content = bytes | UploadedFile | Photograph
-
-
 # Plans that a query searches.
 Where = PlanRecord | VenueRecord
+AnswerT = TypeVar("AnswerT", covariant=True)
+
+
+class AnyQuery(Generic[AnswerT]):
+    """Query about a plan or venue, with the type of its answer."""
+
+    context: QueryContext
 
 
 @dataclass(frozen=True, eq=False)
-class PhotographQuery:
+class PhotographQuery(AnyQuery[LocaliseAnswer]):
     """Query about one photograph.
 
     Attributes:
@@ -39,8 +53,29 @@ class PhotographQuery:
     context: QueryContext
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PictureQuery(AnyQuery[tuple[LocaliseAnswer, bytes]]):
+    """Query about one photograph in a plan, whose answer is also drawn, as a PNG or SVG file.
+
+    Attributes:
+        form: the validated form fields.
+        content: the uploaded picture file, or what was read of its features.
+        context: client, deadline and clock.
+        picture: plan, photograph or both.
+        as_png: PNG; else SVG.
+        rooms: the plan's rooms as drawn by `lalaloc_core.draw.plan.draw_rooms`.
+    """
+
+    form: LocaliseForm
+    content: Content
+    context: QueryContext
+    picture: Picture
+    as_png: bool
+    rooms: str
+
+
 @dataclass(frozen=True, eq=False)
-class SequenceQuery:
+class SequenceQuery(AnyQuery[SequenceAnswer]):
     """Query about several photographs of one visit.
 
     Attributes:
@@ -57,8 +92,16 @@ class SequenceQuery:
     film: bytes | UploadedFile | None = None
 
 
+@dataclass(frozen=True)
+class TrackOutcome:
+    """State of a session after a photograph, and the stored part of its answer."""
+
+    state: bytes
+    stored: StoredPose
+
+
 @dataclass(frozen=True, eq=False)
-class TrackQuery:
+class TrackQuery(AnyQuery[TrackOutcome]):
     """Photograph of a session.
 
     Attributes:
@@ -79,15 +122,15 @@ class TrackQuery:
 
 
 @dataclass(frozen=True)
-class TrackOutcome:
-    """State of a session after a photograph, and the stored part of its answer."""
+class AlbumEntry:
+    """Parts of a photograph that an album keeps: its features, and size, time and camera as JSON."""
 
-    state: bytes
-    stored: StoredPose
+    entry: bytes
+    facts: str
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class AlbumPhotographQuery:
+class AlbumPhotographQuery(AnyQuery[AlbumEntry]):
     """Photograph that is added to an album.
 
     Attributes:
@@ -103,14 +146,6 @@ class AlbumPhotographQuery:
     context: QueryContext
 
 
-@dataclass(frozen=True)
-class AlbumEntry:
-    """Parts of a photograph that an album keeps: its features, and size, time and camera as JSON."""
-
-    entry: bytes
-    facts: str
-
-
 @dataclass(eq=False)
 class AlbumProgress:
     """Progress of a solve, 0 to 1, which the caller can stop; between processes it is not shared."""
@@ -119,8 +154,16 @@ class AlbumProgress:
     stopped: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class AlbumOutcome:
+    """Solution of an album: the common part and the pin of each photograph, by id, as JSON."""
+
+    solution: str
+    pins: Mapping[str, str]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class AlbumQuery:
+class AlbumQuery(AnyQuery[AlbumOutcome]):
     """Album that is solved.
 
     Attributes:
@@ -138,26 +181,3 @@ class AlbumQuery:
     is_same_place: bool
     context: QueryContext
     progress: AlbumProgress
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlbumOutcome:
-    """Solution of an album: the common part and the pin of each photograph, by id, as JSON."""
-
-    solution: str
-    pins: Mapping[str, str]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureRequest:
-    """Requested drawing of an answer.
-
-    Attributes:
-        picture: plan, photograph or both.
-        as_png: PNG; else SVG.
-        rooms: the plan's rooms as drawn by `lalaloc_core.draw.plan.draw_rooms`.
-    """
-
-    picture: Picture
-    as_png: bool
-    rooms: str

@@ -10,7 +10,7 @@ from lalaloc_core.photograph import Photograph
 from service.query.answers import compose_answer, posterior_answer
 from service.query.executor import finish_with
 from service.query.ground import Ground
-from service.query.queries import PhotographQuery, PictureRequest, Where
+from service.query.queries import PhotographQuery, PictureQuery, Where
 from service.query.query_parts import QueryParts
 from service.query.spots import Spot
 from service.schemas import LocaliseAnswer
@@ -39,20 +39,18 @@ class SingleSearch:
         self._parts = parts
 
     async def answer(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
-        """Localise a photograph; see `Localiser.localise` for the errors."""
+        """Localise a photograph."""
         return (await self._search(where, query)).answer
 
-    async def answer_and_draw(
-        self, record: PlanRecord, query: PhotographQuery, request: PictureRequest
-    ) -> tuple[LocaliseAnswer, bytes]:
-        """Localise a photograph and draw the answer; see `Localiser.localise_and_draw` for the errors."""
-        outcome = await self._search(record, query)
+    async def answer_and_draw(self, where: Where, query: PictureQuery) -> tuple[LocaliseAnswer, bytes]:
+        """Localise a photograph in a plan and draw the answer."""
+        outcome = await self._search(where, query)
         with query.context.clock.stage("draw"):
-            picture = await self._draw(outcome, query, request)
+            picture = await self._draw(outcome, query)
         self._parts.executor.observe_stage(query.context, "draw")
         return outcome.answer, picture
 
-    async def _search(self, where: Where, query: PhotographQuery) -> _Outcome:
+    async def _search(self, where: Where, query: PhotographQuery | PictureQuery) -> _Outcome:
         form, context = query.form, query.context
         site = await self._parts.grounds.site(where, form, form)
         # Decode first, so that an unreadable picture is refused without waiting for plans.
@@ -90,7 +88,9 @@ class SingleSearch:
 
         return await self._parts.executor.run_search(finish_with(steps, compose), context)
 
-    def _extras(self, where: Where, query: PhotographQuery, ground: Ground, found: Localisation) -> dict[str, object]:
+    def _extras(
+        self, where: Where, query: PhotographQuery | PictureQuery, ground: Ground, found: Localisation
+    ) -> dict[str, object]:
         """Return fields of the answer that not every answer has."""
         if isinstance(where, PlanRecord):
             wanted = query.form.include == "posterior"
@@ -100,9 +100,9 @@ class SingleSearch:
         plans = ground.plan_probabilities(found, None if confidence is None else confidence.fit)
         return {"venue_id": where.id, "plans": plans[: query.form.top_k]}
 
-    async def _draw(self, outcome: _Outcome, query: PhotographQuery, request: PictureRequest) -> bytes:
+    async def _draw(self, outcome: _Outcome, query: PictureQuery) -> bytes:
         context, picture, ground = query.context, None, outcome.ground
-        if request.picture != "plan":
+        if query.picture != "plan":
             assert not isinstance(query.content, Photograph)
             # Decode again, because the encoder's input is too small for a picture.
             picture = await self._parts.decoder.picture(
@@ -118,9 +118,9 @@ class SingleSearch:
             model = self._parts.bundle.manifest.confidence_for(view=outcome.found.query.is_view)
             source = _SOURCES[outcome.answer.heading_source]
             drawn = drawn_answer(ground.plan, ground.grid, outcome.found, model, source, photograph=outcome.photograph)
-            return draw_answer(drawn, picture, request.picture, rooms=request.rooms)
+            return draw_answer(drawn, picture, query.picture, rooms=query.rooms)
 
         svg = await self._parts.executor.compute(context, draw)
-        if request.as_png:
+        if query.as_png:
             return await self._parts.decoder.rasterise(svg, context.deadline, context.client)
         return svg.encode()

@@ -150,7 +150,7 @@ class _Adding:
             return same, False
         place = await call.place(self._document.floorplan_id, self._document.venue_id)
         query = AlbumPhotographQuery(document=self._document, content=content, sha256=sha256, context=context)
-        entry = await call.runtime.localiser.album_entry(place, query)
+        entry = await call.runtime.localiser.answer(place, query)
         new = NewPhotograph(sha256=sha256, name=_clean(file.name), facts=entry.facts, entry=entry.entry)
         if index:
             await self._done[index - 1].wait()

@@ -36,8 +36,11 @@ async def answer_import(call: ApiCall, idempotent: IdempotentRequest, uploaded: 
 
     Refusals are the last line then: the answer has begun, with status 200.
     """
+
     # On a thread as one call from claim to answer, so that a disconnect does not interrupt it.
-    run = partial(uploaded.on_thread, call, idempotent.run, uploaded.parts)
+    async def run(work: Callable[[str], Response]) -> Response:
+        return await uploaded.on_thread(call, idempotent.run, uploaded.parts, work)
+
     if preferred(call.request, (JSON, NDJSON)) == JSON:
         return await run(partial(store, on_step=None))
     return LinesResponse(_lines(call, run, store), call.settings.requests.request_deadline_s)

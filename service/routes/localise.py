@@ -13,7 +13,7 @@ from service.errors import InvalidRequestError, UnanchoredPlanError
 from service.http.problems import problem_responses
 from service.http.representations import preferred
 from service.http.uploads import GEOJSON, GEOPOSE, JSON
-from service.query import PhotographQuery, PictureRequest
+from service.query import PhotographQuery, PictureQuery
 from service.query.geopose import geojson_feature, geopose_document
 from service.routes.dependencies import Call
 from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
@@ -107,19 +107,24 @@ async def localise(
         picture = "plan" if is_picture else None
 
     async def respond(_token: str) -> Response:
-        query = PhotographQuery(form, content, context)
         place = await call.place(form.floorplan_id, form.venue_id)
         check_anchor(place, media)
         if not is_picture:
-            answer = await call.runtime.localiser.localise(place, query)
+            answer = await call.runtime.localiser.answer(place, PhotographQuery(form, content, context))
             call.log(plan=answer.floorplan_id, revision=answer.floorplan_revision, stage=answer.stage)
             kept = await keep_answer(answer, call) if media == JSON else answer
             return answer_as(kept, media, _ON_EARTH)
         assert isinstance(place, PlanRecord)
         rooms = await call.rendition(place, "drawing")
-        drawn = rooms.content.decode()
-        picture_request = PictureRequest(picture=picture or "both", as_png=media == _PNG, rooms=drawn)
-        answer, drawing = await call.runtime.localiser.localise_and_draw(place, query, picture_request)
+        query = PictureQuery(
+            form=form,
+            content=content,
+            context=context,
+            picture=picture or "both",
+            as_png=media == _PNG,
+            rooms=rooms.content.decode(),
+        )
+        answer, drawing = await call.runtime.localiser.answer(place, query)
         call.log(stage=answer.stage)
         return Response(drawing, headers=VARY | _POLICY, media_type=media)
 

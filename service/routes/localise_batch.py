@@ -66,7 +66,7 @@ async def localise_batch(call: Call) -> Response:
     place = await call.place(form.floorplan_id, form.venue_id)
 
     async def answer(_index: int, _file: UploadedFile, content: Content, context: QueryContext) -> LocaliseAnswer:
-        found = await call.runtime.localiser.localise(place, PhotographQuery(form, content, context))
+        found = await call.runtime.localiser.answer(place, PhotographQuery(form, content, context))
         return await keep_answer(found, call)
 
     return LinesResponse(BatchLines(call, answer, _line).lines(photographs), settings.requests.request_deadline_s)

@@ -80,7 +80,7 @@ async def localise_sequence(call: Call) -> Response:
     async def respond(_token: str) -> Response:
         place = await call.place(form.floorplan_id, form.venue_id)
         check_anchor(place, media)
-        found = await call.runtime.localiser.localise_sequence(place, query)
+        found = await call.runtime.localiser.answer(place, query)
         call.log(stage=found.stage)
         return answer_as(found, media, _ON_EARTH)
 

@@ -168,7 +168,7 @@ async def add_photograph(session_id: str, call: Call) -> Response:
                 raise errors.SessionOutdatedError(session.id, changed)
             call.log(plan=session.plan_id, venue=session.venue_id, revision=session.revision_id)
             query = TrackQuery(session.id, document, session.state, form, content, context)
-            outcome = await call.runtime.localiser.track(place, query)
+            outcome = await call.runtime.localiser.answer(place, query)
             stored = outcome.stored.after(_stored_pose(session)).model_dump_json()
             finish = partial(sessions.finish, ttl_s=call.settings.storage.session_ttl_s)
             after = await call.read(finish, session, token, outcome.state, stored)
