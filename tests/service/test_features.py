@@ -402,7 +402,7 @@ def test_features_of_a_turn_without_angles_are_warned_about(client: httpx.Client
 def test_every_part_of_a_file_is_sent_beside_other_clients(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
 ) -> None:
-    with start_app(tmp_path, api_keys=True, rate_per_minute=0) as client:
+    with start_app(tmp_path, bundle=default_bundle(), api_keys=True, rate_per_minute=0) as client:
         store = Store(database_of(tmp_path))
         client.headers.update(bearer(make_key(store)))
         store.close()
