@@ -87,7 +87,7 @@ class QueryComponents:
     decoder: Decoder
     admission: Admission
     reads: BoundedReads
-    permits: FairSemaphore
+    cores: FairSemaphore
     idle_cores: IdleCores
 
     @classmethod
@@ -101,16 +101,16 @@ class QueryComponents:
         store: Store,
     ) -> QueryComponents:
         """Start the worker processes in the background and load the model."""
-        cores = settings.cores
-        count = cores.compute_threads + cores.workers + settings.decode.workers
-        permits = FairSemaphore(with_headroom(count), telemetry.cpu_accounts, cores=usable_cores())
-        decoder = closed_at_end(cleanup, Decoder(bundle.manifest, settings, telemetry, permits))
+        shares = settings.cores
+        count = shares.compute_threads + shares.workers + settings.decode.workers
+        cores = FairSemaphore(with_headroom(count), telemetry.cpu_accounts, cores=usable_cores())
+        decoder = closed_at_end(cleanup, Decoder(bundle.manifest, settings, telemetry, cores))
         decoder.start()
         encoder = backends.encoder(bundle, settings)
-        idle_cores = closed_at_end(cleanup, IdleCores(usable_cores(), telemetry.cpu_accounts, permits))
+        idle_cores = closed_at_end(cleanup, IdleCores(usable_cores(), telemetry.cpu_accounts, cores))
         encoder.use_helper(idle_cores.if_any)
         by_latents = not encoder.predicts_profile
-        optimiser = backends.optimiser(bundle, settings, telemetry, permits, by_latents)
+        optimiser = backends.optimiser(bundle, settings, telemetry, cores, by_latents)
         closed_at_end(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         return cls(
             settings=settings,
@@ -118,20 +118,20 @@ class QueryComponents:
             bundle=bundle,
             store=store,
             encoder=encoder,
-            grids=closed_at_end(cleanup, GridProvider(store, encoder, bundle.sha256, settings, telemetry, permits)),
+            grids=closed_at_end(cleanup, GridProvider(store, encoder, bundle.sha256, settings, telemetry, cores)),
             optimiser=optimiser,
             decoder=decoder,
             admission=_admission(settings, telemetry, store),
             reads=closed_at_end(
                 cleanup, store_reads(settings, threads=_READ_THREADS, max_pending=settings.pending_limit)
             ),
-            permits=permits,
+            cores=cores,
             idle_cores=idle_cores,
         )
 
     def localiser(self, plans: VenuePlans, indices: IndexSource) -> LocalLocaliser:
         """Build the localiser."""
-        executor = Executor(self.settings, self.optimiser, self.telemetry, self.permits)
+        executor = Executor(self.settings, self.optimiser, self.telemetry, self.cores)
         queries, tolerance_deg = self.admission.queries, self.settings.photographs.compass_tolerance_deg
         search = VenueSearch(plans=plans, indices=indices, encoder=self.encoder, queries=queries)
         parts = QueryParts(
@@ -151,7 +151,7 @@ class QueryComponents:
             executor=executor,
         )
         albums = Threads("albums", 1, self.telemetry.cpu_accounts)
-        return LocalLocaliser(parts, queries, albums, self.permits)
+        return LocalLocaliser(parts, queries, albums, self.cores)
 
     def venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""
@@ -186,7 +186,7 @@ class QueryComponents:
             max_pending=_MAX_PENDING_RENDITIONS,
             # There is one worker.
             turns=FairSemaphore(1, self.telemetry.cpu_accounts),
-            permits=self.permits,
+            cores=self.cores,
         )
 
 

@@ -62,7 +62,7 @@ class Runtime:
         venue_plans: rows of the plans of venues in memory.
         plan_indices: indices of venues in this process.
         renditions: files made from stored plans.
-        permits: permits to compute, of which each piece of work holds one.
+        cores: cores to compute on, of which each piece of work holds one.
         albums: solves albums, while its `run` does.
     """
 
@@ -88,7 +88,7 @@ class Runtime:
     venue_plans: VenuePlans
     plan_indices: PlanIndices
     renditions: RenditionCache
-    permits: FairSemaphore
+    cores: FairSemaphore
 
     @property
     def ready(self) -> bool:
@@ -161,19 +161,19 @@ def start_runtime(
         venue_plans=plans,
         plan_indices=plan_indices,
         renditions=closed_at_end(cleanup, components.renditions(converter)),
-        permits=components.permits,
+        cores=components.cores,
     )
 
 
 def _upload_threads(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) -> tuple[Threads, Threads]:
     """Return the threads that store plans, and those for uploads that wait for the converter."""
     # One thread per client beside other clients, because small uploads share the interpreter with queries.
-    uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts, cores=1, rests=True)
+    uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS, telemetry.cpu_accounts, beside_others=1, rests=True)
     closed_at_end(cleanup, uploads)
     # As many threads as converter processes; fewer per client beside others, because plans are stored by this process.
     # Closed after the converter, because its waiting jobs must end first.
     count = with_headroom(settings.imports.workers)
-    files = Threads("lalaloc-files", count, telemetry.cpu_accounts, cores=usable_cores(), rests=True)
+    files = Threads("lalaloc-files", count, telemetry.cpu_accounts, beside_others=usable_cores(), rests=True)
     return uploads, closed_at_end(cleanup, files)
 
 

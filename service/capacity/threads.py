@@ -26,8 +26,8 @@ class Threads:
         name: prefix of thread names.
         count: number of threads.
         accounts: CPU time of the clients; calls are charged to theirs.
-        permits: permits to compute, of which each call holds one; None: calls need none.
-        cores: limits the threads of a client beside other clients, see `FairSemaphore`.
+        cores: cores to compute on, of which each call holds one; None: calls hold none.
+        beside_others: limits the threads of a client beside other clients, as `cores` of `FairSemaphore`.
         rests: the calls count for `CpuAccounts.rest_s`.
     """
 
@@ -36,25 +36,24 @@ class Threads:
         name: str,
         count: int,
         accounts: CpuAccounts | None = None,
-        permits: FairSemaphore | None = None,
-        cores: int | None = None,
+        cores: FairSemaphore | None = None,
         *,
+        beside_others: int | None = None,
         rests: bool = False,
     ) -> None:
         self._rests = rests
         self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
         self._accounts = accounts or CpuAccounts()
-        self._semaphore = FairSemaphore(count, self._accounts, cores=cores)
-        self._permits = permits
+        threads = FairSemaphore(count, self._accounts, cores=beside_others)
+        self._needed = [threads] if cores is None else [threads, cores]
 
     async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a call for a client and return its result; a call that has begun is never cancelled."""
-        await self._semaphore.acquire(client)
-        taken = [self._semaphore]
+        taken = list[FairSemaphore]()
         try:
-            if self._permits is not None:
-                await self._permits.acquire(client)
-                taken.append(self._permits)
+            for semaphore in self._needed:
+                await semaphore.acquire(client)
+                taken.append(semaphore)
             future = self.submit(self._charged, client, work, *args, **kwargs)
         except BaseException:
             for semaphore in taken:
@@ -83,18 +82,18 @@ class IdleCores(Executor):
     """Threads that take over parts of the calls of `Threads` while cores are idle; charged to the calls' clients.
 
     Args:
-        cores: number of cores.
+        count: number of cores.
         accounts: CPU time of the clients.
-        permits: permits to compute; as many cores are busy as are held.
+        cores: cores to compute on; as many are busy as are held.
     """
 
-    def __init__(self, cores: int, accounts: CpuAccounts, permits: FairSemaphore) -> None:
-        self._executor = ThreadPoolExecutor(max(cores // 2, 1), thread_name_prefix="idle-core")
-        self._cores, self._accounts, self._permits = cores, accounts, permits
+    def __init__(self, count: int, accounts: CpuAccounts, cores: FairSemaphore) -> None:
+        self._executor = ThreadPoolExecutor(max(count // 2, 1), thread_name_prefix="idle-core")
+        self._count, self._accounts, self._cores = count, accounts, cores
 
     def if_any(self) -> IdleCores | None:
         """Return these threads if a core is idle."""
-        return self if self._permits.in_use < self._cores else None
+        return self if self._cores.in_use < self._count else None
 
     def submit(self, work: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Start a part of the call that the current thread computes."""

@@ -52,7 +52,7 @@ _FILM_QUEUE, _FILM_MARGIN_S = 4, 40.0
 class Decoder:
     """Bounded pool of decoding workers."""
 
-    def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, permits: FairSemaphore) -> None:
+    def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, cores: FairSemaphore) -> None:
         self._settings = settings
         sizes = DecodeSizes(
             sphere=sphere_size(manifest), patch=patch_size(manifest), film=settings.photographs.film_limits
@@ -66,7 +66,7 @@ class Decoder:
                 queue_limit=queue_limit,
                 keep_spare=True,
                 accounts=telemetry.cpu_accounts,
-                permits=permits,
+                cores=cores,
                 on_restart=lambda _reason: telemetry.note_restart(name),
             )
 

@@ -127,7 +127,7 @@ class GridBuilder:
         store: Store,
         encoders: PhotographEncoder,
         cache: GridCache,
-        permits: FairSemaphore,
+        cores: FairSemaphore,
         settings: Settings,
         telemetry: Telemetry,
     ) -> None:
@@ -137,14 +137,14 @@ class GridBuilder:
             store: the store.
             encoders: the networks.
             cache: receives finished grids.
-            permits: permits to compute, which queries need as well.
+            cores: cores to compute on, which queries need as well.
             settings: the settings.
             telemetry: the metrics.
         """
         self._store = store
         self._encoders = encoders
         self._cache = cache
-        self._permits = permits
+        self._cores = cores
         self._settings = settings
         self._telemetry = telemetry
         self._owner = uuid.uuid4().hex
@@ -186,7 +186,7 @@ class GridBuilder:
         with self._telemetry.cpu_accounts.charged(record.tenant):
             with self._telemetry.timed(self._telemetry.grid_seconds):
                 grid = self._embed(job, record.plan, record.tenant)
-            with self._permits.hold(record.tenant):
+            with self._cores.hold(record.tenant):
                 prototypes = SortedPrototypes.of_grid(grid, record.plan)
         try:
             if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
@@ -226,7 +226,7 @@ class GridBuilder:
                 self._encoders,
                 step_m=job.key.step_m,
                 camera_height_m=height_m,
-                computing=partial(self._permits.hold, client),
+                computing=partial(self._cores.hold, client),
                 after_room=check,
                 after_chunk=after_chunk,
             )

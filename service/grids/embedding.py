@@ -47,7 +47,7 @@ def embed(
         camera_height_m: camera height (m).
         computing: entered for the sampling and for each chunk, so that queries take turns with them.
         after_room: called after each room of the sampling; an error that it or `after_chunk` raises ends the work.
-        after_chunk: called with the share done (0 to 1), without a permit.
+        after_chunk: called with the share done (0 to 1), without a core.
 
     Raises:
         InvalidPoseError: the networks return non-finite latents at this camera height.

@@ -108,7 +108,7 @@ class GridProvider:
         model_sha256: digest of the model.
         settings: the settings.
         telemetry: the metrics.
-        permits: permits to compute, which queries need as well.
+        cores: cores to compute on, which queries need as well.
     """
 
     def __init__(
@@ -118,16 +118,16 @@ class GridProvider:
         model_sha256: str,
         settings: Settings,
         telemetry: Telemetry,
-        permits: FairSemaphore,
+        cores: FairSemaphore,
     ) -> None:
         self._store = store
         self._encoders = encoders
         self._model_sha256 = model_sha256
         self._settings = settings
         self._telemetry = telemetry
-        self._permits = permits
+        self._cores = cores
         self._cache = GridCache(store, settings.storage.grid_cache_bytes, telemetry)
-        self._jobs = GridBuilder(store, encoders, self._cache, permits, settings, telemetry).jobs
+        self._jobs = GridBuilder(store, encoders, self._cache, cores, settings, telemetry).jobs
         self._unprepared = 0
         telemetry.gauge(
             "lalaloc_grids_pending", "Pose grids being computed or queued in this replica.", lambda: self.pending
@@ -187,8 +187,8 @@ class GridProvider:
         if self._estimate(plan) > self._settings.grids.inline_grid_poses:
             return None
         try:
-            hold = partial(self._permits.hold, client)
-            # Work of a few milliseconds needs one permit; each permit can wake another thread.
+            hold = partial(self._cores.hold, client)
+            # Work of a few milliseconds needs one core; each core can wake another thread.
             is_brief = self._estimate(plan) <= RENDERED
             with hold() if is_brief else nullcontext():
                 part = nullcontext if is_brief else hold
@@ -236,7 +236,7 @@ class GridProvider:
     def _embed_small(self, plans: Sequence[FloorPlan], client: str) -> list[tuple[PoseGrid, SortedPrototypes]]:
         """Return the grids of plans and their prototypes; after an error, those before it."""
         made: list[tuple[PoseGrid, SortedPrototypes]] = []
-        step_m, hold = self._settings.grids.grid_step_m, partial(self._permits.hold, client)
+        step_m, hold = self._settings.grids.grid_step_m, partial(self._cores.hold, client)
         try:
             with self._telemetry.timed(self._telemetry.grid_seconds):
                 for part in embed_small(plans, self._encoders, step_m=step_m, computing=hold):

@@ -4,7 +4,7 @@ Large libraries, some of them in C++, read drawings, models and scans. A file th
 a file that takes too long is not. The workers start with the first file that is not in the native format.
 
 Localisability is predicted and drawn by a worker of its own, started with the first prediction. It is not niced, as its
-jobs hold permits to compute like queries.
+jobs hold cores like queries.
 """
 
 from __future__ import annotations

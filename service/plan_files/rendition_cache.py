@@ -69,7 +69,7 @@ class RenditionCache:
         limit_bytes: int,
         max_pending: int,
         turns: FairSemaphore,
-        permits: FairSemaphore,
+        cores: FairSemaphore,
     ) -> None:
         """Start the threads.
 
@@ -80,8 +80,8 @@ class RenditionCache:
             step_m: grid step of descriptions.
             limit_bytes: size of the cache; 0 keeps no files.
             max_pending: largest number of files being made or waiting, shared between clients.
-            turns: permits to predict localisability.
-            permits: permits to compute, of which a prediction holds one.
+            turns: turns to predict localisability.
+            cores: cores to compute on, of which a prediction holds one.
         """
         self._plans = plans
         self._converter = converter
@@ -91,7 +91,7 @@ class RenditionCache:
         self._cache: BoundedCache[_Key, Rendition] = BoundedCache(limit_bytes, lambda made: len(made.content))
         self._pending: dict[_Key, _PendingJob] = {}
         self._shares = Shares(max_pending)
-        self._turns, self._permits = turns, permits
+        self._turns, self._cores = turns, cores
 
     def put(self, revision_id: str, kind: RenditionKind, made: Rendition) -> None:
         """Keep a file that was made elsewhere."""
@@ -150,8 +150,8 @@ class RenditionCache:
         report = b""
         if key[1] in CONDITIONS:
             report = (await self.get(plan_id, key[0], "localisability", client)).content
-        # The turn comes first: a permit must not be held by a prediction that waits.
-        async with self._turns.held(client), self._permits.held(client):
+        # The turn comes first: a core must not be held by a prediction that waits.
+        async with self._turns.held(client), self._cores.held(client):
             return await self._made(job, plan_id, key, client, report)
 
     async def _made(self, job: _PendingJob, plan_id: str, key: _Key, client: str, report: bytes = b"") -> Rendition:

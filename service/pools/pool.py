@@ -60,7 +60,7 @@ class WorkerPool(Generic[Job, Result]):
         queue_limit: int,
         keep_spare: bool = False,
         accounts: CpuAccounts | None = None,
-        permits: FairSemaphore | None = None,
+        cores: FairSemaphore | None = None,
         on_restart: Callable[[str], None] = lambda _reason: None,
     ) -> None:
         """Create a pool, which `start` starts.
@@ -71,13 +71,13 @@ class WorkerPool(Generic[Job, Result]):
             queue_limit: maximum number of waiting jobs, besides the running ones.
             keep_spare: keep one worker free of clients that already have jobs running; for jobs that take seconds.
             accounts: CPU time of the clients; jobs are charged to theirs.
-            permits: permits to compute, of which a job of `run_job` holds one; None: jobs need none.
+            cores: cores to compute on, of which a job of `run_job` holds one; None: jobs need none.
             on_restart: called with the reason whenever a worker is replaced.
         """
         self._queue = JobQueue(
             queue_limit, self._served_by, accounts or CpuAccounts(), Shares(workers) if keep_spare else None
         )
-        self._permits = permits
+        self._cores = cores
         self._supervisors = [Supervisor(spec, index, self._queue, on_restart) for index in range(workers)]
         self._submitting = ThreadPoolExecutor(_SUBMITTING_THREADS, thread_name_prefix=f"{spec.name}-submit")
 
@@ -139,7 +139,7 @@ class WorkerPool(Generic[Job, Result]):
         """
         deadline = monotonic() + timeout_s
         try:
-            async with asyncio.timeout(timeout_s), self._permits.held(client) if self._permits else nullcontext():
+            async with asyncio.timeout(timeout_s), self._cores.held(client) if self._cores else nullcontext():
                 return await self._run(job, deadline, client)
         except TimeoutError:
             raise JobLostError("deadline") from None

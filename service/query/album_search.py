@@ -44,11 +44,11 @@ class _Stopped(Exception):
 class AlbumSearch:
     """Solver of albums, on a thread of its own: a solve can take longer than queries may wait."""
 
-    def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, permits: FairSemaphore) -> None:
+    def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, cores: FairSemaphore) -> None:
         self._parts = parts
         self._queries = queries
         self._threads = threads
-        self._permits = permits
+        self._cores = cores
         # Found by an earlier solve of the same album; a solve takes it out, as two must not share it.
         self._memories = BoundedCache[str, AlbumMemory](_MEMORY_BYTES, _size_of)
 
@@ -117,7 +117,7 @@ class AlbumSearch:
             else:
                 stated.append(replace(entry, correction=correction))
         memory = self._take(query.album_id)
-        turns = _Turns(self._permits, query.context.client)
+        turns = _Turns(self._cores, query.context.client)
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
@@ -147,14 +147,14 @@ class AlbumSearch:
 
 
 class _Turns:
-    """Permit to compute that a thread holds, and passes on to others that wait."""
+    """Core that a thread holds, and passes on to others that wait."""
 
-    def __init__(self, permits: FairSemaphore, client: str) -> None:
-        self._permits, self._client = permits, client
-        self._held = permits.hold(client)
+    def __init__(self, cores: FairSemaphore, client: str) -> None:
+        self._cores, self._client = cores, client
+        self._held = cores.hold(client)
 
     def __enter__(self) -> _Turns:
-        self._held = self._permits.hold(self._client)
+        self._held = self._cores.hold(self._client)
         self._held.__enter__()
         return self
 
@@ -162,7 +162,7 @@ class _Turns:
         self._held.__exit__(None, None, None)
 
     def pass_on(self) -> None:
-        """Give the permit to the next one, and wait for it."""
+        """Give the core to the next one, and wait for it."""
         self.__exit__()
         self.__enter__()
 

@@ -61,13 +61,13 @@ def finish_with(steps: SearchSteps[FoundT], complete: Callable[[FoundT], T]) -> 
 class Executor:
     """Compute threads of queries."""
 
-    def __init__(self, settings: Settings, optimiser: Optimiser, telemetry: Telemetry, permits: FairSemaphore) -> None:
+    def __init__(self, settings: Settings, optimiser: Optimiser, telemetry: Telemetry, cores: FairSemaphore) -> None:
         self._lpo_deadline_s = settings.lpo.deadline_s
         self._optimiser = optimiser
         self._telemetry = telemetry
         self._steps = StepRunner(optimiser, telemetry)
         self._threads = Threads(
-            "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, permits
+            "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, cores
         )
 
     async def compute(self, context: QueryContext, work: Callable[[], T]) -> T:

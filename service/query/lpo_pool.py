@@ -21,7 +21,7 @@ class LpoPool:
     """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined."""
 
     def __init__(
-        self, bundle: Bundle, settings: Settings, telemetry: Telemetry, permits: FairSemaphore, by_latents: bool = True
+        self, bundle: Bundle, settings: Settings, telemetry: Telemetry, cores: FairSemaphore, by_latents: bool = True
     ) -> None:
         """Create a pool, which `start` starts.
 
@@ -29,25 +29,24 @@ class LpoPool:
             bundle: the model.
             settings: the settings.
             telemetry: metrics.
-            permits: permits to compute.
+            cores: cores to compute on.
             by_latents: whether the model's poses are refined by latents; else workers load no torch.
         """
         self._telemetry = telemetry
-        cores = settings.cores
         spec = WorkerSpec(
             name="lpo",
             target=run_worker,
-            arguments=(str(bundle.folder.resolve()), bundle.sha256, cores.worker_threads, by_latents),
+            arguments=(str(bundle.folder.resolve()), bundle.sha256, settings.cores.worker_threads, by_latents),
             stall_s=settings.lpo.stall_s,
             start_s=_START_S,
             max_start_s=_MAX_START_S,
         )
         self._workers: WorkerPool[RefinementJob | SequenceJob, RefinementResult | SequenceResult] = WorkerPool(
             spec,
-            workers=cores.workers,
+            workers=settings.cores.workers,
             queue_limit=settings.lpo.queue,
             accounts=telemetry.cpu_accounts,
-            permits=permits,
+            cores=cores,
             on_restart=lambda _reason: telemetry.note_restart("lpo"),
         )
         # Counters exist with value 0 from the start, so that the first miss shows as a rise.

@@ -99,7 +99,7 @@ class PlanUpload:
             call.client,
             runtime.converter,
             runtime.settings,
-            runtime.permits,
+            runtime.cores,
             on_step,
         )
 

@@ -62,7 +62,7 @@ def maker(monkeypatch: pytest.MonkeyPatch) -> _BlockedMaker:
 def cache(store: Store) -> Iterator[RenditionCache]:
     converter = Converter(Settings(import_workers=1), Telemetry())
     bundle = Bundle.open(default_bundle())
-    permits = {name: FairSemaphore(1, CpuAccounts()) for name in ("turns", "permits")}
+    permits = {name: FairSemaphore(1, CpuAccounts()) for name in ("turns", "cores")}
     cache = RenditionCache(store.plans, converter, bundle, step_m=0.5, limit_bytes=100_000, max_pending=4, **permits)
     yield cache
     converter.close()
