@@ -23,7 +23,7 @@ from service.capacity.fair_share import FairSemaphore
 from service.capacity.threads import Threads
 from service.query.album_answers import compose_outcome
 from service.query.ground import Ground
-from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery
+from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery, Where
 from service.query.query_parts import QueryParts
 from service.query.spots import Spot, read_view
 from service.schemas.albums import AlbumDocument, PhotographFacts
