@@ -12,7 +12,7 @@ from lalaloc_client.model import Position
 
 @dataclass(frozen=True)
 class PlanProbability:
-    """Probability that a panorama was taken in one plan of a venue."""
+    """Probability that a photograph was taken in one plan of a venue."""
 
     floorplan_id: str
     level: float
@@ -216,11 +216,12 @@ class Localisation:
 
     Attributes:
         heading_deg: azimuth of the photograph's centre, clockwise from the plan's +y.
-        heading_source: `given`, `panorama` (its metadata) or `searched`; None for services without this field.
+        heading_source: `given`, `photograph` (its metadata; `panorama` before 0.12) or `searched`; None for services
+            without this field.
         confidence: probability that the position error is below 1 m; None if the model is not calibrated.
         heading_confidence: probability that the heading error is below 5°.
-        probability_elsewhere: probability that the panorama is of none of the plan's places.
-        warnings: options that were not followed, such as a heading that the panorama contradicts.
+        probability_elsewhere: probability that the photograph is of none of the plan's places.
+        warnings: options that were not followed, such as a heading that the photograph contradicts.
         camera_height_m: the best camera height.
         geopose: the pose on Earth; None without an anchor of plan or venue.
         room_id: the room's id, unique in the plan.

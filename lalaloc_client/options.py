@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Literal, TypeAlias, TypedDict
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Literal, ParamSpec, TypeAlias, TypedDict, TypeVar
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Projection = Literal["auto", "equirectangular", "perspective", "cylindrical", "fisheye"]
 Refine = Literal["none", "vdr", "lpo"]
 SequenceRefine = Literal["none", "lpo"]
@@ -96,3 +100,19 @@ class SequenceOptions(FilmOptions, total=False):
 
 
 Options: TypeAlias = QueryOptions | SequenceOptions | FilmOptions | ViewOptions
+
+
+def earlier_name(earlier: str, name: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Return a decorator of methods that accept an argument under its name in versions before 0.12, too."""
+
+    def decorate(method: Callable[P, T]) -> Callable[P, T]:
+        @wraps(method)
+        def call(*arguments: P.args, **named: P.kwargs) -> T:
+            if earlier in named:
+                warnings.warn(f"argument '{earlier}' is now '{name}'", DeprecationWarning, stacklevel=2)
+                named[name] = named.pop(earlier)
+            return method(*arguments, **named)
+
+        return call
+
+    return decorate

@@ -31,7 +31,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     core.InvalidFloorPlanError: ProblemKind(422, "invalid-floorplan", "Invalid floor plan"),
     core.SeveralLevelsError: ProblemKind(422, "several-levels", "Several levels: choose one"),
     core.MissingExtraError: ProblemKind(501, "missing-extra", "Package for this format not installed"),
-    core.InvalidPhotographError: ProblemKind(422, "invalid-panorama", "Invalid photograph"),
+    core.InvalidPhotographError: ProblemKind(422, "invalid-photograph", "Invalid photograph"),
     core.InvalidFilmError: ProblemKind(422, "invalid-film", "Invalid film"),
     core.InvalidFeaturesError: ProblemKind(422, "invalid-features", "Invalid features"),
     core.ForeignFeaturesError: ProblemKind(409, "foreign-features", "Features of another model"),

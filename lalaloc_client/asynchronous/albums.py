@@ -22,7 +22,7 @@ from lalaloc_client.albums import (
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.transport import AsyncTransport
 from lalaloc_client.errors import AlbumFailedError, NotReadyError
-from lalaloc_client.options import ViewOptions
+from lalaloc_client.options import ViewOptions, earlier_name
 from lalaloc_client.requests import NDJSON, Photograph, Request, json_request, query_request, resource_path, text_values
 
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
@@ -80,7 +80,8 @@ class AsyncAlbums(AsyncTransport):
         headers = {} if if_match is None else {"If-Match": if_match}
         await self._send(Request("DELETE", resource_path("albums", album_id), headers=headers))
 
-    async def add_to_album(self, album_id: str, panoramas: Sequence[Photograph]) -> AsyncIterator[AddedPhotograph]:
+    @earlier_name("panoramas", "photographs")
+    async def add_to_album(self, album_id: str, photographs: Sequence[Photograph]) -> AsyncIterator[AddedPhotograph]:
         """Add photographs to an album; yield an answer for each, in order, as they are stored.
 
         The same picture is stored once, so that sending photographs again is safe. A photograph that cannot be read
@@ -90,18 +91,18 @@ class AsyncAlbums(AsyncTransport):
 
         Args:
             album_id: id of the album.
-            panoramas: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
+            photographs: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
 
         Raises:
             ConnectionFailedError: the connection broke off before the last answer.
         """
         path = f"{resource_path('albums', album_id)}/photographs"
-        left, attempt, waited_s = list(range(len(panoramas))), 0, 0.0
+        left, attempt, waited_s = list(range(len(photographs))), 0, 0.0
         async with self._concurrency.hold():
             while left:
                 attempt += 1
                 busy = list[AddedPhotograph]()
-                part = [panoramas[index] for index in left]
+                part = [photographs[index] for index in left]
                 request = await run_blocking(query_request, path, part, {}, accept=NDJSON, streamed=True)
                 async with aclosing(self._lines(AddedPhotograph, request)) as lines:
                     async for line in lines:

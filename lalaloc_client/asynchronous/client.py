@@ -12,7 +12,7 @@ from lalaloc_client.asynchronous.backend import run_blocking
 from lalaloc_client.asynchronous.plans import AsyncPlans
 from lalaloc_client.asynchronous.tracker import AsyncTracker
 from lalaloc_client.on_device import TurnFeatures, filmed
-from lalaloc_client.options import FilmOptions, QueryOptions, SequenceOptions, ViewOptions
+from lalaloc_client.options import FilmOptions, QueryOptions, SequenceOptions, ViewOptions, earlier_name
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
     NDJSON,
@@ -47,10 +47,11 @@ class AsyncClient(AsyncPlans):
         # 503 means "not ready", which is an answer.
         return parse(Readiness, await self.content(Request("GET", "/readyz", answers=frozenset({200, 503}))))
 
+    @earlier_name("panorama", "photograph")
     async def localise(
         self,
         floorplan_id: str,
-        panorama: Photograph,
+        photograph: Photograph,
         *,
         posterior: bool = False,
         on_device: bool = False,
@@ -60,22 +61,23 @@ class AsyncClient(AsyncPlans):
 
         Args:
             floorplan_id: id of the plan.
-            panorama: the photograph: bytes or path of a JPEG, PNG, WebP or HEIC file, or a PIL image, which is sent as
-                JPEG without metadata. Models without an encoder of views need full 360° spheres. Or the bytes or path
-                of its features, a file that `lalaloc encode` writes.
+            photograph: bytes or path of a JPEG, PNG, WebP or HEIC file, or a PIL image, which is sent as JPEG without
+                metadata. Models without an encoder of views need full 360° spheres. Or the bytes or path of its
+                features, a file that `lalaloc encode` writes.
             posterior: include the probability of every place of the plan in the answer.
             on_device: compute the features of the photograph on this device and send these alone. Needs the extra
                 `onnx`; the first photograph loads the image encoder of the service, about 19 MB.
             **options: see `QueryOptions`.
         """
         values = {"floorplan_id": floorplan_id, "include": "posterior" if posterior else None}
-        content = await self.localise_query("/localise", [panorama], values, options, on_device=on_device)
+        content = await self.localise_query("/localise", [photograph], values, options, on_device=on_device)
         return parse(Localisation, content)
 
+    @earlier_name("panorama", "photograph")
     async def localise_in_venue(
         self,
         venue_id: str,
-        panorama: Photograph,
+        photograph: Photograph,
         *,
         level: float | None = None,
         on_device: bool = False,
@@ -85,18 +87,19 @@ class AsyncClient(AsyncPlans):
 
         Args:
             venue_id: id of the venue.
-            panorama: as for `localise`.
+            photograph: as for `localise`.
             level: level of the camera; a hint unless `strict` is set.
             on_device: as for `localise`.
             **options: see `QueryOptions`; `near` is a latitude and longitude, or, if the venue has an anchor, a point
                 in the common frame of its plans.
         """
         values = {"venue_id": venue_id, "level": level}
-        content = await self.localise_query("/localise", [panorama], values, options, on_device=on_device)
+        content = await self.localise_query("/localise", [photograph], values, options, on_device=on_device)
         return parse(Localisation, content)
 
+    @earlier_name("panoramas", "photographs")
     async def localise_batch(
-        self, floorplan_id: str, panoramas: Sequence[Photograph], **options: Unpack[QueryOptions]
+        self, floorplan_id: str, photographs: Sequence[Photograph], **options: Unpack[QueryOptions]
     ) -> AsyncIterator[BatchAnswer]:
         """Localise many photographs, each by itself, in a plan; yield their answers in order, as they are computed.
 
@@ -104,7 +107,7 @@ class AsyncClient(AsyncPlans):
 
         Args:
             floorplan_id: id of the plan.
-            panoramas: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
+            photographs: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
             **options: see `QueryOptions`; they hold for all photographs.
 
         Raises:
@@ -113,16 +116,17 @@ class AsyncClient(AsyncPlans):
         values = {"floorplan_id": floorplan_id}
         async with self._concurrency.hold():
             request = await run_blocking(
-                query_request, "/localise/batch", panoramas, values, options, accept=NDJSON, streamed=True
+                query_request, "/localise/batch", photographs, values, options, accept=NDJSON, streamed=True
             )
             async with aclosing(self._lines(BatchAnswer, request)) as lines:
                 async for line in lines:
                     yield line
 
+    @earlier_name("panoramas", "photographs")
     async def localise_sequence(
         self,
         floorplan_id: str | None,
-        panoramas: Sequence[Photograph],
+        photographs: Sequence[Photograph],
         *,
         venue_id: str | None = None,
         on_device: bool = False,
@@ -132,16 +136,16 @@ class AsyncClient(AsyncPlans):
 
         Args:
             floorplan_id: id of the plan; None with `venue_id`.
-            panoramas: photographs in the order in which they were taken, each as for `localise`.
+            photographs: photographs in the order in which they were taken, each as for `localise`.
             venue_id: id of a venue, to search all its plans; poses have `floorplan_id` and `level`.
             on_device: as for `localise`; the angles of a turn are computed on this device, too.
             **options: see `SequenceOptions`.
         """
         values = {"floorplan_id": floorplan_id, "venue_id": venue_id}
         if on_device and options.get("relative_heading_deg") is None:
-            content, _ = await self.localise_turn(panoramas, values, options)
+            content, _ = await self.localise_turn(photographs, values, options)
         else:
-            content = await self.localise_query("/localise/sequence", panoramas, values, options, on_device=on_device)
+            content = await self.localise_query("/localise/sequence", photographs, values, options, on_device=on_device)
         return parse(SequenceLocalisation, content)
 
     async def localise_film(
@@ -199,10 +203,11 @@ class AsyncClient(AsyncPlans):
         """
         return AsyncTracker(self, floorplan_id, venue_id, options)
 
+    @earlier_name("panorama", "photograph")
     async def picture(
         self,
         floorplan_id: str,
-        panorama: Photograph,
+        photograph: Photograph,
         picture: Picture = "both",
         *,
         picture_format: PictureFormat = "png",
@@ -212,7 +217,7 @@ class AsyncClient(AsyncPlans):
 
         Args:
             floorplan_id: id of the plan.
-            panorama: as for `localise`.
+            photograph: as for `localise`.
             picture: `plan` with the posterior as a heat map, the answer and the other candidates, `photograph` with
                 the layout drawn over it, or `both`.
             picture_format: `png` or `svg`.
@@ -222,7 +227,7 @@ class AsyncClient(AsyncPlans):
             raise ValueError(f"picture_format is {picture_format!r}; it must be one of {', '.join(PICTURE_MEDIA)}")
         values = {"floorplan_id": floorplan_id}
         media, params = PICTURE_MEDIA[picture_format], {"picture": picture}
-        return await self.query(query_request, "/localise", [panorama], values, options, params=params, accept=media)
+        return await self.query(query_request, "/localise", [photograph], values, options, params=params, accept=media)
 
     async def get_answer(self, answer_id: str) -> Localisation:
         """Return a stored answer by its `answer_id`."""

@@ -23,7 +23,7 @@ from lalaloc_client.albums import (
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import AlbumFailedError, NotReadyError
-from lalaloc_client.options import ViewOptions
+from lalaloc_client.options import ViewOptions, earlier_name
 from lalaloc_client.requests import NDJSON, Photograph, Request, json_request, query_request, resource_path, text_values
 
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
@@ -80,7 +80,8 @@ class Albums(Transport):
         headers = {} if if_match is None else {"If-Match": if_match}
         self._send(Request("DELETE", resource_path("albums", album_id), headers=headers))
 
-    def add_to_album(self, album_id: str, panoramas: Sequence[Photograph]) -> Iterator[AddedPhotograph]:
+    @earlier_name("panoramas", "photographs")
+    def add_to_album(self, album_id: str, photographs: Sequence[Photograph]) -> Iterator[AddedPhotograph]:
         """Add photographs to an album; yield an answer for each, in order, as they are stored.
 
         The same picture is stored once, so that sending photographs again is safe. A photograph that cannot be read
@@ -90,18 +91,18 @@ class Albums(Transport):
 
         Args:
             album_id: id of the album.
-            panoramas: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
+            photographs: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
 
         Raises:
             ConnectionFailedError: the connection broke off before the last answer.
         """
         path = f"{resource_path('albums', album_id)}/photographs"
-        left, attempt, waited_s = list(range(len(panoramas))), 0, 0.0
+        left, attempt, waited_s = list(range(len(photographs))), 0, 0.0
         with self._concurrency.hold():
             while left:
                 attempt += 1
                 busy = list[AddedPhotograph]()
-                part = [panoramas[index] for index in left]
+                part = [photographs[index] for index in left]
                 request = run_blocking(query_request, path, part, {}, accept=NDJSON, streamed=True)
                 with closing(self._lines(AddedPhotograph, request)) as lines:
                     for line in lines:

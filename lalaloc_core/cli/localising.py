@@ -278,7 +278,7 @@ def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
 
 
 _HEAD = ("photograph", "room", "x m", "y m", "heading °", "95 % within", "camera m", "confidence")
-_SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
+_SOURCES = {"given": "given", "photograph": "from the compass", "searched": "estimated"}
 
 
 def _row(document: dict[str, Any], drawn: DrawnAnswer) -> tuple[str, ...]:

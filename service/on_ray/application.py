@@ -70,7 +70,7 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
     per_search = search_settings.query_limit + search_settings.requests.max_waiting_queries
     # The capacity of the maximum number of replicas, so that autoscaling can reach it.
     max_queries = settings.requests.max_queries or with_headroom(options.search_max * search_settings.query_limit)
-    # Panoramas are decoded in the search replicas.
+    # Photographs are decoded in the search replicas.
     ingress_settings = settings.with_values(workers=0, decode_workers=1, max_queries=max_queries)
     single = settings.with_values(onnx_threads=threads)
 

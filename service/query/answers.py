@@ -118,9 +118,9 @@ def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
     if not found.heading_contradicted:
         return []
     assert known.heading is not None
-    origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
+    origin = "heading_deg" if known.source == "given" else "the photograph's compass heading"
     degrees = heading_to_degrees(known.heading)
-    return [f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"]
+    return [f"{origin} is {degrees:.4g}, which the photograph contradicts: the heading was searched for instead"]
 
 
 def _candidate(place: PlacedCandidate, query: Query, probability: float | None) -> CandidateAnswer:

@@ -165,7 +165,7 @@ class Ground:
             stated = f"level is {self.venue_hints.level:g}"
             instead = f"the answer is on level {place.level:g}"
         followed = "the answer follows it because strict is set" if hints.strict else instead
-        return f"{stated}, which the panorama contradicts: {followed}"
+        return f"{stated}, which the photograph contradicts: {followed}"
 
 
 def _by_probability(share: Float[np.ndarray, "m"], number: Int[np.ndarray, "m"]) -> list[int]:

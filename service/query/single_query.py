@@ -19,7 +19,7 @@ from service.storage.records import PlanRecord
 # Among many plans the right one often ranks low before refinement, so refine more candidates than in a single plan.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 # Names of the heading's sources in pictures.
-_SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
+_SOURCES = {"given": "given", "photograph": "from the compass", "searched": "estimated"}
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ _PHOTO_SCHEMA = {
     "format": "binary",
     "description": "Photograph as JPEG, PNG, WebP or, with the extra `heic`, HEIC: a 360° sphere, twice as wide as "
     "high, or a part of it with photo sphere metadata (GPano in XMP), or, for models with an encoder of views, an "
-    "ordinary photograph, a fisheye photograph or a phone's panorama. Its EXIF metadata state the field of view.",
+    "ordinary or fisheye photograph, or a strip of a phone's panorama mode. Its EXIF metadata state the field of view.",
 }
 
 

@@ -37,7 +37,7 @@ from service.storage.records import PlanRecord, VenueRecord
 
 PHOTO, FEATURES, FILM = "photo", "features", "film"
 # Name of the part in versions up to 0.5.
-PANORAMA = "panorama"
+_EARLIER_PHOTO = "panorama"
 VARY = {"Vary": "Accept"}
 Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
 AnyForm = TypeVar("AnyForm", bound=BaseModel)
@@ -59,7 +59,7 @@ def body_schema(
     # `http.api_description` adds these schemas.
     schema.pop("$defs", None)
     schema["properties"][PHOTO] = dict(photo)
-    schema["properties"][PANORAMA] = {**photo, "description": f"Earlier name of `{PHOTO}`.", "deprecated": True}
+    schema["properties"][_EARLIER_PHOTO] = {**photo, "description": f"Earlier name of `{PHOTO}`.", "deprecated": True}
     kind = {"type": "string", "format": "binary"}
     schema["properties"][FEATURES] = {
         **({"type": "array", "items": kind} if photo["type"] == "array" else kind),
@@ -131,7 +131,7 @@ async def read_files(
                 fields=set(form_type.model_fields),
                 check=partial(faults_of, form_type, context=bounds),
                 repeated=repeated or {},
-                aliases={PANORAMA: PHOTO},
+                aliases={_EARLIER_PHOTO: PHOTO},
                 substitutes={FEATURES: PHOTO} | ({FILM: PHOTO} if film else {}),
             )
         except errors.UploadTooLargeError as error:

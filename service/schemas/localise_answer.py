@@ -165,7 +165,7 @@ class LocaliseAnswer(ResponseModel):
         description="Parts of the request that were not followed, such as a hint that the photograph contradicts; what "
         "the photograph was taken for, also in `view`; or the reason of a very low confidence."
     )
-    heading_source: Literal["given", "panorama", "searched"] = Field(
+    heading_source: Literal["given", "photograph", "searched"] = Field(
         description="Source of the heading: the request, the photograph's metadata, or the search."
     )
     stage: Literal["retrieval", "vdr", "lpo"] = Field(description="Last stage that ran.")

@@ -135,7 +135,7 @@ class SequencePoseAnswer(ResponseModel):
     level: float | None = Field(default=None, description="Level of the plan in the venue; null outside of venues.")
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360)
-    heading_source: Literal["given", "panorama", "searched"]
+    heading_source: Literal["given", "photograph", "searched"]
     room: str
     room_id: str
     confidence: Share | None

@@ -119,7 +119,7 @@ class _BlockingAdapter:
         method = getattr(self._client, name)
 
         async def call(*args: Any, **kwargs: Any) -> Any:
-            if inspect.isasyncgenfunction(method):
+            if inspect.isasyncgenfunction(inspect.unwrap(method)):
                 return [item async for item in method(*args, **kwargs)]
             return await method(*args, **kwargs)
 

@@ -273,7 +273,7 @@ def test_batch_yields_an_answer_per_photograph(service: Any, panorama: bytes, tm
     assert answers[0].result().floorplan_id == plan.id
     with pytest.raises(InvalidError) as caught:
         answers[1].result()
-    assert caught.value.type == "urn:lalaloc:problem:invalid-panorama"
+    assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
     with pytest.raises(NotFoundError):
         list(service.localise_batch("f" * 32, [panorama]))
 
@@ -298,5 +298,12 @@ def test_faulty_photograph_gives_its_warning_or_a_named_error(
             return
         with pytest.raises(InvalidError) as caught:
             client.localise(plan.id, FOLDER / fault.name)
-        assert caught.value.type == "urn:lalaloc:problem:invalid-panorama"
+        assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
         fault.check_refusal(str(caught.value))
+
+
+def test_earlier_names_of_arguments_are_accepted(service: Any, panorama: bytes) -> None:
+    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+    with pytest.warns(DeprecationWarning, match="'panorama' is now 'photograph'"):
+        earlier = service.localise(plan_id, panorama=panorama, refine="none")
+    assert earlier.position == service.localise(plan_id, photograph=panorama, refine="none").position

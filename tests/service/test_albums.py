@@ -139,7 +139,7 @@ def test_same_picture_is_added_once(client: httpx.Client, plan_id: str, pictures
 def test_unreadable_files_do_not_stop_the_others(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
     lines = add(client, create(client, plan_id), [b"no picture", pictures[0], b""])
     assert [line["status"] for line in lines] == [422, 201, 422]
-    assert lines[0]["problem"]["type"] == "urn:lalaloc:problem:invalid-panorama"
+    assert lines[0]["problem"]["type"] == "urn:lalaloc:problem:invalid-photograph"
     assert (lines[0]["name"], lines[1]["photograph"]["name"]) == ("0.jpg", "1.jpg")
 
 

@@ -46,7 +46,7 @@ def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, plan_
         (2, "2.jpg", 413),
         (3, "3.jpg", 200),
     ]
-    assert lines[1]["problem"]["type"] == "urn:lalaloc:problem:invalid-panorama"
+    assert lines[1]["problem"]["type"] == "urn:lalaloc:problem:invalid-photograph"
     assert "LALALOC_MAX_PHOTOGRAPH_BYTES" in lines[2]["problem"]["detail"]
     alone = localise(client, plan_id, panorama, refine="none", heading_deg=90).json()
     for line in (lines[0], lines[3]):

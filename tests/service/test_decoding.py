@@ -98,11 +98,11 @@ def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, panor
     with start_app(tmp_path, decode_stall_s=0.2) as client:
         plan_id = upload(client)
         ready(client)
-        problem = assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-panorama")
+        problem = assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-photograph")
         assert "more than 0.2 s of CPU time (LALALOC_DECODE_STALL_S)" in problem["detail"]
         wait_for(lambda: restarts(client) == 1.0)
         ready(client)
-        assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-panorama")
+        assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-photograph")
         wait_for(lambda: restarts(client) == 2.0)
         assert localise(client, plan_id, panorama, **QUICK).status_code == 200
 
@@ -147,7 +147,7 @@ class TestBombs:
             plan_id = upload(client)
             ready(client)
             pid, before = decoder(), most_memory(decoder())
-            assert_problem(localise(client, plan_id, bomb, **BLACK), 422, "invalid-panorama")
+            assert_problem(localise(client, plan_id, bomb, **BLACK), 422, "invalid-photograph")
             assert localise(client, plan_id, panorama, **QUICK).status_code == 200
             assert decoder() == pid, "it did not have to die for that"
             assert most_memory(pid) < before + self.CAP + self.MAPPED
@@ -159,7 +159,7 @@ class TestBombs:
             assert localise(client, plan_id, panorama, **QUICK).status_code == 200
             before = most_memory(decoder())
             for kind, bomb in bombs.items():
-                problem = assert_problem(localise(client, plan_id, bomb, **QUICK), 422, "invalid-panorama")
+                problem = assert_problem(localise(client, plan_id, bomb, **QUICK), 422, "invalid-photograph")
                 assert "4000 x 2000 = 8000000 pixels; the limit is 1000000 (LALALOC_MAX_PIXELS)" in problem["detail"], (
                     kind
                 )

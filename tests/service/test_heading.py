@@ -44,7 +44,7 @@ def poses(response: httpx.Response) -> tuple[str, list[object]]:
 def test_compass_is_used_if_north_is_known(compass_client: httpx.Client, north: str, compass_deg: float) -> None:
     picture = with_packet(PoseHeadingDegrees=compass_deg)
     source, found = poses(localise(compass_client, north, picture, refine="none"))
-    assert source == "panorama"
+    assert source == "photograph"
     heading_deg = (compass_deg + NORTH_DEG) % 360.0
     given = localise(compass_client, north, picture, refine="none", heading_deg=heading_deg, heading_tolerance_deg=15)
     assert poses(given) == ("given", found)

@@ -137,10 +137,10 @@ def test_contradicted_hints_are_warned_about() -> None:
     grid = PoseGrid(PoseSet(np.zeros((1, 2)), np.zeros(1, int)), None, np.ones((1, 8)), 1.0, 1.5)
     ground = Ground.of_plan(record, grid, hints)
     assert ground.hint_warnings(found) == [
-        "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer is 5.0 m from there",
-        "rooms is 'bedroom', 'bedroom-2', which the panorama contradicts: the answer lies in room 'hall'",
+        "near is within 3 m of (6, 4.5), which the photograph contradicts: the answer is 5.0 m from there",
+        "rooms is 'bedroom', 'bedroom-2', which the photograph contradicts: the answer lies in room 'hall'",
     ]
     strict = Ground.of_plan(record, grid, replace(hints, strict=True))
     assert strict.hint_warnings(replace(found, hints_missed=("near",))) == [
-        "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer follows it because strict is set"
+        "near is within 3 m of (6, 4.5), which the photograph contradicts: the answer follows it because strict is set"
     ]

@@ -217,7 +217,7 @@ BAD_PICTURES = {
 def test_invalid_panorama_is_rejected_with_its_fault(
     client: httpx.Client, flat: str, picture: bytes, message: str
 ) -> None:
-    assert message in assert_problem(localise(client, flat, picture), 422, "invalid-panorama")["detail"]
+    assert message in assert_problem(localise(client, flat, picture), 422, "invalid-photograph")["detail"]
 
 
 def test_too_large_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:

@@ -103,7 +103,7 @@ def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id
 
 @pytest.mark.slow
 def test_replica_errors_reach_the_client(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    assert_problem(localise(on_ray, plan_id, b"no picture"), 422, "invalid-panorama")
+    assert_problem(localise(on_ray, plan_id, b"no picture"), 422, "invalid-photograph")
     assert_problem(localise(on_ray, plan_id, panorama, rooms=json.dumps(["nowhere"])), 422, "invalid-hint")
     assert_problem(localise(on_ray, "0" * 32, panorama), 404, "unknown-floorplan")
     assert_problem(localise(on_ray, plan_id, panorama, camera_height_m=2.6), 422, "invalid-pose")

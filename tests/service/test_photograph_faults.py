@@ -45,7 +45,7 @@ def test_file_is_localised_right_or_refused_by_name(shipped: httpx.Client, home:
         assert response.status_code == 200, response.text
         fault.check(response.json())
     else:
-        fault.check_refusal(assert_problem(response, 422, "invalid-panorama")["detail"])
+        fault.check_refusal(assert_problem(response, 422, "invalid-photograph")["detail"])
 
 
 def test_contradicted_statement_is_named_at_a_low_confidence(shipped: httpx.Client, home: str) -> None:
@@ -73,7 +73,7 @@ def test_fault_in_a_sequence_is_named_with_its_photograph(shipped: httpx.Client,
     fields = {name: value for name, value in data_of(fault, home).items() if name in ("floorplan_id", "intrinsics")}
     response = shipped.post("/localise/sequence", data=fields | {"motion": "turn"}, files=two_files(fault))
     if not fault.is_usable:
-        detail = assert_problem(response, 422, "invalid-panorama")["detail"]
+        detail = assert_problem(response, 422, "invalid-photograph")["detail"]
         fault.check_refusal(detail)
         assert "photo[0]" in detail
         return
@@ -92,7 +92,7 @@ def test_fault_in_a_session_is_named_with_its_pose(shipped: httpx.Client, home: 
     if fault.is_usable:
         fault.check(response.json()["pose"])
     else:
-        fault.check_refusal(assert_problem(response, 422, "invalid-panorama")["detail"])
+        fault.check_refusal(assert_problem(response, 422, "invalid-photograph")["detail"])
 
 
 def two_files(fault: Fault) -> list[tuple[str, tuple[str, bytes]]]:
@@ -141,7 +141,7 @@ def test_warnings_about_photographs_of_a_session_are_those_of_its_pose(client: h
 def test_unusable_file_is_named_in_the_words_of_users(
     client: httpx.Client, flat: str, content: bytes, name: str
 ) -> None:
-    detail = assert_problem(ask(client, flat, content), 422, "invalid-panorama")["detail"]
+    detail = assert_problem(ask(client, flat, content), 422, "invalid-photograph")["detail"]
     assert any(word in detail for word in name.split("|")), detail
     assert not any(word in detail for word in LIBRARY_WORDS), detail
 
@@ -177,6 +177,6 @@ def test_sphere_in_another_layout_is_converted_or_named(client: httpx.Client, fl
     circle = (np.hypot(*np.meshgrid(place, place)) < width / 4)[..., None].astype(np.uint8)
     two = np.hstack([pixels[:, : width // 2] * circle, pixels[:, width // 2 :] * circle])
     detail = assert_problem(
-        ask(client, flat, jpeg(np.maximum(two, 60 * np.hstack([circle] * 2)))), 422, "invalid-panorama"
+        ask(client, flat, jpeg(np.maximum(two, 60 * np.hstack([circle] * 2)))), 422, "invalid-photograph"
     )
     assert "dual fisheye picture of a 360° camera" in detail["detail"]

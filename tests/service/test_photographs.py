@@ -140,7 +140,7 @@ def test_heic_is_read(client: httpx.Client, flat: str) -> None:
 def test_impossible_statements_are_refused(
     client: httpx.Client, flat: str, fields: dict[str, str], reason: str
 ) -> None:
-    problem = assert_problem(ask(client, flat, jpeg(shown(), PHONE), **fields), 422, "invalid-panorama")
+    problem = assert_problem(ask(client, flat, jpeg(shown(), PHONE), **fields), 422, "invalid-photograph")
     assert reason in problem["detail"]
     assert problem["detail"].endswith("see docs/how-to/take-photographs.md")
 
@@ -164,7 +164,7 @@ def test_malformed_statements_name_their_field(
 
 def test_white_picture_is_no_sphere(client: httpx.Client, flat: str) -> None:
     white = jpeg(np.full((256, 512, 3), 255, np.uint8))
-    assert "is not a full 360° sphere" in assert_problem(ask(client, flat, white), 422, "invalid-panorama")["detail"]
+    assert "is not a full 360° sphere" in assert_problem(ask(client, flat, white), 422, "invalid-photograph")["detail"]
 
 
 def test_venue_picture_and_feature_work(client: httpx.Client, flat: str) -> None:
@@ -250,7 +250,7 @@ class TestTurn:
 def test_model_for_spheres_refuses_other_photographs(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
-        problem = assert_problem(ask(client, plan_id, jpeg(shown(), PHONE)), 422, "invalid-panorama")
+        problem = assert_problem(ask(client, plan_id, jpeg(shown(), PHONE)), 422, "invalid-photograph")
     assert "reads full 360° spheres only; send an equirectangular picture" in problem["detail"]
 
 
@@ -280,7 +280,7 @@ def test_session_takes_photographs_of_any_projection(client: httpx.Client, flat:
     sphere_file = (EXAMPLES / "living_room.jpg").read_bytes()
     assert send(sphere_file, forward_m=0, turn_deg=0).json()["pose"]["view"]["projection"] == "equirectangular"
     assert send(jpeg(shown(), PHONE)).json()["photographs"] == 5
-    refused = assert_problem(send(jpeg(shown()), projection="fisheye"), 422, "invalid-panorama")
+    refused = assert_problem(send(jpeg(shown()), projection="fisheye"), 422, "invalid-photograph")
     assert "a fisheye photograph needs hfov_deg" in refused["detail"]
     refused = assert_problem(send(jpeg(shown(), PHONE), heading_tolerance_deg=5), 422, "invalid-request")
     assert refused["errors"] == [{"field": "heading_tolerance_deg", "message": "is '5': needs heading_deg"}]

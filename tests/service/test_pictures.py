@@ -73,7 +73,7 @@ def test_picture_shows_both_by_default(client: httpx.Client, flat: str, panorama
 
 
 def test_problems_are_json(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    assert_problem(request_picture(client, flat, b"no picture", PNG), 422, "invalid-panorama")
+    assert_problem(request_picture(client, flat, b"no picture", PNG), 422, "invalid-photograph")
     assert_problem(request_picture(client, "0" * 32, panorama, PNG), 404, "unknown-floorplan")
     problem = assert_problem(request_picture(client, flat, panorama, PNG, "?picture=mesh"), 422, "invalid-request")
     assert problem["errors"][0]["field"] == "picture"

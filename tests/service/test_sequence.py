@@ -69,7 +69,7 @@ def test_given_headings_are_followed(client: httpx.Client, plan_id: str, picture
         if pose["heading_source"] == "given":
             assert abs((pose["heading_deg"] - given + 180.0) % 360.0 - 180.0) < 25.0  # to the next sector
         else:
-            assert "which the panorama contradicts" in pose["warnings"][0]
+            assert "which the photograph contradicts" in pose["warnings"][0]
 
 
 def test_long_turn_is_localised(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
@@ -109,7 +109,7 @@ def test_invalid_sequence_is_rejected(
 
 
 def test_invalid_panorama_is_rejected(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    assert_problem(ask(client, plan_id, [panorama, b"no picture"]), 422, "invalid-panorama")
+    assert_problem(ask(client, plan_id, [panorama, b"no picture"]), 422, "invalid-photograph")
     assert_problem(ask(client, "f" * 32, [panorama] * 2), 404, "unknown-floorplan")
 
 

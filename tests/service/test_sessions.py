@@ -123,7 +123,7 @@ def test_impossible_motion_is_refused(
 
 def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
     session_id = begin(client, plan_id)
-    assert_problem(send(client, session_id, b"no picture"), 422, "invalid-panorama")
+    assert_problem(send(client, session_id, b"no picture"), 422, "invalid-photograph")
     assert send(client, session_id, panorama, number=1).status_code == 200
 
 

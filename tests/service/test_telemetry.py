@@ -117,12 +117,12 @@ def test_log_has_route_template_and_plan_id(client: httpx.Client, log: Log) -> N
 @pytest.mark.one_replica
 def test_refused_request_logs_its_reason(client: httpx.Client, log: Log) -> None:
     plan_id = upload(client)
-    refusals = 'lalaloc_rejections_total{reason="invalid-panorama"}'
+    refusals = 'lalaloc_rejections_total{reason="invalid-photograph"}'
     before = _metric(client, refusals)
     response = localise(client, plan_id, b"no picture")
-    assert_problem(response, 422, "invalid-panorama")
+    assert_problem(response, 422, "invalid-photograph")
     (line,) = log.of_request(response.headers["x-request-id"])
-    assert (line["status"], line["rejection"], line["plan"]) == (422, "invalid-panorama", plan_id)
+    assert (line["status"], line["rejection"], line["plan"]) == (422, "invalid-photograph", plan_id)
     assert set(line["stages_ms"]) == {"upload", "decode"}
     assert _metric(client, refusals) == before + 1.0
 

@@ -57,7 +57,7 @@ def test_level_distinguishes_equal_storeys(
     answer = answer_to(client, venue_id, panorama, level=level)
     if answer["floorplan_id"] == storeys[3]:
         # This small model cannot tell the flats apart.
-        assert answer["warnings"] == [f"level is {level}, which the panorama contradicts: the answer is on level 3"]
+        assert answer["warnings"] == [f"level is {level}, which the photograph contradicts: the answer is on level 3"]
     found = [candidate["level"] for candidate in answer["candidates"] if candidate["floorplan_id"] != storeys[3]]
     assert found[0] == level
 

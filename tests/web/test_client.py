@@ -40,7 +40,7 @@ def test_batch_is_answered_line_by_line(desktop: Visit) -> None:
         """,
     )
     assert [lines[0], lines[2]] == [[0, 250], [2, 250]]
-    assert lines[1] == [1, "invalid-panorama"]
+    assert lines[1] == [1, "invalid-photograph"]
 
 
 @pytest.mark.slow

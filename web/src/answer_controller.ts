@@ -12,7 +12,7 @@ import { layoutLines, roomAt } from "./layout";
 import type { LiveAnswer } from "./look/live_lines";
 import type { FoundPlace } from "./look/look_around";
 import { clearError, clearErrors, showError } from "./notices";
-import { PanoramaView } from "./panorama_view";
+import { PhotoView } from "./photo_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
 import type { PlanScene } from "./plan_scene";
@@ -31,7 +31,7 @@ export interface ControllerActions {
 export class AnswerController {
   readonly photos = new Photos((photo, isOther) => this.onPhoto(photo, isOther));
   readonly hints: HintForm;
-  private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.scene.marker.look(yaw, fov));
+  private readonly photoView = new PhotoView(byId("photo-view"), (yaw, fov) => this.scene.marker.look(yaw, fov));
   private readonly find = byId<HTMLButtonElement>("find");
   private readonly error = byId("photo-error");
   private layout: Layout | null = null;
@@ -55,7 +55,7 @@ export class AnswerController {
   }
 
   async start(): Promise<void> {
-    await this.panorama.setPicture(null);
+    await this.photoView.setPicture(null);
     await device.start().catch((error: unknown) => showError(this.error, error));
   }
 
@@ -109,10 +109,10 @@ export class AnswerController {
       // A link shows an answer without its photograph; a photograph added to it is assumed to be the one.
       if (photo !== null && photo.answer === null && this.answer !== null && this.answeredPhoto === null)
         photo.answer = this.answer;
-      void this.panorama
+      void this.photoView
         .setPicture(photo?.file ?? null)
         .then(() => {
-          this.panorama.setView(this.photos.current?.answer?.view ?? null);
+          this.photoView.setView(this.photos.current?.answer?.view ?? null);
           this.draw();
         })
         .catch((error: unknown) => {
@@ -139,15 +139,15 @@ export class AnswerController {
     this.answeredPhoto = photo;
     this.selected = 0;
     this.moved = null;
-    this.panorama.setView(photo === null ? null : (answer?.view ?? null));
+    this.photoView.setView(photo === null ? null : (answer?.view ?? null));
     showAnswer(answer, photo, {
       select: (index) => this.select(index),
       save: async (shown, answered) => {
         clearError(this.error, this.fields);
         // An answer that a link opened has no photograph until one is added.
         const name = answered?.file.name ?? "answer";
-        await savePicture(name, this.panorama.toCanvas(), this.scene.svg, captionWords(shown)).catch((error: unknown) =>
-          showError(this.error, error),
+        await savePicture(name, this.photoView.toCanvas(), this.scene.svg, captionWords(shown)).catch(
+          (error: unknown) => showError(this.error, error),
         );
       },
     });
@@ -166,7 +166,7 @@ export class AnswerController {
 
   private draw(): void {
     if (!this.scene.drawAnswer(this.answer, this.selected, this.answeredPhoto, this.photos.list)) {
-      this.panorama.setLines([], 0);
+      this.photoView.setLines([], 0);
       this.photos.compass.setFound(null);
       byId("fit-state").textContent =
         this.answer === null ? "" : "The selected place lies in another plan of the venue.";
@@ -205,7 +205,7 @@ export class AnswerController {
     if (this.layout === null) return;
     const room = roomAt(this.layout.rooms, pose.x_m, pose.y_m);
     const height = this.answer?.camera_height_m ?? this.scene.plan?.plan.camera_height_m ?? DEFAULT_CAMERA_HEIGHT_M;
-    this.panorama.setLines(room === null ? [] : layoutLines(pose.x_m, pose.y_m, room, height), pose.heading_deg);
+    this.photoView.setLines(room === null ? [] : layoutLines(pose.x_m, pose.y_m, room, height), pose.heading_deg);
     const place = `x ${pose.x_m.toFixed(2)} m, y ${pose.y_m.toFixed(2)} m, heading ${pose.heading_deg.toFixed(0)}°`;
     byId("fit-state").textContent =
       room === null

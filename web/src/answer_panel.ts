@@ -229,7 +229,7 @@ function facts(answer: Answer): HTMLElement {
     ...(earth ? [["On Earth", `${earth.lat.toFixed(6)}, ${earth.lon.toFixed(6)}`] as [string, string]] : []),
     [
       "Heading",
-      `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${HEADING_SOURCES[answer.heading_source]}`,
+      `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${HEADING_SOURCES[answer.heading_source] ?? HEADING_SOURCES.photograph}`,
     ],
     ...(answer.view == null ? [] : [["Seen", seenWords(answer.view)] as [string, string]]),
     ["Camera height", `${answer.camera_height_m.toFixed(2)} m (best fit)`],

@@ -122,7 +122,7 @@ const ROOM_WORDS: Record<string, string> = {
 const PROJECTIONS: Record<ViewAnswer["projection"], string> = {
   equirectangular: "a 360° photograph",
   perspective: "an ordinary photograph",
-  cylindrical: "a panorama strip",
+  cylindrical: "a strip of a phone’s panorama mode",
   fisheye: "a fisheye photograph",
 };
 
@@ -138,7 +138,7 @@ const VALUE_SOURCES: Record<ViewAnswer["pitch"]["source"], string> = {
 /** Origin of a heading. */
 export const HEADING_SOURCES: Record<Answer["heading_source"], string> = {
   given: "as given",
-  panorama: "from the photograph’s metadata",
+  photograph: "from the photograph’s metadata",
   searched: "estimated from the picture",
 };
 

@@ -58,7 +58,7 @@ export interface ColumnView {
   ceiling: number;
 }
 
-/** Return the wall or opening that each column of a panorama shows at camera height. */
+/** Return the wall or opening that each column of a sphere shows at camera height. */
 export function layoutView(pose: Pose, room: RoomLayout, columns: number, cameraHeight: number): ColumnView[] {
   const heading = radians(pose.heading_deg);
   return columnAzimuths(columns).map((azimuth) => {

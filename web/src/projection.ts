@@ -1,4 +1,4 @@
-/** Projection of directions in a panorama to the screen, for the viewer and the flat picture. */
+/** Projection of directions in a sphere to the screen, for the viewer and the flat picture. */
 
 import type { Point } from "./types";
 

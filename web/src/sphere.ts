@@ -5,7 +5,7 @@ import { type PanoData, Viewer } from "@photo-sphere-viewer/core";
 import { radians } from "./layout";
 import type { Gaze } from "./projection";
 
-/** Panorama viewer. */
+/** Viewer of full spheres. */
 export class Sphere {
   private readonly viewer: Viewer;
   private shown: string | null = null;

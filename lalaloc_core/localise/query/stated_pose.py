@@ -19,7 +19,7 @@ from lalaloc_core.conventions import TWO_PI, heading_from_degrees
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 
-HeadingSource = Literal["given", "panorama", "searched"]
+HeadingSource = Literal["given", "photograph", "searched"]
 # Largest error (degrees) of the compass heading in a photograph's metadata.
 COMPASS_TOLERANCE_DEG = 20.0
 # Range of unknown camera heights (m) over the floor, all equally likely.
@@ -118,7 +118,7 @@ def known_heading(
         return KnownHeading(heading_from_degrees(heading_deg), math.radians(tolerance_deg), "given")
     if north is not None and compass_heading is not None:
         heading = (compass_heading + north) % TWO_PI
-        return KnownHeading(heading, math.radians(compass_tolerance_deg), "panorama")
+        return KnownHeading(heading, math.radians(compass_tolerance_deg), "photograph")
     return KnownHeading(None, 0.0, "searched")
 
 

@@ -35,7 +35,7 @@ const DIAGONAL_MM = Math.hypot(36, 24),
   SHORT_MM = 0.6 * DIAGONAL_MM;
 const FILM_MM = [4, 250] as const,
   ZOOM = [1, 20] as const,
-  PANORAMA = 6,
+  STRIP = 6,
   CROPPED = 0.03;
 const CROP = [
   "CroppedAreaImageWidthPixels",
@@ -108,8 +108,8 @@ function projectionOf(
     return ["equirectangular", "gpano"];
   if (kind === "cylindrical") return ["cylindrical", "gpano"];
   if (isSphere && (hfovDeg ?? 360) === 360 && isSphere()) return ["equirectangular", "estimated"];
-  if (hfovDeg !== null) return [exif.panorama || hfovDeg > WIDEST_LENS_DEG ? "cylindrical" : "perspective", "assumed"];
-  if (exif.panorama) return ["cylindrical", "exif"];
+  if (hfovDeg !== null) return [exif.strip || hfovDeg > WIDEST_LENS_DEG ? "cylindrical" : "perspective", "assumed"];
+  if (exif.strip) return ["cylindrical", "exif"];
   if (exif.focal === null && isSphere) {
     throw new InputError(
       "The photograph is twice as wide as high, but it does not look like a full 360° photograph. Enter its “Kind” and “Field of view”.",
@@ -138,16 +138,16 @@ interface ExifLens {
   /** Focal length, pixels of the full picture. */
   focal: number | null;
   sd: number;
-  panorama: boolean;
+  strip: boolean;
   warnings: string[];
 }
 
 /** Read the 35 mm equivalent focal length. */
 function readLens({ exif }: Metadata, { width, height }: Size): ExifLens {
-  const none: ExifLens = { focal: null, sd: 0, panorama: exif.get(TAG.customRendered) === PANORAMA, warnings: [] };
+  const none: ExifLens = { focal: null, sd: 0, strip: exif.get(TAG.customRendered) === STRIP, warnings: [] };
   const film = exif.get(TAG.film) ?? 0,
     zoom = exif.get(TAG.zoom) ?? 0;
-  if (none.panorama || !(film >= FILM_MM[0] && film <= FILM_MM[1])) return none;
+  if (none.strip || !(film >= FILM_MM[0] && film <= FILM_MM[1])) return none;
   const long = Math.max(width, height),
     ratio = long / Math.min(width, height);
   const [across, down] = [exif.get(TAG.width) ?? 0, exif.get(TAG.height) ?? 0];

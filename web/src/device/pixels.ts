@@ -1,4 +1,4 @@
-/** Pictures as pixels: decoding, scaling and levelling, as in lalaloc_core/panorama. */
+/** Pictures as pixels: decoding, scaling and levelling, as in lalaloc_core/photograph. */
 
 import { type Ray, tiltOf } from "../camera";
 import { InputError } from "../input_error";

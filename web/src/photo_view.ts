@@ -1,4 +1,4 @@
-/** Photograph, full spheres in a panorama viewer, with the lines of the layout over it. */
+/** Photograph, full spheres in a viewer, with the lines of the layout over it. */
 
 import { throughCamera } from "./camera";
 import { button, h, show } from "./dom";
@@ -19,7 +19,7 @@ const END_OF_JPEG = new Uint8Array([0xff, 0xd9]);
 // Pixels of the longer side of a saved photograph.
 const SAVED_PIXELS = 2400;
 
-export class PanoramaView {
+export class PhotoView {
   private readonly canvas = h("canvas", { class: "overlay", "aria-hidden": "true" });
   private readonly stage = h("div", {
     class: "stage",
