@@ -146,17 +146,24 @@ def test_readme_begins_with_a_true_answer(monkeypatch: pytest.MonkeyPatch, capsy
     np.testing.assert_allclose(_numbers(table)[:2], _numbers(expected)[:2], atol=0.1)
 
 
-def test_session_of_the_readme_has_its_result(tmp_path: Path) -> None:
-    [session] = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)
+@pytest.mark.parametrize("number", [0, 1], ids=["in this process", "over HTTP"])
+def test_sessions_of_the_readme_have_their_results(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    session = re.findall(r"```pycon\n(.*?)```", README, re.DOTALL)[number]
     *statements, question = re.findall(r"^>>> (.*)$", session, re.MULTILINE)
     [expected] = re.findall(r"^\(.*$", session, re.MULTILINE)
-    with running_service(0, {"LALALOC_DATA_DIR": str(tmp_path)}) as service:
-        names: dict[str, Any] = vars(lalaloc_client).copy()
-        code = "\n".join(statements).replace("http://127.0.0.1:8000", service.url)
-        exec(code.replace("examples/", f"{ROOT}/examples/"), names)
-        names["service"].close()
+    names: dict[str, Any] = vars(lalaloc_client).copy()
+    code = "\n".join(statements)
+    if "Client" in code:
+        with running_service(0, {"LALALOC_DATA_DIR": str(tmp_path)}) as service:
+            exec(code.replace("http://127.0.0.1:8000", service.url), names)
+            names["service"].close()
+    else:
+        exec(code, names)
     room, position, confidence = eval(question, names)
-    expected_room, expected_position, expected_confidence = eval(expected, names)
+    expected_room, expected_position, expected_confidence = eval(expected, vars(lalaloc_client).copy())
     assert room == expected_room
     assert (position.x_m, position.y_m) == pytest.approx((expected_position.x_m, expected_position.y_m), abs=0.1)
     assert confidence == pytest.approx(expected_confidence, abs=0.05)

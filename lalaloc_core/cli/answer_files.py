@@ -7,6 +7,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,29 +101,46 @@ def unread(text: str) -> str:
     return f"'{text}" if text.startswith(_FORMULA) else text
 
 
-def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the places as a GeoJSON FeatureCollection (RFC 7946)."""
+@dataclass(frozen=True)
+class EarthPlace:
+    """Place on Earth, and azimuth from true north; degrees."""
+
+    latitude: float
+    longitude: float
+    azimuth_deg: float | None
+
+
+def place_on_earth(plan: FloorPlan, place_m: tuple[float, float], heading_deg: float | None) -> EarthPlace | None:
+    """Return a place of a plan, and the azimuth of a heading there; None without an anchor."""
     import numpy as np
 
-    assert plan.anchor is not None
+    if plan.anchor is None:
+        return None
+    ((longitude, latitude),) = plan.anchor.to_earth(np.array([place_m])).tolist()
+    azimuth_deg = None if heading_deg is None else plan.anchor.true_azimuth_deg(place_m, heading_deg)
+    return EarthPlace(latitude, longitude, azimuth_deg)
+
+
+def place_feature(place: EarthPlace, properties: dict[str, Any]) -> dict[str, Any]:
+    """Return a place as a GeoJSON Feature (RFC 7946)."""
+    azimuth_deg = None if place.azimuth_deg is None else round(place.azimuth_deg, 2)
+    return {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": [round(place.longitude, 8), round(place.latitude, 8)]},
+        "properties": properties | {"azimuth_deg": azimuth_deg},
+    }
+
+
+def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the places as a GeoJSON FeatureCollection (RFC 7946)."""
     features = []
     for answer in answers:
         if "error" in answer:
             continue
-        place = answer["position"]["x_m"], answer["position"]["y_m"]
-        ((longitude, latitude),) = plan.anchor.to_earth(np.array([place])).tolist()
-        confidence = answer["confidence"]
-        properties = {
-            "photograph": answer["photograph"],
-            "room": answer["room"],
-            "confidence": None if confidence is None else round(confidence, 4),
-        }
-        azimuth_deg = plan.anchor.true_azimuth_deg(place, answer["heading_deg"])
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": [round(longitude, 8), round(latitude, 8)]},
-                "properties": properties | {"azimuth_deg": round(azimuth_deg, 2)},
-            }
-        )
+        position, confidence = answer["position"], answer["confidence"]
+        place = place_on_earth(plan, (position["x_m"], position["y_m"]), answer["heading_deg"])
+        assert place is not None
+        share = None if confidence is None else round(confidence, 4)
+        properties = {"photograph": answer["photograph"], "room": answer["room"], "confidence": share}
+        features.append(place_feature(place, properties))
     return {"type": "FeatureCollection", "features": features}

@@ -1,20 +1,14 @@
-"""Options of commands about the camera of photographs, and what was assumed about it."""
+"""Options of commands about the camera of photographs."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from lalaloc_core.errors import ForeignFeaturesError, InvalidFeaturesError, InvalidPhotographError
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lalaloc_core.photograph import Assumed, Intrinsics, Photograph, StatedCamera
+    from lalaloc_core.photograph import Intrinsics, StatedCamera
 
 
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
@@ -78,38 +72,3 @@ def stated_camera(arguments: argparse.Namespace) -> StatedCamera:
     )
     stated.check()
     return stated
-
-
-def content_of(path: Path) -> bytes:
-    """Return the bytes of a photograph.
-
-    Raises:
-        InvalidPhotographError: the file cannot be read.
-    """
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InvalidPhotographError(f"'{path}' cannot be read: {error.strerror}") from error
-
-
-def view_document(view: Photograph) -> dict[str, Any]:
-    """Return what was assumed about a photograph, with the field names of the API."""
-
-    def angle(assumed: Assumed) -> dict[str, Any]:
-        return {"value_deg": math.degrees(assumed.value), "std_deg": math.degrees(assumed.sd), "source": assumed.source}
-
-    angles = {name: angle(getattr(view, name)) for name in ("hfov", "pitch", "roll")}
-    if view.wall_direction is not None:
-        angles["wall_direction"] = angle(view.wall_direction)
-    return {"projection": view.projection, "projection_source": view.projection_source, **angles}
-
-
-@contextmanager
-def named(path: Path) -> Iterator[None]:
-    """Name the photograph in errors about it."""
-    try:
-        yield
-    except (InvalidFeaturesError, ForeignFeaturesError) as error:
-        raise InvalidPhotographError(f"'{path}': {error}") from error
-    except InvalidPhotographError as error:
-        raise InvalidPhotographError(f"'{path}': {error}; see docs/how-to/take-photographs.md") from error

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera
+from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import add_options, positive
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture
 from lalaloc_core.cli.printing import print_json
@@ -64,6 +64,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _encode(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.api import named, photograph_content
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.localise.encode.features import FeatureEncoder
     from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
@@ -79,7 +80,7 @@ def _encode(arguments: argparse.Namespace) -> None:
         _encode_turn(arguments, bundle.manifest, encoder, stated)
         return
     for path in arguments.photographs:
-        content = content_of(path)
+        content = photograph_content(path)
         with named(path):
             view = open_photograph(
                 content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
@@ -92,20 +93,24 @@ def _encode_turn(
     arguments: argparse.Namespace, manifest: Manifest, encoder: FeatureEncoder, stated: StatedCamera
 ) -> None:
     """Write the features of a turn, and the angles between them, which features cannot tell."""
-    from lalaloc_core.cli.turning import read_turn
+    from lalaloc_core.api import read_turn
     from lalaloc_core.photograph.turned import stated_headings
 
-    turn = read_turn(arguments.turn, manifest, stated)
-    for warning in turn.warnings:
+    photographs, linked, film = read_turn(arguments.turn, manifest, stated)
+    if film is None:
+        angles = linked.warnings(min(photograph.hfov.value for photograph in photographs))
+    else:
+        angles = film.warnings
+    for warning in dict.fromkeys([*angles, *(text for photograph in photographs for text in photograph.warnings)]):
         print(f"warning: {arguments.turn}: {warning}", file=sys.stderr)
     out = arguments.out or arguments.turn.with_suffix(".features")
     try:
         out.mkdir(exist_ok=True)
     except OSError as error:
         raise InvalidInputError(f"'{out}' cannot be made: {error.strerror}") from error
-    for index, photograph in enumerate(turn.photographs):
+    for index, photograph in enumerate(photographs):
         _write(out / f"{index:02}.features", encoder.features(photograph))
-    headings_deg, std_deg = stated_headings(turn.linked.angles)
+    headings_deg, std_deg = stated_headings(linked.angles)
     fields = {"motion": "turn", "relative_heading_deg": headings_deg, "relative_heading_std_deg": std_deg}
     _write(out / "turn.json", json.dumps(fields, indent=1).encode())
 
@@ -119,6 +124,7 @@ def _write(out: Path, content: bytes) -> None:
 
 
 def _features(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.api import named, photograph_content
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.draw.seen_room import draw_seen_room, seen_room
     from lalaloc_core.localise.encode.features import read_features
@@ -127,7 +133,7 @@ def _features(arguments: argparse.Namespace) -> None:
 
     if arguments.out is not None:
         check_picture_name(arguments.out)
-    bundle, content = Bundle.open(arguments.bundle), content_of(arguments.file)
+    bundle, content = Bundle.open(arguments.bundle), photograph_content(arguments.file)
     with named(arguments.file):
         view = read_features(content, bundle)
     query = PhotographEncoder(bundle, threads=1).query(view, None, CameraHeight(arguments.camera_height))

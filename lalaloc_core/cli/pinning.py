@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
+import contextlib
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
-from lalaloc_core.cli.cameras import add_camera_options, content_of, stated_camera
+from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import add_options
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
-from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
+from lalaloc_core.errors import InvalidInputError
 
-if TYPE_CHECKING:
-    from lalaloc_core.cli.pin_files import PinnedFile
-    from lalaloc_core.floorplan import FloorPlan
-    from lalaloc_core.localise.album.entry import AlbumPhotograph
-    from lalaloc_core.localise.album.pins import Album
-    from lalaloc_core.photograph import StatedCamera
-
-# Files that can be photographs; others are counted and left out.
-_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp"})
 _HEAD = ("no", "photograph", "room", "x m", "y m", "heading °", "confidence", "state")
 
 
@@ -52,24 +42,24 @@ def add_commands(commands: Any) -> None:
 
 
 def _pin(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.cli.pin_files import moved_lines, pins_document, read_previous, write_pin_files
+    from lalaloc_core.api import LaLaLoc
+    from lalaloc_core.cli.pin_files import write_pin_files
+    from lalaloc_core.localise.answers.pinned import read_pins
 
     paths, notes = _photographs_in(arguments.folder, arguments.out, arguments.plan)
-    previous = None if arguments.previous is None else read_previous(arguments.previous)
+    previous = None if arguments.previous is None else read_pins(arguments.previous)
     stated = stated_camera(arguments)
     plans = [imported.plan() for imported in read_plans(arguments.plan, arguments)]
-    ids = _plan_ids(plans)
-    files, photographs, album = _solved(arguments, plans, ids, paths, stated)
-    notes += _notes_of(files, len(photographs))
-    notes += album.warnings
-    moved = [] if previous is None else moved_lines(previous, album.pins, files)
-    document = pins_document(plans, ids, album, files, notes, moved)
+    with _Progress() as progress:
+        pinned = LaLaLoc(arguments.bundle).pin(plans, paths, camera=stated, progress=progress)
+    pinned.notes[:0] = notes
+    moved = [] if previous is None else pinned.moved_since(previous)
     try:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        notes += write_pin_files(arguments.out, plans, ids, album, files, document, copies=not arguments.no_copies)
+        document = write_pin_files(arguments.out, pinned, paths, moved, copies=not arguments.no_copies)
     except OSError as error:
         raise InvalidInputError(f"'{arguments.out}' cannot be written: {error.strerror}") from error
-    for note in (*notes, *moved):
+    for note in (*document["notes"], *moved):
         print(f"note: {note}", file=sys.stderr)
     if arguments.json:
         print_json(document, JSON_DECIMALS)
@@ -79,116 +69,48 @@ def _pin(arguments: argparse.Namespace) -> None:
         print(f"{counts}; see {arguments.out / 'report.pdf'}")
 
 
-def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:
-    """Return the files of a folder that can be photographs, sorted by name, and notes on what is left out."""
-    from lalaloc_core.localise.album.solve import MAX_PHOTOGRAPHS
+class _Progress:
+    """Progress bars on a terminal, one for each stage."""
 
-    try:
-        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    except OSError as error:
-        raise InvalidInputError(f"'{folder}' cannot be read as a folder: {error.strerror}") from error
+    def __enter__(self) -> Self:
+        self._stage, self._bar = "", contextlib.ExitStack()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def __call__(self, stage: str, done: int, count: int) -> None:
+        """Show the number of photographs that a stage is done with."""
+        from tqdm import tqdm
+
+        if stage != self._stage:
+            self._bar.close()
+            self._stage = stage
+            self._shown = self._bar.enter_context(
+                tqdm(total=count, desc=stage, unit="photograph", disable=None, leave=False)
+            )
+        self._shown.update(done - self._shown.n)
+
+
+def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:
+    """Return the picture files of a folder, and notes on what is left out."""
+    from lalaloc_core.api import MAX_PHOTOGRAPHS, pictures_in
+
+    found = [path for path in pictures_in(folder) if path.resolve() != plan.resolve()]
     if out.resolve() == folder.resolve():
         raise InvalidInputError("--out is the folder of the photographs, which is never changed; choose another one")
-    files = [entry for entry in entries if entry.is_file() and not _is_same(entry, plan)]
-    found = [entry for entry in files if entry.suffix.lower() in _SUFFIXES]
-    folders = [entry for entry in entries if entry.is_dir() and not _is_same(entry, out)]
-    notes = []
-    if len(found) < len(files):
-        notes.append(f"'{folder}' has files that are no pictures, which are left out: {len(files) - len(found)}")
-    if folders:
-        notes.append(f"'{folder}' has folders, which are left out: {len(folders)}; pin them by themselves")
-    if not found:
-        raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(_SUFFIXES))})")
     if len(found) > MAX_PHOTOGRAPHS:
         raise InvalidInputError(
             f"'{folder}' has {len(found)} photographs; the limit is {MAX_PHOTOGRAPHS}: divide them into several folders"
         )
+    others = [path for path in folder.iterdir() if not path.name.startswith(".") and path not in found]
+    others = [path for path in others if path.resolve() not in (out.resolve(), plan.resolve())]
+    folders, notes = sum(path.is_dir() for path in others), []
+    if folders < len(others):
+        notes.append(f"'{folder}' has files that are no pictures, which are left out: {len(others) - folders}")
+    if folders:
+        notes.append(f"'{folder}' has folders, which are left out: {folders}; pin them by themselves")
     return found, notes
-
-
-def _is_same(entry: Path, other: Path) -> bool:
-    return entry.resolve() == other.resolve()
-
-
-def _plan_ids(plans: Sequence[FloorPlan]) -> list[str]:
-    """Return a name for each plan that stays in its next revision: that of the level, or "plan" for the only one."""
-    if len(plans) == 1:
-        return ["plan"]
-    names = [plan.name for plan in plans]
-    return [name if names.count(name) == 1 else f"{name} {number}" for number, name in enumerate(names, start=1)]
-
-
-def _solved(
-    arguments: argparse.Namespace,
-    plans: Sequence[FloorPlan],
-    ids: Sequence[str],
-    paths: Sequence[Path],
-    stated: StatedCamera,
-) -> tuple[list[PinnedFile], list[AlbumPhotograph], Album]:
-    """Read and pin the photographs."""
-    from tqdm import tqdm
-
-    from lalaloc_core.bundle import Bundle
-    from lalaloc_core.localise.album.ground import AlbumGround
-    from lalaloc_core.localise.album.solve import solve_album
-    from lalaloc_core.localise.local_model import LocalModel
-    from lalaloc_core.localise.venue.merged_plans import MergedPlans
-
-    model = LocalModel(Bundle.open(arguments.bundle))
-    files: list[PinnedFile] = []
-    photographs: dict[str, AlbumPhotograph] = {}
-    for file, photograph in _read(
-        model, tqdm(paths, desc="read", unit="photograph", disable=None, leave=False), stated
-    ):
-        files.append(file)
-        if photograph is not None:
-            photographs.setdefault(photograph.id, photograph)
-    if not photographs:
-        raise InvalidPhotographError(f"none of {len(files)} photographs can be read; the first: {files[0].reason}")
-    grids = [model.grid(plan, plan.camera_height_m) for plan in plans]
-    if len(plans) == 1:
-        ground = AlbumGround.of_plan(ids[0], plans[0], grids[0])
-    else:
-        ground = AlbumGround.of_venue(ids, MergedPlans.of(plans, grids, plans[0].camera_height_m))
-    with tqdm(total=len(photographs), desc="pin", unit="photograph", disable=None, leave=False) as bar:
-        album = solve_album(ground, model.encoder, list(photographs.values()), progress=lambda _: bar.update())
-    return files, list(photographs.values()), album
-
-
-def _read(model: Any, paths: Any, stated: StatedCamera) -> Iterator[tuple[PinnedFile, AlbumPhotograph | None]]:
-    """Yield every file and its photograph; None if it cannot be read or is a copy of an earlier one."""
-    from lalaloc_core.cli.pin_files import PinnedFile
-    from lalaloc_core.localise.album.entry import photograph_entry
-    from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
-    from lalaloc_core.photograph import open_photograph
-    from lalaloc_core.photograph.overlap import ALBUM_SIDE
-    from lalaloc_core.photograph.taken import read_taken
-
-    known: dict[str, str] = {}
-    sizes = {"sphere_size": sphere_size(model.bundle.manifest), "patch_size": patch_size(model.bundle.manifest)}
-    for number, path in enumerate(paths, start=1):
-        try:
-            content = content_of(path)
-            id = hashlib.sha256(content).hexdigest()
-            if id in known:
-                yield PinnedFile(number, path, id, taken=known[id]), None
-                continue
-            view = model.encoder.with_features(open_photograph(content, stated=stated, overview=ALBUM_SIDE, **sizes))
-            taken = read_taken(content)
-        except InvalidPhotographError as error:
-            yield PinnedFile(number, path, None, str(error)), None
-            continue
-        known[id] = "" if taken.at is None else taken.at.isoformat(sep=" ", timespec="seconds")
-        yield PinnedFile(number, path, id, taken=known[id]), photograph_entry(id, view, taken)
-
-
-def _notes_of(files: Sequence[PinnedFile], photographs: int) -> list[str]:
-    """Return notes on unreadable files and copies."""
-    notes = [f"'{file.path.name}' is set aside: {file.reason}" for file in files if file.id is None]
-    copies = sum(file.id is not None for file in files) - photographs
-    if copies:
-        notes.append(f"copies of other files, which have the same pin: {copies}")
-    return notes
 
 
 def _row(entry: dict[str, Any]) -> tuple[str, ...]:

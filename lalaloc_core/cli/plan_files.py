@@ -43,11 +43,12 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
 
 def read_plans(file: Path, arguments: argparse.Namespace, trace: Trace | None = None) -> tuple[ImportedPlan, ...]:
     """Read the plans in a file, one for each level; `trace` receives what is read from a drawing."""
+    from lalaloc_core.api import plan_content
     from lalaloc_core.importers import ImportOptions, building_name, import_plans
 
     values = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
     options = ImportOptions.from_text({name: value for name, value in values.items() if value is not None})
-    content = _content(file)
+    content = plan_content(file)
     with _progress_line(file.name) as on_step:
         return import_plans(content, options, building=building_name(file.name), trace=trace, on_step=on_step)
 
@@ -67,19 +68,6 @@ def _progress_line(name: str) -> Iterator[OnStep | None]:
         yield show
     finally:
         print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-
-def _content(file: Path) -> bytes:
-    """Return the bytes of a plan file; of the YAML file of a ROS map, an archive with its picture."""
-    if file.suffix.lower() in (".yaml", ".yml"):
-        from lalaloc_core.importers.common.bounded_files import pack
-        from lalaloc_core.importers.formats.ros import map_files
-
-        return pack(map_files(file))
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise InvalidFloorPlanError(f"'{file}' cannot be read: {error.strerror}") from error
 
 
 def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from lalaloc_core.floorplan import FloorPlan
+from typing import Any
 
 # Decimals of printed poses: micrometres, and mm² of covariances.
 JSON_DECIMALS = 6
@@ -25,15 +22,6 @@ def _rounded(value: Any, decimals: int) -> Any:
     if isinstance(value, dict):
         return {name: _rounded(item, decimals) for name, item in value.items()}
     return [_rounded(item, decimals) for item in value] if isinstance(value, list | tuple) else value
-
-
-def pose_document(
-    plan: FloorPlan, room_index: int, x_m: float, y_m: float, heading_deg: float | None
-) -> dict[str, Any]:
-    """Return a pose as JSON, with the field names of the API."""
-    room = plan.rooms[room_index]
-    position = {"x_m": x_m, "y_m": y_m}
-    return {"position": position, "heading_deg": heading_deg, "room": room.name, "room_id": room.id}
 
 
 def pose_cells(document: dict[str, Any]) -> tuple[str, ...]:

@@ -5,42 +5,23 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.cli.cameras import add_camera_options, content_of, named, stated_camera, view_document
+from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture, write_text
-from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, pose_document, print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
-    from lalaloc_core.localise.tracking.tracking_filter import Tracked
+    from lalaloc_core.localise.answers.documents import TrackedAnswer
     from lalaloc_core.localise.tracking.trajectories import Trajectory
     from lalaloc_core.photograph import StatedCamera
 
-_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic"})
 _HEAD = ("photograph", "mode", "room", "x m", "y m", "heading °", "probability")
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """The answer for one photograph, and what was assumed about it."""
-
-    path: Path
-    time_s: float
-    view: dict[str, Any]
-    tracked: Tracked
-
-
-@dataclass(frozen=True)
-class _Refused:
-    """A photograph that cannot be used, and why."""
-
-    path: Path
-    error: str
 
 
 def add_commands(commands: Any) -> None:
@@ -93,25 +74,30 @@ def _track(arguments: argparse.Namespace) -> None:
         trajectory = read_trajectory(_text(arguments.odometry), arguments.odometry_frame)
         for warning in trajectory.warnings:
             print(f"warning: {arguments.odometry}: {warning}", file=sys.stderr)
-    answers = _followed(arguments, plan, photographs, trajectory, stated)
-    found = [answer for answer in answers if isinstance(answer, _Found)]
+    answers = list(_followed(arguments, plan, photographs, trajectory, stated))
+    found = [(time_s, answer) for time_s, answer, _ in answers if answer is not None]
+    documents = [document for _, _, document in answers]
     if not found:
         raise InvalidPhotographError(f"none of {len(answers)} photographs can be used; see the errors above")
     if arguments.trajectory is not None:
-        poses = [(answer, answer.tracked.pose) for answer in found]
         lines = [
-            tum_line(answer.time_s, pose.position_m, _height_m(answer.tracked), pose.heading) for answer, pose in poses
+            tum_line(
+                time_s,
+                (answer.position.x_m, answer.position.y_m),
+                answer.camera_height_m,
+                math.radians(answer.heading_deg),
+            )
+            for time_s, answer in found
         ]
         write_text(arguments.trajectory, "\n".join(lines) + "\n")
     if arguments.out is not None:
-        write_picture(_picture(plan, [answer.tracked for answer in found]), arguments.out)
-    documents = [_document(answer, plan) for answer in answers]
+        write_picture(_picture(plan, [answer for _, answer in found]), arguments.out)
     if arguments.json:
         print_json(documents, JSON_DECIMALS)
     else:
         rows = [
-            (answer.path.name, pose["mode"], *pose_cells(pose), f"{100.0 * pose['probability']:.1f} %")
-            for answer, pose in zip(answers, documents, strict=True)
+            (Path(pose["photograph"]).name, pose["mode"], *pose_cells(pose), f"{100.0 * pose['probability']:.1f} %")
+            for pose in documents
             if "error" not in pose
         ]
         print_table(_HEAD, rows)
@@ -122,14 +108,10 @@ def _track(arguments: argparse.Namespace) -> None:
 
 def _photographs(folder: Path) -> list[tuple[float, Path]]:
     """Return times (s) and files of photographs, by rising time."""
-    try:
-        files = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
-    except OSError as error:
-        raise InvalidInputError(f"'{folder}' cannot be read: {error.strerror}") from error
-    if not files:
-        raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(_SUFFIXES))})")
+    from lalaloc_core.api import pictures_in
+
     found = []
-    for path in files:
+    for path in pictures_in(folder):
         try:
             found.append((float(path.stem), path))
         except ValueError as error:
@@ -145,84 +127,40 @@ def _followed(
     photographs: list[tuple[float, Path]],
     trajectory: Trajectory | None,
     stated: StatedCamera,
-) -> list[_Found | _Refused]:
-    """Return the answer of each photograph, with a progress bar on a terminal.
+) -> Iterator[tuple[float, TrackedAnswer | None, dict[str, Any]]]:
+    """Yield time, answer and document of each photograph, with a progress bar on a terminal.
 
-    Odometry leads from the last photograph that can be used to the next one.
+    Odometry leads from the last photograph that can be used to the next one; one that cannot has no answer.
     """
     from tqdm import tqdm
 
-    from lalaloc_core.bundle import Bundle
-    from lalaloc_core.localise.local_model import LocalModel
-    from lalaloc_core.localise.query import known_heading, stated_height
-    from lalaloc_core.localise.search.pipeline import run_steps
-    from lalaloc_core.localise.tracking import TrackState
-    from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
-    from lalaloc_core.localise.tracking.tracking_filter import track_steps
-    from lalaloc_core.localise.tracking.trajectories import OdometryErrors
+    from lalaloc_core.api import LaLaLoc
 
-    model = LocalModel(Bundle.open(arguments.bundle))
-    height = stated_height(plan, arguments.camera_height)
-    ground, errors, mount = (
-        TrackedPlans.of_plan(plan, model.grid(plan, height.height_m)),
-        OdometryErrors(),
-        arguments.mount,
-    )
-    state, before_s = None, None
-    found: list[_Found | _Refused] = []
+    track, before_s = LaLaLoc(arguments.bundle).track(plan, camera_height_m=arguments.camera_height), None
     for time_s, path in tqdm(photographs, desc="track", unit="photograph", disable=None, leave=False):
-        try:
-            content = content_of(path)
-            with named(path):
-                view = model.open(content, stated)
-                query = model.encoder.query(view, None, height)
-        except InvalidPhotographError as error:
-            print(f"error: {error}", file=sys.stderr)
-            found.append(_Refused(path, str(error)))
-            continue
-        state = state or TrackState.first(len(query.roll))
         motion = None
         if trajectory is not None and before_s is not None:
-            motion = trajectory.motion(before_s, time_s, errors, math.radians(mount))
-        known = known_heading(plan.north, None, 0.0, view.compass_heading)
-        steps = track_steps(ground, model.encoder, state, query, motion, known_heading=known)
-        answer = run_steps(steps, model.refiner)
-        contradictions = [f"the photographs contradict {name} of the odometry" for name in answer.contradicted]
-        for warning in (*view.warnings, *contradictions):
+            motion = trajectory.motion(before_s, time_s, math.radians(arguments.mount))
+        try:
+            answer = track.add(path, motion, camera=stated)
+        except InvalidPhotographError as error:
+            print(f"error: {error}", file=sys.stderr)
+            yield time_s, None, {"photograph": str(path), "error": str(error)}
+            continue
+        for warning in answer.warnings:
             print(f"warning: {path}: {warning}", file=sys.stderr)
-        found.append(_Found(path, time_s, view_document(view), answer))
-        state, before_s = answer.state, time_s
-    return found
+        before_s = time_s
+        yield time_s, answer, {"photograph": str(path), **answer.document()}
 
 
-def _height_m(answer: Tracked) -> float:
-    return answer.query.camera_height.height_m * math.exp(answer.candidates[0].height_offset)
-
-
-def _picture(plan: FloorPlan, found: list[Tracked]) -> str:
+def _picture(plan: FloorPlan, found: list[TrackedAnswer]) -> str:
     import numpy as np
 
     from lalaloc_core.draw.plan_overlays import DrawnPath, draw_path
 
-    position_m = np.stack([answer.pose.position_m for answer in found])
-    is_sure = [answer.pose.mode == "tracking" for answer in found]
-    return draw_path(plan, DrawnPath(position_m, is_sure, math.degrees(found[-1].pose.heading)))
-
-
-def _document(answer: _Found | _Refused, plan: FloorPlan) -> dict[str, Any]:
-    """Return an answer as JSON, with the field names of the API."""
-    if isinstance(answer, _Refused):
-        return {"photograph": str(answer.path), "error": answer.error}
-    pose = answer.tracked.pose
-    return {
-        "photograph": str(answer.path),
-        "number": pose.number,
-        "mode": pose.mode,
-        **pose_document(plan, pose.room_index, pose.x_m, pose.y_m, math.degrees(pose.heading) % 360.0),
-        "probability": pose.probability,
-        "motion_contradicted": list(answer.tracked.contradicted),
-        "view": answer.view,
-    }
+    position_m = np.array([[answer.position.x_m, answer.position.y_m] for answer in found])
+    is_sure = [answer.mode == "tracking" for answer in found]
+    return draw_path(plan, DrawnPath(position_m, is_sure, found[-1].heading_deg))
 
 
 def _text(path: Path) -> str:

@@ -10,18 +10,15 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from lalaloc_core.bundle import ConfidenceModel
-from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
+from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
 from lalaloc_core.draw.outline import Outline, layout_outline
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import RIGHT_WITHIN_M, photograph_heading, pose_uncertainty, probability_map
-from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import Candidate, Query
-from lalaloc_core.localise.search.pipeline import Localisation
+from lalaloc_core.localise.answers.documents import Answer
+from lalaloc_core.localise.belief import RIGHT_WITHIN_M, probability_map
 from lalaloc_core.photograph import Photograph
 
 Picture = Literal["both", "plan", "photograph"]
@@ -36,6 +33,8 @@ _MIN_PLAN, _MAX_PLAN = 560.0, 1150.0
 _MIN_PROBABILITY = 0.001
 # Longer titles and names are shortened.
 _MAX_CHARACTERS = 52
+# Origin of the heading in words.
+_SOURCES = {"given": "given", "photograph": "from the compass", "searched": "estimated"}
 
 
 @dataclass(frozen=True)
@@ -80,51 +79,28 @@ class DrawnAnswer:
         return outline if self.photograph is None else outline.seen_in(self.photograph)
 
 
-def drawn_answer(
-    plan: FloorPlan,
-    grid: PoseGrid,
-    found: Localisation,
-    model: ConfidenceModel | None,
-    heading_source: str,
-    *,
-    photograph: Photograph | None = None,
-) -> DrawnAnswer:
-    """Collect the contents of the picture of a localisation.
-
-    `heading_source` states the origin of the heading in one or two words. Without a model, probabilities are left out.
-    `photograph` is the decoded one; None stands for a full sphere.
-    """
-    confidence = found.confidence(model)
-    best, *rival_candidates = found.candidates
-    uncertainty = None
-    if model is not None and best.information is not None:
-        uncertainty = pose_uncertainty(best.information, plan.rooms[best.room_index], model)
-    covariance = None
-    if uncertainty is not None:
-        (xx, xy), (_, yy) = uncertainty.position_m2.tolist()
+def drawn_answer(answer: Answer) -> DrawnAnswer:
+    """Collect the contents of the picture of an answer in one plan."""
+    evidence, covariance = answer.evidence, None
+    plan, grid = evidence.ground.plan, evidence.ground.grid
+    if answer.covariance_m2 is not None:
+        (xx, xy), (_, yy) = answer.covariance_m2
         covariance = (xx, xy, yy)
-    rivals = [
-        DrawnCandidate(
-            candidate.x_m,
-            candidate.y_m,
-            _heading_deg(found.query, candidate),
-            plan.rooms[candidate.room_index].name,
-            None if confidence is None else confidence.candidates[index],
-        )
-        for index, candidate in enumerate(rival_candidates, start=1)
-    ]
+    rivals = tuple(
+        DrawnCandidate(pose.position.x_m, pose.position.y_m, pose.heading_deg, pose.room, pose.probability)
+        for pose in answer.candidates[1:]
+    )
+    x_m, y_m = answer.position.x_m, answer.position.y_m
     return DrawnAnswer(
         plan=plan,
-        camera=Marker(
-            x_m=best.x_m, y_m=best.y_m, heading_deg=_heading_deg(found.query, best), covariance_m2=covariance
-        ),
-        room_index=best.room_index,
-        camera_height_m=found.camera_height_m,
-        heading_source="estimated" if found.heading_contradicted else heading_source,
-        confidence=None if confidence is None else confidence.position,
-        rivals=tuple(rivals),
-        heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
-        photograph=None if photograph is None or photograph.is_sphere else photograph,
+        camera=Marker(x_m=x_m, y_m=y_m, heading_deg=answer.heading_deg, covariance_m2=covariance),
+        room_index=evidence.found.candidates[0].room_index,
+        camera_height_m=answer.camera_height_m,
+        heading_source=_SOURCES[answer.heading_source],
+        confidence=answer.confidence,
+        rivals=rivals,
+        heat=posterior_map(plan, probability_map(plan, grid.poses, evidence.found.posterior), grid.step_m),
+        photograph=None if evidence.photograph.is_sphere else evidence.photograph,
     )
 
 
@@ -273,7 +249,3 @@ def _distance_m(first: DrawnCandidate, second: DrawnCandidate | Marker) -> float
 
 def _length(metres: float) -> str:
     return f"{100 * metres:.0f} cm" if metres < 0.995 else f"{metres:.1f} m"
-
-
-def _heading_deg(query: Query, candidate: Candidate) -> float:
-    return heading_to_degrees(photograph_heading(query, candidate))

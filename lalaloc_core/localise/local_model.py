@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.answers.documents import Ground
+from lalaloc_core.localise.answers.turns import Turn
+from lalaloc_core.localise.encode.features import is_features, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Query
-from lalaloc_core.localise.refine import RefinementJob, RefinementResult, refine_walls, refined_by_walls
-from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refiner, localise
+from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
+from lalaloc_core.localise.refine import RefinementJob, refine_walls, refined_by_walls
+from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise, run_steps
+from lalaloc_core.localise.sequence import SequenceJob
 from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
-from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
+from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
+from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import open_turn
@@ -29,36 +36,40 @@ class LocalModel:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.encoder = PhotographEncoder(bundle, threads=1)
-        self.refiner: Refiner = _LocalRefiner(bundle).refine
+        self.refiner = _LocalRefiner(bundle).refine
+        manifest = bundle.manifest
+        self._sizes: dict[str, Any] = {"sphere_size": sphere_size(manifest), "patch_size": patch_size(manifest)}
 
     def grid(self, plan: FloorPlan, camera_height_m: float, step_m: float = GRID_STEP_M) -> PoseGrid:
         """Compute the pose grid of a plan, with latents if the model compares only these."""
         latents = not self.encoder.predicts_profile
         return build_grid(plan, self.encoder, step_m=step_m, camera_height_m=camera_height_m, latents=latents)
 
-    def open(self, content: bytes, stated: StatedCamera | None = None) -> Photograph:
-        """Read a photograph in the sizes that the model needs.
+    def open(self, content: bytes, stated: StatedCamera | None = None, *, overview: int = 0) -> Photograph:
+        """Read a photograph in the sizes that the model needs; `overview` is as for `open_photograph`.
 
         Raises:
             InvalidPhotographError: the photograph cannot be read.
         """
-        manifest = self.bundle.manifest
-        return open_photograph(
-            content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest)
-        )
+        return open_photograph(content, stated=stated, overview=overview, **self._sizes)
 
-    def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
-        """Search a plan."""
-        return localise(plan, grid, self.encoder, query, refiner=self.refiner)
+    def open_any(self, content: bytes, stated: StatedCamera) -> Photograph:
+        """Read a photograph, or the one whose features a file has."""
+        if not is_features(content):
+            return self.open(content, stated)
+        if stated != StatedCamera():
+            raise InvalidPhotographError("the camera is stated to `lalaloc encode`; leave its options out")
+        return read_features(content, self.bundle)
 
     def open_turn(
         self, contents: Sequence[bytes], stated: StatedCamera | None = None
     ) -> tuple[list[Photograph], list[TurnAngles]]:
         """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells."""
-        manifest = self.bundle.manifest
-        return open_turn(
-            contents, stated or StatedCamera(), sphere_size=sphere_size(manifest), patch_size=patch_size(manifest)
-        )
+        return open_turn(contents, stated or StatedCamera(), **self._sizes)
+
+    def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
+        """Search a plan."""
+        return localise(plan, grid, self.encoder, query, refiner=self.refiner)
 
     def localise_turn(
         self,
@@ -69,19 +80,12 @@ class LocalModel:
         height: CameraHeight,
     ) -> SequenceLocalisation:
         """Search the place of photographs of one spot, and the angles that are not known."""
+        known = [UNKNOWN_HEADING] * len(photographs)
+        return self.search_turn(Turn.of_overlap(photographs, known, height, linked), Ground(plan, grid))
 
-        def as_one(turns: Sequence[float]) -> Localisation:
-            others = list(zip(photographs[1:], turns[1:], strict=True))
-            query = self.encoder.query(photographs[0], None, height, others=others)
-            config = LocaliseConfig(vdr_candidates=0)
-            return localise(plan, grid, self.encoder, query, refiner=self.refiner, config=config)
-
-        if linked.turns is not None:
-            return localised_turn(as_one(linked.turns), linked.turns)
-        queries = [self.encoder.query(photographs[index], None, height) for index in linked.order]
-        found = localise_sequence(plan, grid, self.encoder, queries, linked.motions, refiner=refine_sequence)
-        found = linked.in_order(found)
-        return judged_turn(found, as_one(found_turns(found)))
+    def search_turn(self, turn: Turn, ground: Ground) -> SequenceLocalisation:
+        """Search the place of a turn."""
+        return run_steps(turn.steps(ground, self.encoder, turn.queries(self.encoder)), self.refiner)
 
 
 class _LocalRefiner:
@@ -91,8 +95,10 @@ class _LocalRefiner:
         self._bundle = bundle
         self._by_latents: Refiner | None = None
 
-    def refine(self, job: RefinementJob) -> RefinementResult | None:
+    def refine(self, job: RefinementJob | SequenceJob) -> Any:
         """Refine the poses of a job within their rooms."""
+        if isinstance(job, SequenceJob):
+            return refine_sequence(job)
         if refined_by_walls(job):
             return refine_walls(job)
         if self._by_latents is None:

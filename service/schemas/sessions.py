@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lalaloc_core.localise.tracking import Odometry
-from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN
+from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN, usual_stds
 from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
 from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
@@ -27,8 +27,6 @@ _ROOMS = 100
 PLAN_OF_POSE = "Floor plan of the pose, in whose frame it is; null for photographs of earlier versions."
 LEVEL_OF_POSE = "Level of this plan in the venue; null for a session in one plan."
 MAX_PATH = 200
-# Errors of odometry whose deviations are not stated: shares of the distance and degrees per metre, and what is added.
-_DRIFT, _LEAST_M, _TURN_PER_M_DEG, _LEAST_DEG = 0.05, 0.02, 2.0, 1.0
 
 
 class SessionDocument(PlaceFields, CameraFields):
@@ -130,14 +128,13 @@ class PhotographForm(PhotographFields):
         if self.covariance is not None:
             scale = np.array([1.0, 1.0, math.radians(1.0)])
             return Odometry(self.forward_m, right_m, turn, np.array(self.covariance) * np.outer(scale, scale))
-        length_m = math.hypot(self.forward_m, right_m)
-        std_m, std_deg = _DRIFT * length_m + _LEAST_M, _TURN_PER_M_DEG * length_m + _LEAST_DEG
-        stds = (
-            std_m if self.forward_std_m is None else self.forward_std_m,
-            std_m if self.right_std_m is None else self.right_std_m,
-            math.radians(std_deg if self.turn_std_deg is None else self.turn_std_deg),
+        usual = usual_stds(math.hypot(self.forward_m, right_m))
+        turn_std = None if self.turn_std_deg is None else math.radians(self.turn_std_deg)
+        forward_std, right_std, turn_std = (
+            default if given is None else given
+            for given, default in zip((self.forward_std_m, self.right_std_m, turn_std), usual, strict=True)
         )
-        return Odometry.of_stds(self.forward_m, right_m, turn, stds)
+        return Odometry.of_stds(self.forward_m, right_m, turn, (forward_std, right_std, turn_std))
 
 
 class RivalAnswer(ResponseModel):

@@ -178,7 +178,7 @@ def test_many_photographs_give_a_table_places_on_earth_and_a_map(
         ([PLAN, PLAN], "flat.json': the photograph is"),
         ([PLAN, KITCHEN, "--out", "answer.gif"], "'answer.gif'; it must end in .png or .svg"),
         ([PLAN, KITCHEN, "--out", "/gone/answer.svg", "--picture", "plan"], "cannot be written"),
-        ([PLAN, KITCHEN, "--camera-height", "3"], "--camera-height is 3 m; it must be at least 0.1 m and below"),
+        ([PLAN, KITCHEN, "--camera-height", "3"], "camera_height_m is 3; it must be at least 0.1 and below"),
         ([PLAN, KITCHEN, "--heading-tolerance", "3"], "--heading, which is missing"),
     ],
 )

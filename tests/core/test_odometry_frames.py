@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.errors import InvalidMotionError
-from lalaloc_core.localise.tracking.trajectories import Frame, OdometryErrors, read_trajectory
+from lalaloc_core.localise.tracking.trajectories import Frame, read_trajectory
 
 # Azimuths (radians, clockwise) and places (m, to the right and forward of the first pose) of a walk.
 TURNS = np.radians([0.0, -40.0, -90.0, -100.0, 30.0])
@@ -55,7 +55,7 @@ def test_frames_are_recognised(body: np.ndarray, world: np.ndarray, frame: str, 
         path = read_trajectory(text, stated)  # pyright: ignore[reportArgumentType]
         assert bool(path.warnings) == (is_named and stated == "auto")
         for step in range(1, len(TURNS)):
-            motion = path.motion(step - 1.0, float(step), OdometryErrors())
+            motion = path.motion(step - 1.0, float(step))
             right, ahead = PLACES[step] - PLACES[step - 1]
             before = TURNS[step - 1]
             forward_m = ahead * math.cos(before) + right * math.sin(before)
@@ -69,7 +69,7 @@ def test_straight_ways_tell_the_frame_by_their_heights() -> None:
     for body, is_optical in ((REP103, False), (OPTICAL, True)):
         path = read_trajectory(tum(body, body, turns, places))
         assert bool(path.warnings) == is_optical
-        assert path.motion(0.0, 2.0, OdometryErrors()).forward_m == pytest.approx(5.0, abs=1e-6)
+        assert path.motion(0.0, 2.0).forward_m == pytest.approx(5.0, abs=1e-6)
 
 
 def test_poses_that_are_upright_in_no_frame_are_refused() -> None:

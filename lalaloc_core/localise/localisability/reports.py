@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from lalaloc_core.bundle import Manifest
@@ -11,7 +12,7 @@ from lalaloc_core.conditions import CONDITIONS, HARDEST, Condition, HeadingState
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Confidence
-from lalaloc_core.localise.localisability.next_step import Known, NextStep, next_step
+from lalaloc_core.localise.localisability.next_step import Known, NextStep, StepKind, next_step
 from lalaloc_core.localise.localisability.predicted_localisability import STEP_M, Localisability
 from lalaloc_core.localise.search.pipeline import Localisation
 
@@ -121,6 +122,30 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
+@dataclass(frozen=True, kw_only=True)
+class AdvisedStep:
+    """Step after an answer that is not sure, and what it is expected to tell.
+
+    Attributes:
+        kind: "turn": take another photograph from the same spot; "door": take one from behind a door; "heading": state
+            the heading; "rooms": choose one of `rooms` as a hint.
+        text: the step in words.
+        turn_deg: direction of "turn" and "door" relative to the photograph's centre, clockwise.
+        distance_m: distance to the door.
+        rooms: ids of the probable rooms, the most probable first.
+        expected_bits: expected increase of the information.
+        expected_confidence: expected confidence after the step.
+    """
+
+    kind: StepKind
+    text: str
+    turn_deg: float | None
+    distance_m: float | None
+    rooms: list[str] | None
+    expected_bits: float
+    expected_confidence: float
+
+
 def step_after(
     plan: FloorPlan,
     manifest: Manifest,
@@ -131,8 +156,8 @@ def step_after(
     field: float,
     step_m: float,
     rooms_known: bool = False,
-) -> dict[str, Any] | None:
-    """Return the next step after an answer, with the field names of the API; None without a confidence, or a step.
+) -> AdvisedStep | None:
+    """Return the next step after an answer; None without a confidence, or a step.
 
     Args:
         plan: the plan that was searched.
@@ -148,7 +173,17 @@ def step_after(
         return None
     known = known_of(found, confidence, arcs=arcs, field=field, rooms_known=rooms_known)
     step = next_step(plan, manifest, known, step_m=step_m)
-    return None if step is None else _document(plan, step)
+    if step is None:
+        return None
+    return AdvisedStep(
+        kind=step.kind,
+        text=words_of(plan, step),
+        turn_deg=math.degrees(step.turn) if step.kind in ("turn", "door") else None,
+        distance_m=step.distance_m if step.kind == "door" else None,
+        rooms=[plan.rooms[index].id for index in step.rooms] if step.kind == "rooms" else None,
+        expected_bits=step.bits,
+        expected_confidence=step.confidence,
+    )
 
 
 def known_of(
@@ -172,18 +207,6 @@ def known_of(
         heading=found.query.heading_known or found.query.searched is not None,
         rooms=rooms_known,
     )
-
-
-def _document(plan: FloorPlan, step: NextStep) -> dict[str, Any]:
-    return {
-        "kind": step.kind,
-        "text": words_of(plan, step),
-        "turn_deg": math.degrees(step.turn) if step.kind in ("turn", "door") else None,
-        "distance_m": step.distance_m if step.kind == "door" else None,
-        "rooms": [plan.rooms[index].id for index in step.rooms] if step.kind == "rooms" else None,
-        "expected_bits": step.bits,
-        "expected_confidence": step.confidence,
-    }
 
 
 def words_of(plan: FloorPlan, step: NextStep) -> str:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.conventions import TWO_PI, heading_from_degrees
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI, heading_from_degrees
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 
@@ -102,6 +102,9 @@ class KnownHeading:
     source: HeadingSource
 
 
+UNKNOWN_HEADING = KnownHeading(None, 0.0, "searched")
+
+
 def known_heading(
     north: float | None,
     heading_deg: float | None,
@@ -119,7 +122,21 @@ def known_heading(
     if north is not None and compass_heading is not None:
         heading = (compass_heading + north) % TWO_PI
         return KnownHeading(heading, math.radians(compass_tolerance_deg), "photograph")
-    return KnownHeading(None, 0.0, "searched")
+    return UNKNOWN_HEADING
+
+
+def check_height_m(plan: FloorPlan, height_m: float) -> None:
+    """Check that a camera can have a height (m) in a plan.
+
+    Raises:
+        InvalidPoseError: the height is not below the lowest ceiling, or too low for any camera.
+    """
+    lowest_m = float(plan.ceiling_heights_m.min())
+    if height_m != plan.camera_height_m and not MIN_CAMERA_HEIGHT_M <= height_m < lowest_m:
+        raise InvalidPoseError(
+            f"camera_height_m is {height_m:g}; it must be at least {MIN_CAMERA_HEIGHT_M:g} and below the plan's lowest "
+            f"ceiling ({lowest_m:g} m)"
+        )
 
 
 def stated_height(plan: FloorPlan, height_m: float | None, std_m: float | None = None) -> CameraHeight:

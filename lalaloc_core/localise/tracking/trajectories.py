@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
-from lalaloc_core.localise.tracking.walk_motion import Odometry
+from lalaloc_core.localise.tracking.walk_motion import Odometry, usual_stds
 
 _CSV = ("time_s", "x_m", "y_m", "yaw_deg")
 _TUM_VALUES = 8
@@ -28,16 +28,6 @@ Frame = Literal["auto", "optical", "rep103"]
 _UPRIGHT, _CLEARER = math.cos(math.radians(35.0)), 0.1
 # Share of the way on the floor that heights vary by, at most, and the shortest way (m) that tells.
 _LEVEL, _SHORTEST_M = 0.2, 0.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class OdometryErrors:
-    """Standard deviations of odometry: shares of the distance and radians per metre, and what is added."""
-
-    drift: float = 0.05
-    least_m: float = 0.02
-    turn_per_m: float = math.radians(2.0)
-    least_turn: float = math.radians(1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +49,7 @@ class Trajectory:
         position = np.array([np.interp(time_s, self.time_s, self.position_m[:, axis]) for axis in (0, 1)])
         return position, float(np.interp(time_s, self.time_s, np.unwrap(self.yaw)))
 
-    def motion(self, first_s: float, second_s: float, errors: OdometryErrors, mount: float = 0.0) -> Odometry:
+    def motion(self, first_s: float, second_s: float, mount: float = 0.0) -> Odometry:
         """Return the motion between two times, in the frame of the camera.
 
         `mount` is the azimuth (radians, clockwise) of the camera's heading relative to the frame's x.
@@ -69,10 +59,9 @@ class Trajectory:
         # Clockwise from the camera's heading, as azimuths.
         ahead = -math.atan2(y, x) + yaw - mount
         length_m = math.hypot(x, y)
-        std_m = errors.drift * length_m + errors.least_m
-        stds = std_m, std_m, errors.turn_per_m * length_m + errors.least_turn
         turn = -float(wrap_angle(later - yaw))
-        return Odometry.of_stds(length_m * math.cos(ahead), length_m * math.sin(ahead), turn, stds)
+        forward_m, right_m = length_m * math.cos(ahead), length_m * math.sin(ahead)
+        return Odometry.of_stds(forward_m, right_m, turn, usual_stds(length_m))
 
 
 def read_trajectory(text: str, frame: Frame = "auto") -> Trajectory:
@@ -140,7 +129,7 @@ def _rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 
     return np.array(rows).transpose(2, 0, 1)
 
 
-def tum_line(time_s: float, position_m: Float[np.ndarray, "2"], z_m: float, heading: float) -> str:
+def tum_line(time_s: float, position_m: tuple[float, float], z_m: float, heading: float) -> str:
     """Return a pose of the plan frame as a line of a TUM file; `heading` is an azimuth (radians)."""
     yaw = 0.5 * math.pi - heading
     x, y = position_m

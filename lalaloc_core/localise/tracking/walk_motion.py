@@ -26,6 +26,8 @@ MAX_TURN = 2.0 * TWO_PI
 _MAX_STD_M, _MAX_TURN_STD = 50.0, TWO_PI
 # Smallest deviations: measurements are never exact.
 _MIN_STD_M, _MIN_TURN_STD = 0.01, math.radians(0.5)
+# Errors of odometry whose deviations are not stated: shares of the distance and radians per metre, and what is added.
+_DRIFT, _LEAST_M, _TURN_PER_M, _LEAST_TURN = 0.05, 0.02, math.radians(2.0), math.radians(1.0)
 # Rounding of correlations in requests.
 _ROUNDING = 1e-6
 # Longest link, in steps of the grid, and how much farther (m) than a wall two linked poses may be apart: walls are
@@ -45,6 +47,12 @@ STROLL_M, _STROLL_TURN = 2.0, math.radians(60.0)
 _SLIP = 0.02
 # Pairs of a state and a reachable pose that are weighed at once, and in all.
 _PAIRS, _MAX_PAIRS = 1 << 20, 1 << 24
+
+
+def usual_stds(length_m: float) -> tuple[float, float, float]:
+    """Return the standard deviations (m, m, radians) of odometry over a distance, where none are stated."""
+    std_m = _DRIFT * length_m + _LEAST_M
+    return std_m, std_m, _TURN_PER_M * length_m + _LEAST_TURN
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +102,11 @@ class Odometry:
             if not value >= 0.0:
                 raise InvalidMotionError(f"{name} is {value:g}; it must not be negative")
         return cls(forward_m, right_m, turn, np.diag(np.square(stds)))
+
+    @property
+    def components(self) -> dict[str, float]:
+        """Values of the motion by name, the turn in degrees."""
+        return {"forward_m": self.forward_m, "right_m": self.right_m, "turn_deg": math.degrees(self.turn)}
 
     @property
     def displacement_m(self) -> Float[np.ndarray, "2"]:

@@ -1,0 +1,5 @@
+"""Answers: what every door to the model gives, and how it is composed of what was found.
+
+Begin with `documents.py`, the answers. `compose.py` makes those of a search and of a moving camera, `turns.py` searches
+and answers for photographs of one spot, and `pinned.py` has albums.
+"""
