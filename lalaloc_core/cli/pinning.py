@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import add_options
@@ -50,7 +51,7 @@ def _pin(arguments: argparse.Namespace) -> None:
     previous = None if arguments.previous is None else read_pins(arguments.previous)
     stated = stated_camera(arguments)
     plans = [imported.plan() for imported in read_plans(arguments.plan, arguments)]
-    with _Progress() as progress:
+    with _progress_bars() as progress:
         pinned = LaLaLoc(arguments.bundle).pin(plans, paths, camera=stated, progress=progress)
     pinned.notes[:0] = notes
     moved = [] if previous is None else pinned.moved_since(previous)
@@ -69,27 +70,27 @@ def _pin(arguments: argparse.Namespace) -> None:
         print(f"{counts}; see {arguments.out / 'report.pdf'}")
 
 
-class _Progress:
-    """Progress bars on a terminal, one for each stage."""
+@contextmanager
+def _progress_bars() -> Iterator[Callable[[str, int, int], None]]:
+    """Give a function that shows the progress of each stage on a terminal."""
+    from tqdm import tqdm
 
-    def __enter__(self) -> Self:
-        self._stage, self._bar = "", contextlib.ExitStack()
-        return self
+    bars: dict[str, Any] = {}
 
-    def __exit__(self, *error: object) -> None:
-        self._bar.close()
+    def show(stage: str, done: int, count: int) -> None:
+        if stage not in bars:
+            close()
+            bars[stage] = tqdm(total=count, desc=stage, unit="photograph", disable=None, leave=False)
+        bars[stage].update(done - bars[stage].n)
 
-    def __call__(self, stage: str, done: int, count: int) -> None:
-        """Show the number of photographs that a stage is done with."""
-        from tqdm import tqdm
+    def close() -> None:
+        for bar in bars.values():
+            bar.close()
 
-        if stage != self._stage:
-            self._bar.close()
-            self._stage = stage
-            self._shown = self._bar.enter_context(
-                tqdm(total=count, desc=stage, unit="photograph", disable=None, leave=False)
-            )
-        self._shown.update(done - self._shown.n)
+    try:
+        yield show
+    finally:
+        close()
 
 
 def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:

@@ -85,7 +85,8 @@ class LocalModel:
 
     def search_turn(self, turn: Turn, ground: Ground) -> SequenceLocalisation:
         """Search the place of a turn."""
-        return run_steps(turn.steps(ground, self.encoder, turn.queries(self.encoder)), self.refiner)
+        queries = [turn.query(self.encoder, *spot) for spot in turn.spots]
+        return run_steps(turn.steps(ground, self.encoder, queries), self.refiner)
 
 
 class _LocalRefiner:

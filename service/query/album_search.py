@@ -13,8 +13,11 @@ from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry,
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.answers.compose import read_photograph
+from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.encode.features import encodes_spheres
-from lalaloc_core.localise.query import KnownHeading, Query
+from lalaloc_core.localise.query import Query
+from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.taken import Taken
 from service.capacity.admission_control import Slots
@@ -25,7 +28,6 @@ from service.query.album_answers import compose_outcome
 from service.query.ground import Ground
 from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery, Where
 from service.query.query_parts import QueryParts
-from service.query.spots import Spot, read_view
 from service.schemas.albums import AlbumDocument, PhotographFacts
 from service.storage.album_jobs import AlbumPart
 from service.storage.records import PlanRecord, VenueRecord
@@ -34,7 +36,6 @@ from service.storage.records import PlanRecord, VenueRecord
 _MEMORY_BYTES = 256 * 2**20
 # Photographs that the plans of a large venue are chosen by.
 _CHOOSING = 8
-_UNKNOWN = KnownHeading(None, 0.0, "searched")
 
 
 class _Stopped(Exception):
@@ -74,7 +75,7 @@ class AlbumSearch:
                 model=taken.model or None,
                 width=taken.width or None,
                 height=taken.height or None,
-                **vars(read_view(Spot(made.view))),
+                **read_photograph(Spot(made.view)).document(),
             )
             return AlbumEntry(made.to_bytes(self._parts.bundle), facts.model_dump_json())
 
@@ -93,7 +94,7 @@ class AlbumSearch:
             chosen: list[Query] = []
             if isinstance(where, VenueRecord):
                 spots = [Spot(entry.view) for entry in _spread(photographs)]
-                known, heights = [_UNKNOWN] * len(spots), [site.height] * len(spots)
+                known, heights = [UNKNOWN_HEADING] * len(spots), [site.height] * len(spots)
                 chosen = await self._parts.reader.encode(spots, known, heights, context)
             ground = await site.ground(chosen, context)
         work = partial(self._solve, query, ground, photographs)

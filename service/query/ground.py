@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.localise.answers import documents as answers
+from lalaloc_core.localise.answers.documents import Placed
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, Candidate, HintName, Hints
 from lalaloc_core.localise.search.pipeline import Localisation
@@ -25,34 +26,28 @@ from service.venues.venue_search import LoadedPlans
 _TIED = 1e-9
 
 
-@dataclass(frozen=True)
-class PlacedCandidate:
-    """A candidate and the plan that it lies in.
+@dataclass(frozen=True, kw_only=True)
+class PlacedCandidate(Placed):
+    """A candidate in the frame of its stored plan.
 
     Attributes:
         plan_id: id of the plan.
         revision_id: id of the plan's revision.
-        plan: the plan.
-        candidate: the candidate in the plan's frame.
         anchor: place of the plan on Earth; None where unknown.
         level: level of the plan in its venue; None outside of venues.
     """
 
     plan_id: str
     revision_id: str
-    plan: FloorPlan
-    candidate: Candidate
     anchor: Anchor | None
-    level: float | None = None
+    level: float | None
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class Ground(answers.Ground):
     """Places that a photograph is compared with.
 
     Attributes:
-        plan: the plan, or the plans side by side.
-        grid: its pose grid.
         records: the stored plans.
         anchors: their places on Earth.
         levels: their levels; None outside of venues.
@@ -63,8 +58,6 @@ class Ground:
         venue_hints: hints of the request about the venue; None outside of venues.
     """
 
-    plan: FloorPlan
-    grid: PoseGrid
     records: Sequence[PlanRecord]
     anchors: Sequence[Anchor | None]
     levels: Sequence[float | None]
@@ -111,8 +104,18 @@ class Ground:
         number, own = (0, candidate) if self.merged is None else self.merged.in_own_plan(candidate)
         record = self.records[number]
         return PlacedCandidate(
-            record.id, record.revision_id, record.plan, own, self.anchors[number], self.levels[number]
+            record.plan,
+            own,
+            plan_id=record.id,
+            revision_id=record.revision_id,
+            anchor=self.anchors[number],
+            level=self.levels[number],
         )
+
+    @property
+    def rooms_known(self) -> bool:
+        """True if rooms need not be asked for; plans of a venue have rooms of the same names."""
+        return self.hints.rooms is not None or self.merged is not None
 
     def share(self, found: Localisation) -> float:
         """Return the probability that the camera is in a searched plan."""

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.query.stated_pose import known_heading
@@ -19,7 +20,6 @@ from service.capacity.query_context import QueryContext
 from service.decoding.decoder import Decoder
 from service.query.executor import Executor
 from service.query.queries import Content
-from service.query.spots import Spot
 from service.schemas import LocaliseForm, PhotographForm, StatedHeading
 from service.uploaded_file import UploadedFile
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -11,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import Row
 
-from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.localise.answers.compose import compose_tracked
+from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import KnownHeading
+from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
 from lalaloc_core.localise.tracking import TrackState
 from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
@@ -23,21 +22,11 @@ from lalaloc_core.localise.tracking.walk_motion import WalkGraph
 from service.capacity.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
 from service.query.geopose import geopose_at
-from service.query.ground import Ground, PlacedCandidate
+from service.query.ground import Ground
 from service.query.grounds import VenueSite
 from service.query.queries import TrackOutcome, TrackQuery
 from service.query.query_parts import QueryParts
-from service.query.spots import Spot, read_view
-from service.schemas import (
-    ModelAnswer,
-    PathPoint,
-    PhotographForm,
-    Position,
-    RivalAnswer,
-    StoredPose,
-    TimingsAnswer,
-    TrackedPoseAnswer,
-)
+from service.schemas import PathPoint, PhotographForm, StoredPose, TimingsAnswer, TrackedPoseAnswer
 from service.storage.records import PlanRecord, VenueRecord
 
 # Poses of a plan whose belief is computed for every photograph; a belief has a weight for each pose and heading.
@@ -48,7 +37,7 @@ _GRAPH_BYTES = 64 * 2**20
 _STAYS_FROM, _NEXT_LEVEL = 1e-3, 5.0
 # Log factor of plans that stay, larger than any difference of log masses.
 _STAYS = 1e6
-_UNKNOWN = KnownHeading(None, 0.0, "searched")
+_RIVAL_FIELDS = ("position", "heading_deg", "room", "room_id", "probability")
 # Stages of tracking that answers report as a stage of a single query.
 _STAGES = {"retrieve": ("predict", "retrieve"), "lpo": ("lpo", "rank")}
 
@@ -71,7 +60,7 @@ class SessionSearch:
             site = await self._parts.grounds.site(where, document, hinted, max_poses=MAX_POSES)
             known = self._parts.reader.known_heading(form, site.north, photograph)
             await site.wait(context)
-            (encoded,) = await self._parts.reader.encode([Spot(photograph)], [_UNKNOWN], [site.height], context)
+            (encoded,) = await self._parts.reader.encode([Spot(photograph)], [UNKNOWN_HEADING], [site.height], context)
             favour = None
             if isinstance(site, VenueSite):
                 favour = _favour_of(site, {} if state is None else state.by_plan, query.session_id)
@@ -117,66 +106,29 @@ class SessionSearch:
         self, ground: Ground, found: Tracked, spot: Spot, form: PhotographForm, timings_ms: dict[str, float]
     ) -> StoredPose:
         """Compose the part of the answer that is stored with the session; its path is the new pose alone."""
-        pose, query, best = found.pose, found.query, found.candidates[0]
-        place = ground.place(best)
-        scale = np.array([1.0, 1.0, math.degrees(1.0)])
-        heading_deg, room = heading_to_degrees(pose.heading), place.plan.rooms[pose.room_index]
-        position = Position(x_m=pose.x_m, y_m=pose.y_m)
-        camera_height_m = query.camera_height.height_m * math.exp(best.height_offset)
-        rivals = [
-            _rival(ground.place(rival), heading_to_degrees(photograph_heading(query, rival)), probability)
-            for rival, probability in zip(found.candidates, found.probability, strict=True)
-        ]
-        totals = {
-            name: sum(timings_ms.get(part, 0.0) for part in _STAGES.get(name, (name,)))
-            for name in TimingsAnswer.model_fields
-        }
-        answer = TrackedPoseAnswer(
-            number=pose.number,
-            position=position,
-            heading_deg=heading_deg,
-            room=room.name,
-            room_id=room.id,
-            floorplan_id=place.plan_id,
-            level=place.level,
-            covariance=(pose.covariance * np.outer(scale, scale)).tolist(),
-            probability=min(pose.probability, 1.0),
-            camera_height_m=camera_height_m,
-            candidates=rivals,
-            motion_contradicted=list(found.contradicted),
-            warnings=[*_warnings(found, form), *ground.warnings, *spot.photograph.warnings],
-            geopose=geopose_at(place.anchor, (pose.x_m, pose.y_m), heading_deg, camera_height_m),
-            view=read_view(spot),
-            timings_ms=TimingsAnswer(**totals),
-            model=ModelAnswer.of(self._parts.bundle),
+        composed = compose_tracked(
+            found, ground, spot, self._parts.bundle, odometry=form.odometry, warnings=ground.warnings
         )
+        fields = composed.document()
+        place = ground.place(found.candidates[0])
+        fields["candidates"] = [
+            {name: pose[name] for name in _RIVAL_FIELDS} | {"floorplan_id": rival.plan_id, "level": rival.level}
+            for pose, rival in zip(fields["candidates"], map(ground.place, found.candidates), strict=True)
+        ]
+        position = (composed.position.x_m, composed.position.y_m)
+        fields |= {
+            "floorplan_id": place.plan_id,
+            "level": place.level,
+            "geopose": geopose_at(place.anchor, position, composed.heading_deg, composed.camera_height_m),
+            "timings_ms": {
+                name: sum(timings_ms.get(part, 0.0) for part in _STAGES.get(name, (name,)))
+                for name in TimingsAnswer.model_fields
+            },
+        }
+        mode = fields.pop("mode")
+        answer = TrackedPoseAnswer.model_validate(fields)
         point = PathPoint(**{name: getattr(answer, name) for name in PathPoint.model_fields})
-        return StoredPose(mode=pose.mode, pose=answer, path=[point])
-
-
-def _rival(place: PlacedCandidate, heading_deg: float, probability: float) -> RivalAnswer:
-    room = place.plan.rooms[place.candidate.room_index]
-    return RivalAnswer(
-        position=Position(x_m=place.candidate.x_m, y_m=place.candidate.y_m),
-        heading_deg=heading_deg,
-        room=room.name,
-        room_id=room.id,
-        floorplan_id=place.plan_id,
-        level=place.level,
-        probability=min(probability, 1.0),
-    )
-
-
-def _warnings(found: Tracked, form: PhotographForm) -> list[str]:
-    """Return a warning for each contradicted component of the motion, and for odometry that is wrong repeatedly."""
-    warnings = [
-        f"{name} is {getattr(form, name) or 0.0:g}, which the photographs contradict by more than 4 standard deviations"
-        for name in found.contradicted
-    ]
-    return warnings + [
-        f"{name} contradicts at least 3 of the last 8 photographs: check its sign, unit and standard deviation"
-        for name in found.state.suspected
-    ]
+        return StoredPose(mode=mode, pose=answer, path=[point])
 
 
 def _favour_of(

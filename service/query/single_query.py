@@ -5,30 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
+from lalaloc_core.localise.answers.compose import compose_answer
+from lalaloc_core.localise.answers.documents import Answer, Spot
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.photograph import Photograph
-from service.query.answers import compose_answer, posterior_answer
+from service.query.answers import localise_answer, posterior_answer
 from service.query.executor import finish_with
 from service.query.ground import Ground
 from service.query.queries import PhotographQuery, PictureQuery, Where
 from service.query.query_parts import QueryParts
-from service.query.spots import Spot
 from service.schemas import LocaliseAnswer
 from service.storage.records import PlanRecord
 
 # Among many plans the right one often ranks low before refinement, so refine more candidates than in a single plan.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
-# Names of the heading's sources in pictures.
-_SOURCES = {"given": "given", "photograph": "from the compass", "searched": "estimated"}
 
 
 @dataclass(frozen=True)
 class _Outcome:
-    """An answer, and the photograph, search result and ground behind it."""
+    """An answer, before and after its places were named, and the ground behind it."""
 
     answer: LocaliseAnswer
-    photograph: Photograph
-    found: Localisation
+    composed: Answer
     ground: Ground
 
 
@@ -73,18 +71,11 @@ class SingleSearch:
         )
 
         def compose(found: Localisation) -> _Outcome:
-            answer = compose_answer(
-                found,
-                ground,
-                spot,
-                known,
-                timings_ms=self._parts.executor.observe(context, found.stage),
-                bundle=self._parts.bundle,
-                warnings=[*ground.hint_warnings(found), *ground.warnings],
-            )
-            return _Outcome(
-                answer.model_copy(update=self._extras(where, query, ground, found)), photograph, found, ground
-            )
+            timings_ms = self._parts.executor.observe(context, found.stage)
+            warnings = [*ground.hint_warnings(found), *ground.warnings]
+            composed = compose_answer(found, ground, spot, known, self._parts.bundle, warnings=warnings)
+            answer = localise_answer(composed, ground, timings_ms)
+            return _Outcome(answer.model_copy(update=self._extras(where, query, ground, found)), composed, ground)
 
         return await self._parts.executor.run_search(finish_with(steps, compose), context)
 
@@ -101,7 +92,7 @@ class SingleSearch:
         return {"venue_id": where.id, "plans": plans[: query.form.top_k]}
 
     async def _draw(self, outcome: _Outcome, query: PictureQuery) -> bytes:
-        context, picture, ground = query.context, None, outcome.ground
+        context, picture = query.context, None
         if query.picture != "plan":
             assert not isinstance(query.content, Photograph)
             # Decode again, because the encoder's input is too small for a picture.
@@ -110,14 +101,12 @@ class SingleSearch:
                 query.form.stated_camera,
                 context.deadline,
                 context.client,
-                is_sphere=outcome.photograph.is_sphere,
+                is_sphere=outcome.composed.evidence.photograph.is_sphere,
                 max_size=PHOTOGRAPH_SIZE,
             )
 
         def draw() -> str:
-            model = self._parts.bundle.manifest.confidence_for(view=outcome.found.query.is_view)
-            source = _SOURCES[outcome.answer.heading_source]
-            drawn = drawn_answer(ground.plan, ground.grid, outcome.found, model, source, photograph=outcome.photograph)
+            drawn = drawn_answer(outcome.composed)
             return draw_answer(drawn, picture, query.picture, rooms=query.rooms)
 
         svg = await self._parts.executor.compute(context, draw)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.measured_motion import MIN_ANGLE_STD
-from lalaloc_core.localise.sequence.turn_localisation import EXACT, ON_THE_SPOT
 from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.form_validators import needs, parse_json, reject_underscores
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
@@ -100,27 +96,6 @@ class SequenceForm(PlaceFields, CameraFields, PhotographFields):
         """Return (field, message) for fields that do not go with a film."""
         given = [name for name in ("relative_heading_deg", "headings_deg") if getattr(self, name) is not None]
         return [(name, "does not go with a film, whose frames are chosen by the service") for name in given]
-
-    def steps(self, photographs: int) -> list[Motion]:
-        """Return the motions between the photographs."""
-        relative = self.relative_heading_deg or [None] * photographs
-        return [self._turn(*pair) for pair in itertools.pairwise(relative)]
-
-    @property
-    def known_turns(self) -> list[float] | None:
-        """Headings (radians) minus that of the first photograph; None unless all are known well enough to be exact."""
-        given = self.relative_heading_deg or []
-        known = [angle for angle in given if angle is not None]
-        if not known or len(known) < len(given) or math.radians(self.relative_heading_std_deg) > EXACT:
-            return None
-        return [math.radians(angle - known[0]) for angle in known]
-
-    def _turn(self, first_deg: float | None, second_deg: float | None) -> Motion:
-        """Return the motion between two photographs from one spot."""
-        if first_deg is None or second_deg is None:
-            return ON_THE_SPOT
-        std = math.radians(self.relative_heading_std_deg)
-        return replace(ON_THE_SPOT, turn=math.radians(second_deg - first_deg), turn_std=std)
 
     def heading_of(self, index: int) -> StatedHeading:
         """Return the given heading of a photograph."""

@@ -72,10 +72,11 @@ def test_plans_go_in_as_they_are(model: LaLaLoc, tmp_path: Path) -> None:
     plans = [str(file), file, file.read_bytes(), import_plan(file.read_bytes())]
     assert {model.localise(plan, KITCHEN).room for plan in plans} == {"kitchen"}
     assert read_plan(file).name == read_plan(file.read_bytes()).name
-    picture = Image.new("RGB", (600, 400), "white")
-    for box in ((50, 50, 300, 350), (300, 50, 550, 350)):
-        ImageDraw.Draw(picture).rectangle(box, outline="black", width=6)
+    picture = Image.new("RGB", (1200, 800), "white")
+    for box in ((50, 50, 610, 750), (590, 50, 1150, 750)):
+        ImageDraw.Draw(picture).rectangle(box, outline="black", width=20)
     assert len(read_plan(picture, metres_per_pixel=0.01).rooms) == 2
+    assert len(read_plan(np.asarray(picture), metres_per_pixel=0.01).rooms) == 2
     with pytest.raises(InvalidFloorPlanError, match="cannot be read"):
         read_plan(tmp_path / "gone.dxf")
 
@@ -98,12 +99,12 @@ def test_contradicted_heading_is_searched(model: LaLaLoc, plan: lalaloc_core.Flo
 
 
 def test_photographs_of_a_turn_are_one_answer(model: LaLaLoc, plan: lalaloc_core.FloorPlan) -> None:
-    answer = model.localise_turn(plan, [jpeg(frame) for frame in turn()[:48:8]], camera=PHONE)
+    answer = model.localise_turn(plan, [jpeg(frame) for frame in turn()[:48:4]], camera=PHONE)
     assert off_m(answer.position, "living_room.jpg") < 0.5
-    assert len(answer.poses) == 6
+    assert len(answer.poses) == 12
     angles = [pose.view.relative_heading.value_deg % 360.0 for pose in answer.poses if pose.view.relative_heading]
-    assert angles == pytest.approx([48.0 * index for index in range(6)], abs=2.0)
-    assert [pose["view"]["next_step"] for pose in answer.document()["poses"][1:]] == [None] * 5
+    assert angles == pytest.approx([24.0 * index for index in range(12)], abs=2.0)
+    assert [pose["view"]["next_step"] for pose in answer.document()["poses"][1:]] == [None] * 11
     with pytest.raises(InvalidInputError, match="the turn has 1 photographs; a turn has 2 to 100"):
         model.localise_turn(plan, [KITCHEN])
 

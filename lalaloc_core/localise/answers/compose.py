@@ -146,18 +146,33 @@ def _with_reason(warnings: list[str], found: Localisation, confidence: Confidenc
 
 
 def compose_tracked(
-    found: Tracked, ground: Ground, spot: Spot, bundle: Bundle, *, odometry: Odometry | None = None
+    found: Tracked,
+    ground: Ground,
+    spot: Spot,
+    bundle: Bundle,
+    *,
+    odometry: Odometry | None = None,
+    warnings: Sequence[str] = (),
 ) -> TrackedAnswer:
-    """Compose the answer of a camera that moves; `odometry` is the motion that was stated."""
+    """Compose the answer of a camera that moves.
+
+    Args:
+        found: result of the filter.
+        ground: the searched places.
+        spot: the photograph.
+        bundle: the model.
+        odometry: the motion that was stated.
+        warnings: warnings besides those about the motion and the photograph.
+    """
     pose, query, best = found.pose, found.query, found.candidates[0]
     room = ground.place(best).plan.rooms[pose.room_index]
     scale = np.array([1.0, 1.0, math.degrees(1.0)])
     stated = {} if odometry is None else odometry.components
-    warnings = [
+    about_motion = [
         f"{name} is {stated[name]:g}, which the photographs contradict by more than 4 standard deviations"
         for name in found.contradicted
     ]
-    warnings += [
+    about_motion += [
         f"{name} contradicts at least 3 of the last 8 photographs: check its sign, unit and standard deviation"
         for name in found.state.suspected
     ]
@@ -176,7 +191,7 @@ def compose_tracked(
             for candidate, probability in zip(found.candidates, found.probability, strict=True)
         ],
         motion_contradicted=list(found.contradicted),
-        warnings=[*warnings, *spot.photograph.warnings],
+        warnings=[*about_motion, *warnings, *spot.photograph.warnings],
         view=read_photograph(spot),
         model=Model.of(bundle),
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.answers.compose import compose_answer
 from lalaloc_core.localise.answers.documents import Angle, FilmReading, Ground, Spot, TurnAnswer
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
@@ -17,7 +19,14 @@ from lalaloc_core.localise.refine import RefinementJob
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
 from lalaloc_core.localise.sequence import Motion, SequenceJob
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, SequenceRefine, localise_sequence_steps
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn, localised_turn
+from lalaloc_core.localise.sequence.turn_localisation import (
+    EXACT,
+    ON_THE_SPOT,
+    LinkedTurn,
+    found_turns,
+    judged_turn,
+    localised_turn,
+)
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.film import Film
 
@@ -83,19 +92,58 @@ class Turn:
             film=film,
         )
 
+    @classmethod
+    def of_headings(
+        cls,
+        photographs: Sequence[Photograph],
+        known: Sequence[KnownHeading],
+        height: CameraHeight,
+        headings: Sequence[float | None],
+        std: float,
+    ) -> Turn:
+        """Return a turn with stated headings (radians) relative to each other, and the deviation between two."""
+        relative = [None if angle is None or headings[0] is None else angle - headings[0] for angle in headings]
+        given = [angle for angle in headings if angle is not None]
+        is_exact = 0 < len(given) == len(headings) and std <= EXACT
+        motions = [
+            ON_THE_SPOT if None in (first, second) else replace(ON_THE_SPOT, turn=second - first, turn_std=std)
+            for first, second in itertools.pairwise(headings)
+        ]
+        return cls(
+            photographs=photographs,
+            known=known,
+            height=height,
+            turns=[angle - given[0] for angle in given] if is_exact else None,
+            motions=motions,
+            relative_headings=[
+                None
+                if angle is None
+                else Angle(
+                    value_deg=math.degrees(wrap_angle(angle)),
+                    std_deg=math.degrees(std) if index else 0.0,
+                    source="given",
+                )
+                for index, angle in enumerate(relative)
+            ],
+        )
+
     @property
     def is_one_query(self) -> bool:
         """True unless one of the photographs is a sphere, which shows all that others could add."""
         return not any(photograph.is_sphere for photograph in self.photographs)
 
-    def queries(self, encoder: PhotographEncoder) -> list[Query]:
-        """Return the query of all photographs if their angles are known, else one of each photograph."""
+    @property
+    def spots(self) -> list[tuple[Spot, KnownHeading]]:
+        """All photographs together if their angles are known, else each by itself; with the known heading."""
         if self.is_one_query and self.turns is not None:
-            return [self._joint_query(encoder, self.turns)]
-        return [
-            encoder.query(photograph, known.heading, self.height, heading_tolerance=known.tolerance)
-            for photograph, known in zip(self.photographs, self.known, strict=True)
-        ]
+            return [self._joint_spot(self.turns)]
+        return [(Spot(photograph), known) for photograph, known in zip(self.photographs, self.known, strict=True)]
+
+    def query(self, encoder: PhotographEncoder, spot: Spot, known: KnownHeading) -> Query:
+        """Return the query of one of the `spots`."""
+        return encoder.query(
+            spot.photograph, known.heading, self.height, heading_tolerance=known.tolerance, others=spot.others
+        )
 
     def steps(
         self,
@@ -126,22 +174,25 @@ class Turn:
         found = found if self.linked is None else self.linked.in_order(found)
         if not self.is_one_query:
             return found
-        return judged_turn(found, (yield from joint_steps(self._joint_query(encoder, found_turns(found)))))
+        return judged_turn(found, (yield from joint_steps(self.query(encoder, *self._joint_spot(found_turns(found))))))
 
-    def _joint_query(self, encoder: PhotographEncoder, turns: Sequence[float]) -> Query:
-        """Return all photographs as one query that sees more azimuths, so that overlapping parts count once."""
-        known = next(
-            (
-                replace(heading, heading=heading.heading - turn)
-                for heading, turn in zip(self.known, turns, strict=True)
-                if heading.heading is not None
-            ),
-            self.known[0],
+    def _joint_spot(self, turns: Sequence[float]) -> tuple[Spot, KnownHeading]:
+        """Return all photographs as one that sees more azimuths, so that overlapping parts count once."""
+        stated = (
+            replace(heading, heading=heading.heading - turn)
+            for heading, turn in zip(self.known, turns, strict=True)
+            if heading.heading is not None
         )
-        others = list(zip(self.photographs[1:], turns[1:], strict=True))
-        return encoder.query(
-            self.photographs[0], known.heading, self.height, heading_tolerance=known.tolerance, others=others
-        )
+        spot = Spot(self.photographs[0], list(zip(self.photographs[1:], turns[1:], strict=True)))
+        return spot, next(stated, self.known[0])
+
+    def contradictions(self, found: SequenceLocalisation) -> list[str]:
+        """Return warnings about photographs that do not fit the one before, by its place or its stated angle."""
+        order = range(len(self.photographs)) if self.linked is None else self.linked.order
+        return [
+            f"photo[{order[index + 1]}]: its place or angle contradicts photo[{order[index]}] and was ignored"
+            for index in found.motions_contradicted
+        ]
 
     @property
     def warnings(self) -> list[str]:
@@ -150,11 +201,17 @@ class Turn:
             return []
         if self.linked is not None:
             return self.linked.warnings(min(photograph.hfov.value for photograph in self.photographs))
-        return [] if any(self.relative_headings) or not self.is_one_query else [_NO_ANGLES]
+        has_turn = any(motion.turn is not None for motion in self.motions)
+        return [] if has_turn or not self.is_one_query else [_NO_ANGLES]
 
 
-def compose_turn(turn: Turn, found: SequenceLocalisation, ground: Ground, bundle: Bundle) -> TurnAnswer:
-    """Compose the answer about photographs of one spot; its first pose has the next step."""
+def compose_turn(
+    turn: Turn, found: SequenceLocalisation, ground: Ground, bundle: Bundle, *, warnings: Sequence[str] = ()
+) -> TurnAnswer:
+    """Compose the answer about photographs of one spot; its first pose has the next step.
+
+    `warnings` are those besides warnings about the photographs.
+    """
     turns = found_turns(found)
     poses = [
         compose_answer(
@@ -175,7 +232,7 @@ def compose_turn(turn: Turn, found: SequenceLocalisation, ground: Ground, bundle
     share = min(ground.share(picture) for picture in found.pictures)
     changed = {
         "confidence": found.confidence(bundle.manifest, share),
-        "warnings": [*turn.warnings, *named],
+        "warnings": [*turn.warnings, *turn.contradictions(found), *named, *warnings],
         "stage": found.stage,
         "camera_height_m": found.camera_height_m,
     }
