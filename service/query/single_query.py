@@ -23,11 +23,10 @@ VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profil
 
 @dataclass(frozen=True)
 class _Outcome:
-    """An answer, before and after its places were named, and the ground behind it."""
+    """An answer, after and before its places were named."""
 
     answer: LocaliseAnswer
     composed: Answer
-    ground: Ground
 
 
 class SingleSearch:
@@ -75,7 +74,7 @@ class SingleSearch:
             warnings = [*ground.hint_warnings(found), *ground.warnings]
             composed = compose_answer(found, ground, spot, known, self._parts.bundle, warnings=warnings)
             answer = localise_answer(composed, ground, timings_ms)
-            return _Outcome(answer.model_copy(update=self._extras(where, query, ground, found)), composed, ground)
+            return _Outcome(answer.model_copy(update=self._extras(where, query, ground, found)), composed)
 
         return await self._parts.executor.run_search(finish_with(steps, compose), context)
 
