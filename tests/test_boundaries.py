@@ -99,11 +99,11 @@ FORBIDDEN = {
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
     "uploaded_file capacity.fair_share capacity.cpu_accounts capacity.cores capacity.bounded_cache",
-    "settings errors problem_kinds schemas stored_plan",
+    "settings errors problem_kinds schemas plan_documents",
     "telemetry",
     "capacity",
     # Programs of worker processes, which do not import their supervisors.
-    "workers plan_files.plan_description plan_files.plan_mesh plan_files.localisability_rendition",
+    "workers plan_files.plan_description plan_files.plan_mesh",
     "decoding.decode_worker plan_files.renditions",
     "plan_files.convert_worker",
     "pools storage",

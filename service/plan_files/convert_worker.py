@@ -27,7 +27,7 @@ from lalaloc_core.importers import (
     import_plans,
 )
 from service.errors import DamagedDataError
-from service.stored_plan import LARGE, PackedPlan, PlanDocument, Rendition, RenditionJob
+from service.plan_documents import LARGE, PackedPlan, PlanDocument, Rendition, RenditionJob
 from service.workers.process import address_space_bytes, limit_memory, serve_jobs, tell
 
 # A worker that has grown by this share of its limit is replaced, so that memory kept by libraries does not fail the

@@ -18,6 +18,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, OnStep
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
+from service.plan_documents import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob, RenditionKind
 from service.plan_files.convert_worker import (
     ConversionJob,
     ConversionRefusal,
@@ -29,7 +30,6 @@ from service.plan_files.convert_worker import (
 )
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
-from service.stored_plan import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
 
 _Pool = WorkerPool[ConversionJob, ConversionResult]

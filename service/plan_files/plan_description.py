@@ -10,6 +10,7 @@ from typing import Literal
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.sampling import grid_size
+from service.plan_documents import PlanHead, Rendition
 from service.schemas.plan_import import ImportReport
 from service.schemas.stored_plans import (
     BoundsAnswer,
@@ -20,7 +21,6 @@ from service.schemas.stored_plans import (
     PlanStatus,
     RoomAnswer,
 )
-from service.stored_plan import PlanHead, Rendition
 
 
 def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:

@@ -23,10 +23,10 @@ from lalaloc_core.importers import (
     is_json,
 )
 from service.capacity.fair_share import FairSemaphore
+from service.plan_documents import LARGE, PlanDocument, Rendition
 from service.plan_files.convert_worker import Imported, report_of
 from service.plan_files.converter import Converter
 from service.settings import Settings
-from service.stored_plan import LARGE, PlanDocument, Rendition
 from service.uploaded_file import UploadedFile
 
 

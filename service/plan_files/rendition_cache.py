@@ -21,10 +21,10 @@ from service.capacity.bounded_cache import BoundedCache
 from service.capacity.fair_share import FairSemaphore, Shares
 from service.capacity.threads import Threads
 from service.errors import DamagedDataError, OverloadedError, UnknownFloorPlanError, UnmeasuredModelError
+from service.plan_documents import PREDICTIONS, SLOW, Rendition, RenditionJob, RenditionKind
 from service.plan_files.converter import Converter
 from service.plan_files.renditions import make_rendition
 from service.storage.plans import Plans
-from service.stored_plan import PREDICTIONS, SLOW, Rendition, RenditionJob, RenditionKind
 from service.telemetry import LOGGER_NAME
 
 # Characters of a document up to which its files are made in this process: about 30 rooms.

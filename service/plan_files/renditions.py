@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 from typing import cast
 
-from lalaloc_core.conditions import CONDITIONS
+from lalaloc_core.conditions import CONDITIONS, Condition
 from lalaloc_core.draw.plan import bounds_with, draw_rooms
 from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from lalaloc_core.importers import ExportFormat, export_plan
 from service.errors import DamagedDataError
+from service.plan_documents import Rendition, RenditionJob
 from service.plan_files.plan_description import describe
+from service.schemas import ModelAnswer
+from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.stored_plans import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
-from service.stored_plan import Rendition, RenditionJob
 
 
 def make_rendition(job: RenditionJob) -> Rendition:
@@ -45,9 +47,6 @@ def no_room_of(report: str | None) -> list[list[list[float]]]:
 def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
     match job.kind:
         case "localisability" | "coarse localisability":
-            # Imported late: the search needs libraries that other files do not.
-            from service.plan_files.localisability_rendition import plan_localisability
-
             return plan_localisability(plan, job, coarse=job.kind != "localisability")
         case "layout":
             return plan_layout(plan, job.stored.id, job.stored.revision_id)
@@ -59,9 +58,6 @@ def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
 
             return plan_glb(plan)
         case kind if kind in CONDITIONS:
-            # Imported late for the same reason.
-            from service.plan_files.localisability_rendition import localisability_map
-
             return localisability_map(plan, job.report, kind)
         case kind:
             return export_plan(plan, cast(ExportFormat, kind))
@@ -89,3 +85,27 @@ def _opening(plan: FloorPlan, face: OpeningFace) -> OpeningFaceAnswer:
     return OpeningFaceAnswer(
         kind=opening.kind, wall=face.wall, start=face.start, end=face.end, sill_m=opening.sill_m, head_m=opening.head_m
     )
+
+
+def plan_localisability(plan: FloorPlan, job: RenditionJob, *, coarse: bool = False) -> bytes:
+    """Return the `LocalisabilityAnswer` of a plan as JSON."""
+    # Imported late: the search needs libraries that other files do not.
+    from lalaloc_core.localise.localisability.predicted_localisability import localisability
+    from lalaloc_core.localise.localisability.reports import report_of
+
+    assert job.bundle is not None, "the prediction needs the model"
+    answer = LocalisabilityAnswer(
+        floorplan_id=job.stored.id,
+        revision=job.stored.revision_id,
+        model=ModelAnswer.of(job.bundle),
+        **report_of(plan, localisability(plan, job.bundle.manifest, coarse=coarse), coarse=coarse),
+    )
+    return answer.model_dump_json().encode()
+
+
+def localisability_map(plan: FloorPlan, report: bytes, condition: Condition) -> bytes:
+    """Return the drawing of a `LocalisabilityAnswer` of the plan as SVG."""
+    # Imported late for the same reason.
+    from lalaloc_core.draw.localisability import localisability_svg
+
+    return localisability_svg(plan, json.loads(report), condition).encode()

@@ -20,13 +20,13 @@ from service.http.idempotent_request import HEADER
 from service.http.middleware.admission import reading
 from service.http.representations import expected_revision
 from service.http.uploads import JSON, UploadLimits, media_type, read_body
+from service.plan_documents import Rendition, RenditionKind
 from service.runtime import Runtime, get_runtime
 from service.security import caller_of
 from service.settings import Settings
 from service.storage import Store
 from service.storage.album_rows import AlbumRecord
 from service.storage.records import Cursor, PlanRecord, PlanSummary, VenuePlace, VenueRecord
-from service.stored_plan import Rendition, RenditionKind
 from service.telemetry import add_log_fields
 from service.uploaded_file import UploadedFile
 

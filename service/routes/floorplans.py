@@ -14,6 +14,7 @@ from service.grids import GridState
 from service.http.problems import problem_responses
 from service.http.representations import not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON
+from service.plan_documents import Rendition
 from service.plan_files.plan_description import describe, state_of_description, with_head
 from service.plan_files.plan_file import PlanFile
 from service.routes.dependencies import ApiCall, Call, Name, Page, Revision
@@ -31,7 +32,6 @@ from service.routes.import_lines import answer_import
 from service.routes.plan_uploads import UPLOAD_BODY, PlanUpload, prepare_plan, read_upload
 from service.schemas.stored_plans import FloorPlanAnswer, FloorPlanList, FloorPlanSummary
 from service.storage.records import PlanRecord, PlanSummary
-from service.stored_plan import Rendition
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 

@@ -28,6 +28,7 @@ from service.http.events import EventStream
 from service.http.problems import problem_responses
 from service.http.representations import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
 from service.http.uploads import JSON
+from service.plan_documents import PREDICTIONS, RenditionKind
 from service.routes.dependencies import ApiCall, Call, Revision
 from service.routes.descriptions import (
     CONDITIONAL,
@@ -40,7 +41,6 @@ from service.routes.descriptions import (
 from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.stored_plans import LayoutAnswer
 from service.storage.records import PlanSummary
-from service.stored_plan import PREDICTIONS, RenditionKind
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 

@@ -13,13 +13,13 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, OnStep, building_name
 from service.errors import InvalidRequestError
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
+from service.plan_documents import PlanDocument
 from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
 from service.routes.dependencies import ApiCall
 from service.routes.descriptions import json_body
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.plan_import import ImportForm, LevelsForm
 from service.storage.records import ComputedGrid, NewPlan, Original
-from service.stored_plan import PlanDocument
 from service.uploaded_file import UploadedFile
 
 P = ParamSpec("P")

@@ -1,11 +1,20 @@
-"""Access checks of every request before its body is read: exposure, API key or token, rate limit, scope."""
+"""Access checks of every request before its body is read: exposure, API key or token, rate limit, scope.
+
+Without API keys, only local requests are answered, unless configured otherwise. Addresses and host names are checked
+separately: a container receives requests over its own network, but only from programs and pages of its host. A browser
+must use a loopback name, and for changes a page of this service: other sites can make their names resolve to 127.0.0.1
+(DNS rebinding), and can send forms anywhere.
+"""
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import time
+from collections.abc import Sequence, Set
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from limits import RateLimitItem, RateLimitItemPerMinute, RateLimitItemPerSecond
 from limits.aio.storage import MemoryStorage
@@ -15,9 +24,9 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import Scope
 
+from lalaloc_core.errors import ConfigError
 from service import errors
-from service.errors import InvalidRequestError, RateLimitedError, TooManyRefusedKeysError
-from service.security.exposure import check_origin, is_local
+from service.errors import ExposedWithoutKeysError, InvalidRequestError, RateLimitedError, TooManyRefusedKeysError
 from service.security.keys import KeyCache, PresentedKey, parse_authorization, parse_token
 from service.security.permissions import Caller, Identity, Permission, anyone, is_page, network_of, permissions_needed
 from service.settings import Settings
@@ -26,73 +35,6 @@ from service.telemetry import add_log_fields
 
 if TYPE_CHECKING:
     from service.security.oidc import TokenVerifier
-
-# Client addresses share a fixed number of counters, which bounds memory. A collision only affects addresses that send
-# invalid keys.
-_ADDRESS_COUNTERS = 1024
-# Invalid API keys per minute of a client address; further ones get a 429. Valid keys are not affected.
-REFUSED_KEYS_PER_MINUTE = 60
-# Bytes of an answer that cost as much as a request.
-BYTES_PER_REQUEST = 256 * 1024
-
-
-class RateLimits:
-    """Rate limits over a sliding window; for one event loop."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
-        self._per_minute = settings.access.rate_per_minute
-        self._burst = settings.access.rate_burst
-        self._refused = RateLimitItemPerMinute(REFUSED_KEYS_PER_MINUTE, namespace="refused")
-
-    async def count(self, caller: Identity) -> None:
-        """Count a request."""
-        if self._burst:
-            await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), caller.id, "second")
-        if (limit := self._limit_of(caller)) is not None:
-            await self._count(limit, caller.id, "minute")
-
-    async def count_photographs(self, caller: Identity, photographs: int) -> None:
-        """Count each photograph of a request, which was counted once, as a request; all of them or none."""
-        limit = self._limit_of(caller)
-        if limit is None or photographs <= 1:
-            return
-        if photographs > limit.amount:
-            fault = f"is given {photographs} times; the rate limit is {limit.amount} per minute: send fewer"
-            raise InvalidRequestError([("photo", fault)])
-        await self._count(limit, caller.id, "minute", cost=photographs - 1)
-
-    async def charge(self, caller: Identity, sent_bytes: int) -> None:
-        """Count an answer as one more request per `BYTES_PER_REQUEST`, up to the limit."""
-        more, limit = sent_bytes // BYTES_PER_REQUEST, self._limit_of(caller)
-        if more and limit is not None:
-            _, left = await self._limiter.get_window_stats(limit, caller.id)
-            await self._limiter.hit(limit, caller.id, cost=min(more, left))
-
-    async def count_refused(self, client: str) -> None:
-        """Count an invalid key of a client address."""
-        if not await self._limiter.hit(self._refused, _counter_of(client)):
-            retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
-            raise TooManyRefusedKeysError(self._refused.amount, retry_after_s)
-
-    def _limit_of(self, caller: Identity) -> RateLimitItem | None:
-        per_minute = self._per_minute if caller.rate_per_minute is None else caller.rate_per_minute
-        return RateLimitItemPerMinute(per_minute, namespace="rate") if per_minute else None
-
-    async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:
-        if not await self._limiter.hit(limit, key_id, cost=cost):
-            raise RateLimitedError(limit.amount, period, await self._retry_after_s(limit, key_id))
-
-    async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
-        """Return the whole seconds until the count drops."""
-        freed_at_s, _ = await self._limiter.get_window_stats(limit, identifier)
-        return max(math.ceil(freed_at_s - time.time()), 1)
-
-
-def _counter_of(client: str) -> str:
-    """Return the counter of a client address; the hash is salted per process, so collisions cannot be planned."""
-    return str(hash(network_of(client)) % _ADDRESS_COUNTERS)
-
 
 # Errors of `AuthorisationMiddleware`, besides 404 and 405.
 REFUSALS = (
@@ -241,3 +183,140 @@ def routed_path(scope: Scope) -> str:
     """Return the path without the prefix of a proxy."""
     path, prefix = scope["path"], scope.get("root_path", "")
     return path[len(prefix) :] if prefix and path.startswith(f"{prefix}/") else path
+
+
+# Client addresses share a fixed number of counters, which bounds memory. A collision only affects addresses that send
+# invalid keys.
+_ADDRESS_COUNTERS = 1024
+# Invalid API keys per minute of a client address; further ones get a 429. Valid keys are not affected.
+REFUSED_KEYS_PER_MINUTE = 60
+# Bytes of an answer that cost as much as a request.
+BYTES_PER_REQUEST = 256 * 1024
+
+
+class RateLimits:
+    """Rate limits over a sliding window; for one event loop."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
+        self._per_minute = settings.access.rate_per_minute
+        self._burst = settings.access.rate_burst
+        self._refused = RateLimitItemPerMinute(REFUSED_KEYS_PER_MINUTE, namespace="refused")
+
+    async def count(self, caller: Identity) -> None:
+        """Count a request."""
+        if self._burst:
+            await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), caller.id, "second")
+        if (limit := self._limit_of(caller)) is not None:
+            await self._count(limit, caller.id, "minute")
+
+    async def count_photographs(self, caller: Identity, photographs: int) -> None:
+        """Count each photograph of a request, which was counted once, as a request; all of them or none."""
+        limit = self._limit_of(caller)
+        if limit is None or photographs <= 1:
+            return
+        if photographs > limit.amount:
+            fault = f"is given {photographs} times; the rate limit is {limit.amount} per minute: send fewer"
+            raise InvalidRequestError([("photo", fault)])
+        await self._count(limit, caller.id, "minute", cost=photographs - 1)
+
+    async def charge(self, caller: Identity, sent_bytes: int) -> None:
+        """Count an answer as one more request per `BYTES_PER_REQUEST`, up to the limit."""
+        more, limit = sent_bytes // BYTES_PER_REQUEST, self._limit_of(caller)
+        if more and limit is not None:
+            _, left = await self._limiter.get_window_stats(limit, caller.id)
+            await self._limiter.hit(limit, caller.id, cost=min(more, left))
+
+    async def count_refused(self, client: str) -> None:
+        """Count an invalid key of a client address."""
+        if not await self._limiter.hit(self._refused, _counter_of(client)):
+            retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
+            raise TooManyRefusedKeysError(self._refused.amount, retry_after_s)
+
+    def _limit_of(self, caller: Identity) -> RateLimitItem | None:
+        per_minute = self._per_minute if caller.rate_per_minute is None else caller.rate_per_minute
+        return RateLimitItemPerMinute(per_minute, namespace="rate") if per_minute else None
+
+    async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:
+        if not await self._limiter.hit(limit, key_id, cost=cost):
+            raise RateLimitedError(limit.amount, period, await self._retry_after_s(limit, key_id))
+
+    async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
+        """Return the whole seconds until the count drops."""
+        freed_at_s, _ = await self._limiter.get_window_stats(limit, identifier)
+        return max(math.ceil(freed_at_s - time.time()), 1)
+
+
+def _counter_of(client: str) -> str:
+    """Return the counter of a client address; the hash is salted per process, so collisions cannot be planned."""
+    return str(hash(network_of(client)) % _ADDRESS_COUNTERS)
+
+
+_CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
+
+
+def is_local(server: tuple[str, int | None] | None) -> bool:
+    """Return True if only this machine can reach the server's local address.
+
+    Args:
+        server: local address: host and port, or path and None; None for a Unix socket.
+    """
+    if server is None or server[1] is None:
+        return True
+    try:
+        address = ipaddress.ip_address(server[0])
+    except ValueError:
+        return False
+    # A dual-stack socket reports 127.0.0.1 as an IPv4-mapped address.
+    mapped = getattr(address, "ipv4_mapped", None)
+    return (mapped or address).is_loopback
+
+
+def is_allowed_host(authority: str, allowed: Set[str] = frozenset()) -> bool:
+    """Return True if a host, with or without port, is loopback, `localhost` or in `allowed` (`*`: any)."""
+    try:
+        host = urlsplit(f"//{authority}").hostname or ""
+    except ValueError:
+        return False
+    return host == "localhost" or is_local((host, 0)) or host in allowed or "*" in allowed
+
+
+def check_origin(
+    method: str,
+    hosts: Sequence[str],
+    origins: Sequence[str],
+    allowed: Set[str] = frozenset(),
+    pages: Set[str] = frozenset(),
+) -> None:
+    """Refuse requests that a page of another site makes a browser send.
+
+    Args:
+        method: HTTP method.
+        hosts: values of `Host`, which browsers always send.
+        origins: values of `Origin`, which browsers send with changes.
+        allowed: allowed host names besides this machine's, `*` for any.
+        pages: allowed origins.
+    """
+    for host in hosts:
+        if not is_allowed_host(host, allowed):
+            raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)", host)
+    foreign = [origin for origin in origins if origin.lower() not in pages]
+    for origin in foreign if method in _CHANGING else ():
+        if not is_allowed_host(origin.partition("://")[2], allowed):
+            raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)", origin)
+
+
+def check_address(host: str, settings: Settings) -> None:
+    """Refuse to listen on a public address without keys.
+
+    Args:
+        host: numeric address to listen on; `published_on` in the settings takes precedence.
+        settings: settings of the service.
+    """
+    reached = settings.access.published_host or host
+    if not settings.access.api_keys and not settings.access.allow_anonymous and not is_local((reached, 0)):
+        raise ConfigError(
+            f"refusing to listen on {reached} without API keys: anyone on the network could read, change and delete "
+            "every floor plan. Set LALALOC_API_KEYS=on and create keys with `lalaloc-service keys create`, listen on "
+            "127.0.0.1, or, behind your own access control, set LALALOC_ALLOW_ANONYMOUS=on"
+        )

@@ -3,28 +3,48 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import uuid
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from time import monotonic
 from typing import Any, Self
 
+import numpy as np
 from sqlalchemy import Connection, func, select
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.query import DEFAULT_STD_M
+from service.capacity.bounded_cache import BoundedCache
+from service.plan_documents import PlanDocument
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
-from service.storage.plan_places import place_columns
 from service.storage.records import JSON, GridKey, NewPlan, Original, PlanRecord
 from service.storage.statements import damaged, read_chunks, write_all_chunks, write_chunks
 from service.storage.stored_bytes import ROW_BYTES, StoredBytes
 from service.storage.stored_grids import grid_bytes, insert_grid, insert_grids
 from service.storage.tables import FLOORPLANS, ORIGINAL_CHUNKS, REVISIONS
-from service.stored_plan import PlanDocument
 
 # Plans per statement, so that copies of their files and grids are few.
 _TOGETHER = 50
+
+
+def place_columns(plan: FloorPlan) -> dict[str, float | None]:
+    """Return the columns of a plan's place: the circle around it, and the circle's centre on Earth."""
+    x_min, y_min, x_max, y_max = (float(value) for value in plan.bounds_m)
+    x_m, y_m = 0.5 * (x_min + x_max), 0.5 * (y_min + y_max)
+    columns: dict[str, float | None] = {
+        "centre_x_m": x_m,
+        "centre_y_m": y_m,
+        "reach_m": 0.5 * math.dist((x_min, y_min), (x_max, y_max)),
+        "latitude": None,
+        "longitude": None,
+    }
+    if plan.anchor is not None:
+        ((longitude, latitude),) = plan.anchor.to_earth(np.array([[x_m, y_m]]))
+        columns |= {"latitude": float(latitude), "longitude": float(longitude)}
+    return columns
 
 
 @dataclass(frozen=True)
@@ -184,3 +204,52 @@ class Originals:
         own, place = ORIGINAL_CHUNKS.c.revision_id == revision_id, ORIGINAL_CHUNKS.c.number == number
         with self._database.reading() as connection:
             return connection.scalar(select(ORIGINAL_CHUNKS.c.content).where(own, place))
+
+
+class PlanCache:
+    """Plans by tenant and id, bounded in bytes; safe to share between threads."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        """Create an empty cache.
+
+        Args:
+            limit_bytes: approximate memory limit; 0 keeps no plans.
+        """
+        self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
+            limit_bytes, lambda entry: plan_bytes(entry[0].plan) + len(entry[0].report or "")
+        )
+
+    def put(self, record: PlanRecord) -> None:
+        """Keep a plan at its current revision, as of now."""
+        self._records.put((record.tenant, record.id), (record, monotonic()))
+
+    def put_unread(self, record: PlanRecord) -> None:
+        """Keep one of many new plans; see `BoundedCache.put_unread`."""
+        self._records.put_unread((record.tenant, record.id), (record, monotonic()))
+
+    def get(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
+        """Return a plan if it is in memory at this revision."""
+        entry = self._records.get((tenant, plan_id))
+        return None if entry is None or entry[0].revision_id != revision_id else entry[0]
+
+    def recent(self, tenant: str, plan_id: str, max_age_s: float) -> PlanRecord | None:
+        """Return a plan that was read or stored within `max_age_s` (s)."""
+        entry = self._records.get((tenant, plan_id))
+        return None if entry is None or monotonic() - entry[1] > max_age_s else entry[0]
+
+    def revisions(self) -> set[str]:
+        """Return the revisions in memory."""
+        return {record.revision_id for _, (record, _) in self._records.items()}
+
+    def forget(self, tenant: str, plan_id: str) -> None:
+        """Drop a deleted plan."""
+        self._records.drop(lambda key, _: key == (tenant, plan_id))
+
+    def forget_revisions(self, revision_ids: set[str]) -> None:
+        """Drop plans at deleted revisions."""
+        self._records.drop(lambda _, entry: entry[0].revision_id in revision_ids)
+
+
+def plan_bytes(plan: FloorPlan) -> int:
+    """Estimate the memory of a plan: its walls as arrays, and its corners three times."""
+    return plan.wall_table.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)

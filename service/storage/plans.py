@@ -12,10 +12,11 @@ from sqlalchemy import ColumnElement, Connection, Row, delete, func, select, tru
 from lalaloc_core.floorplan import FloorPlan
 from service.capacity.bounded_cache import SingleFlight
 from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.plan_documents import PlanDocument, StoredPlan
 from service.storage.album_rows import delete_albums
 from service.storage.database import Database
-from service.storage.plan_cache import PlanCache
 from service.storage.plan_rows import (
+    PlanCache,
     PlanContent,
     count_plans,
     insert_plan,
@@ -28,7 +29,6 @@ from service.storage.statements import damaged, lock_plan_of, newest_first, sele
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import ALBUMS, FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
 from service.storage.venue_rows import remove_from_venues
-from service.stored_plan import PlanDocument, StoredPlan
 
 # Ids per statement.
 _BATCH_SIZE = 500

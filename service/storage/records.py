@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.match import PoseGrid
+from service.plan_documents import PlanDocument, PlanHead
 from service.storage.grid_format import SortedPrototypes
-from service.stored_plan import PlanDocument, PlanHead
 
 # Tenant of all callers without API keys.
 DEFAULT_TENANT = "default"

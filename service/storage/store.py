@@ -26,8 +26,7 @@ from service.storage.api_keys import ApiKeys, TenantLimits, Tenants
 from service.storage.audit_log import AuditLog
 from service.storage.database import CircuitBreaker, Database, State
 from service.storage.kept_answers import MIN_LEASE_S, IdempotencyKeys, KeptAnswers
-from service.storage.plan_cache import PlanCache
-from service.storage.plan_rows import Originals
+from service.storage.plan_rows import Originals, PlanCache
 from service.storage.plans import Plans
 from service.storage.records import PlanRecord
 from service.storage.sessions import Sessions

@@ -12,8 +12,7 @@ from sqlalchemy import Connection, select, update
 
 from service.errors import TooManyFloorPlansError, UnknownVenueError
 from service.storage.database import Database
-from service.storage.plan_cache import PlanCache
-from service.storage.plan_rows import PlanContent, count_plans, insert_plans, new_record
+from service.storage.plan_rows import PlanCache, PlanContent, count_plans, insert_plans, new_record
 from service.storage.records import NewPlan, PlanRecord, VenueMember, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS, VENUES

@@ -13,12 +13,11 @@ from sqlalchemy import Row
 
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.localise.query import HintName, Hints, NearInEach, log_factor, rooms_named
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HintFields
-from service.storage.plan_places import distances_m
 
 # Maximum number of levels that an error message lists.
 _MAX_LEVELS_LISTED = 20
@@ -212,3 +211,30 @@ def _rooms_called(name: str, plans: Sequence[FloorPlan], partly: bool) -> list[t
             "rooms", f"none of the {len(plans)} floor plans that are searched has a room '{name:.50}'"
         )
     return found
+
+
+def distances_m(
+    rows: Sequence[Any], venue_anchor: Anchor | None, latitude: float, longitude: float
+) -> Float[np.ndarray, "n"]:
+    """Return the distances (m) from a place to the circles around plans, 0 inside; NaN for plans with an unknown place.
+
+    Args:
+        rows: rows with `centre_x_m`, `centre_y_m`, `reach_m`, `latitude` and `longitude`.
+        venue_anchor: anchor of plans without their own.
+        latitude: latitude (degrees) of the place.
+        longitude: longitude (degrees) of the place.
+    """
+    lon_lat = np.array([[_number(row.longitude), _number(row.latitude)] for row in rows]).reshape(-1, 2)
+    centre = np.array([[_number(row.centre_x_m), _number(row.centre_y_m)] for row in rows]).reshape(-1, 2)
+    unknown = np.isnan(lon_lat[:, 0])
+    if venue_anchor is not None and unknown.any():
+        lon_lat[unknown] = venue_anchor.to_earth(centre[unknown])
+    away = LocalFrame(longitude, latitude).to_local(lon_lat)
+    reach = np.array([_number(row.reach_m) for row in rows])
+    # The projection returns NaN beyond its range, which means infinitely far.
+    distance = np.where(np.isnan(lon_lat[:, 0]), np.nan, np.hypot(away[:, 0], away[:, 1]))
+    return np.maximum(distance - reach, 0.0)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

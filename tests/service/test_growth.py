@@ -15,7 +15,7 @@ from service.http.idempotent_request import _key_of
 from service.http.representations import expected_revision
 from service.http.uploads import UploadLimits, read_parts
 from service.routes.dependencies import parse_cursor
-from service.security.exposure import is_allowed_host
+from service.security.access_control import is_allowed_host
 from service.security.keys import parse_authorization
 from service.telemetry.logs import parse_traceparent
 from tests.growth import assert_no_worse_than_linear

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan, json_values
+from service.plan_documents import LARGE, PackedPlan, PlanDocument
 from service.plan_files.converter import Converter
 from service.settings import Settings
-from service.stored_plan import LARGE, PackedPlan, PlanDocument
 from service.telemetry import Telemetry
 from tests.service.conftest import StartApp, tiled_plan
 

@@ -10,7 +10,7 @@ import pytest
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.query.geopose import geopose_at
-from service.storage.plan_places import distances_m
+from service.venues.venue_hints import distances_m
 from tests.core.test_earth import PLACES
 
 GEOD = pyproj.Geod(ellps="WGS84")

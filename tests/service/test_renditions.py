@@ -21,6 +21,7 @@ from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
 from service.errors import OverloadedError
+from service.plan_documents import Rendition, RenditionJob, RenditionKind
 from service.plan_files import rendition_cache
 from service.plan_files.converter import Converter
 from service.plan_files.plan_mesh import plan_glb
@@ -29,7 +30,6 @@ from service.plan_files.renditions import plan_layout
 from service.settings import Settings
 from service.storage import Store
 from service.storage.records import NewPlan, Original
-from service.stored_plan import Rendition, RenditionJob, RenditionKind
 from service.telemetry import Telemetry
 from tests.growth import assert_no_worse_than_linear
 from tests.service.conftest import FLAT, StartApp, assert_problem, tiled_plan, upload

@@ -27,8 +27,7 @@ from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.errors import StoreBusyError, StoreUnavailableError, TooManyRefusedKeysError
 from service.security import access_control
-from service.security.access_control import RateLimits
-from service.security.exposure import check_address, is_local
+from service.security.access_control import RateLimits, check_address, is_local
 from service.security.keys import KeyCache, PresentedKey, hash_of, key_text, new_secret, parse_authorization
 from service.security.permissions import NEEDED, OPEN_PATHS, PAGES, Permission
 from service.settings import Settings

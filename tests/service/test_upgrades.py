@@ -17,7 +17,7 @@ from alembic.operations import Operations
 from alembic.script import ScriptDirectory
 
 from service.storage import Store, migrations
-from service.storage.plan_places import place_columns
+from service.storage.plan_rows import place_columns
 from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import FLOORPLANS, METADATA, ORIGINAL_CHUNKS, REVISIONS
 from tests.service.conftest import StartApp, localise, upload, wait_for

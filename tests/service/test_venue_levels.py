@@ -19,7 +19,7 @@ from benchmarks.large_venues import random_home
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import UnknownVenueError
 from service.storage.database import Database
-from service.storage.plan_cache import plan_bytes
+from service.storage.plan_rows import plan_bytes
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
 from tests.importers.conftest import zip_file

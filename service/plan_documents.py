@@ -1,4 +1,7 @@
-"""Stored plans before they are parsed, and the files made from them; light, because worker processes import it."""
+"""Documents of plans between store, service and worker processes: stored plans before they are parsed, files from them.
+
+Light, because worker processes import it.
+"""
 
 from __future__ import annotations
 
