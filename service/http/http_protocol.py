@@ -1,18 +1,33 @@
-"""HTTP/1.1 protocol that bounds connections, heads of requests, events, and bodies of refused requests."""
+"""HTTP/1.1 protocol that bounds connections, heads of requests, events, and bodies of refused requests.
+
+Events cost more than bytes: one read of 256 KiB can hold 40,000 chunks of a body, and parsing them at once would keep
+the event loop from all other connections. So a connection parses a bounded number of events at a time.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 from collections.abc import Callable
-from time import monotonic
+from time import monotonic, thread_time
 from typing import Any
 
 import h11
 from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.h11_impl import STATUS_PHRASES, H11Protocol
 
-from service.http.paced_parsing import Pace, PacedParser, ParsingAccount
+from service.capacity.cpu_accounts import CpuAccounts
+from service.security.permissions import client_of
+
+# Events of one connection in a turn of the event loop.
+EVENTS_PER_TURN = 64
+# Time (s) per event of connections that have more than that, of all of them together: a few percent of the loop.
+_EVENT_S = 2e-4
+# CPU time (s) of parsing that is charged at once; a client is active when it is charged, which one request is not for.
+_CHARGED_S = 1e-3
+# Unparsed bytes of a connection: that of a few reads, which can arrive although reading is paused.
+_MAX_WAITING_BYTES = 2**20
+
 
 # Heads of requests, and their lines; larger ones get a 431.
 MAX_HEAD_BYTES, _MAX_HEADERS = 16 * 1024, 100
@@ -27,6 +42,125 @@ _PENALTY_S, _MAX_PENALTY_S = 0.01, 0.5
 # Time (s) per byte at which bodies of refused requests arrive, of all connections together. They are dropped, so that
 # clients read the refusal; at the speed of a local network they would occupy the event loop.
 _DROPPING_S = 5e-9
+
+
+class Pace:
+    """Pace of bytes or events that arrive on several connections."""
+
+    def __init__(self, each_s: float) -> None:
+        self._each_s = each_s
+        self._free_at = 0.0
+
+    def wait_s(self, count: int) -> float:
+        """Return the time (s) until more may arrive on a connection, after the next `count`."""
+        now = monotonic()
+        self._free_at = max(self._free_at, now) + count * self._each_s
+        return self._free_at - now
+
+
+EVENTS = Pace(_EVENT_S)
+
+
+class PacedParser:
+    """Feeder of a protocol's parser.
+
+    Attributes:
+        events_left: events that may be handled in this turn of the event loop.
+    """
+
+    def __init__(
+        self,
+        transport: asyncio.Transport,
+        parse: Callable[[bytes], None],
+        piece_bytes: int,
+        may_read: Callable[[], bool],
+        spent: Callable[[float], None],
+    ) -> None:
+        """Create a feeder.
+
+        Args:
+            transport: of the connection; it is not read while bytes wait.
+            parse: handles a piece; an empty one handles what the parser holds already.
+            piece_bytes: maximum size of a piece. A piece is parsed as a whole if the parser does not count its events.
+            may_read: tells whether the protocol itself wants more bytes.
+            spent: receives the CPU time (s) of each turn.
+        """
+        self.events_left = EVENTS_PER_TURN
+        self._transport = transport
+        self._parse = parse
+        self._piece_bytes = piece_bytes
+        self._may_read = may_read
+        self._spent = spent
+        self._waiting = bytearray()
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_blocked = False
+
+    @property
+    def held(self) -> bool:
+        """True while bytes wait, so that nothing may be read."""
+        return self._timer is not None or self._is_blocked
+
+    def feed(self, data: bytes) -> None:
+        """Parse bytes, now or later."""
+        self._waiting += data
+        if not self.held:
+            self._run()
+        elif len(self._waiting) > _MAX_WAITING_BYTES:
+            self._transport.abort()
+        else:
+            self._transport.pause_reading()
+
+    def block(self) -> None:
+        """Parse nothing until `unblock`."""
+        self._is_blocked = True
+        self._transport.pause_reading()
+
+    def unblock(self) -> None:
+        """Go on."""
+        self._is_blocked = False
+        if self._timer is None:
+            self._go_on()
+
+    def settle(self) -> None:
+        """Go on in a later turn if the events of this one are used up."""
+        if self._transport.is_closing():
+            self.close()
+        elif self.events_left <= 0 and self._timer is None:
+            self._transport.pause_reading()
+            loop = asyncio.get_running_loop()
+            self._timer = loop.call_later(EVENTS.wait_s(EVENTS_PER_TURN), self._go_on)
+
+    def close(self) -> None:
+        """Drop what waits."""
+        self._waiting.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def resume(self) -> None:
+        """Read from the connection again if it is time."""
+        if not self.held and self._may_read() and not self._transport.is_closing():
+            self._transport.resume_reading()
+
+    def _run(self) -> None:
+        self.events_left = EVENTS_PER_TURN
+        begin_s = thread_time()
+        self._parse(self._take())
+        while self._waiting and self.events_left > 0 and not self._is_blocked and not self._transport.is_closing():
+            self._parse(self._take())
+        self._spent(thread_time() - begin_s)
+        self.settle()
+
+    def _go_on(self) -> None:
+        self._timer = None
+        if not self._is_blocked:
+            self._run()
+            self.resume()
+
+    def _take(self) -> bytes:
+        piece = bytes(self._waiting[: self._piece_bytes])
+        del self._waiting[: self._piece_bytes]
+        return piece
 
 
 class _RefusedError(h11.RemoteProtocolError):
@@ -159,16 +293,15 @@ class _BoundedProtocol(H11Protocol):
     _bounds: _Bounds
     _limit: asyncio.TimerHandle | None = None
     _pause: asyncio.TimerHandle | None = None
-    _idle_since = 0.0
+    _idle_since = _owed_s = 0.0
     _parser: PacedParser
     conn: _CountedConnection
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)
         self.conn = _CountedConnection(lambda: self._parser)
-        account = ParsingAccount(self.config.app, lambda: self.scope, self._address)
         self._parser = PacedParser(
-            transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused, account.add
+            transport, self._parse, MAX_HEAD_BYTES, lambda: not self.flow.read_paused, self._charge
         )
         self.flow = _Flow(transport, self._parser)
         _send_at_once(transport)
@@ -176,7 +309,7 @@ class _BoundedProtocol(H11Protocol):
         self._make_room()
         self._watch()
         if (penalty_s := self._bounds.penalty_s(self._address)) > 0.0:
-            self._parser.block("penalty")
+            self._parser.block()
             self.loop.call_later(penalty_s, self._end_penalty)
 
     def data_received(self, data: bytes) -> None:
@@ -231,7 +364,17 @@ class _BoundedProtocol(H11Protocol):
 
     def _end_penalty(self) -> None:
         if not self.transport.is_closing():
-            self._parser.unblock("penalty")
+            self._parser.unblock()
+
+    def _charge(self, cpu_s: float) -> None:
+        """Charge CPU time (s) of parsing to the client of the last request, or the address if it was not accepted."""
+        self._owed_s += cpu_s
+        # An app without its lifespan has no accounts.
+        admission = getattr(getattr(self.config.app, "state", None), "admission", None)
+        if self._owed_s >= _CHARGED_S and admission is not None:
+            accounts: CpuAccounts = admission.cpu_accounts
+            accounts.charge(client_of(self.scope or {}, self._address), self._owed_s, rests=True)
+            self._owed_s = 0.0
 
     def _parse(self, piece: bytes) -> None:
         if piece:

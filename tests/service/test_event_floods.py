@@ -16,9 +16,8 @@ import pytest
 from fastapi import FastAPI, Request
 
 from service.capacity.cpu_accounts import CpuAccounts
-from service.http import http_protocol, paced_parsing
-from service.http.http_protocol import MAX_HEAD_BYTES
-from service.http.paced_parsing import EVENTS_PER_TURN, PacedParser
+from service.http import http_protocol
+from service.http.http_protocol import EVENTS_PER_TURN, MAX_HEAD_BYTES, PacedParser
 from service.security.permissions import Caller, put_caller
 from service.settings import Settings
 from tests.service.test_server import served
@@ -87,7 +86,7 @@ class _Transport(asyncio.Transport):
 
 
 def test_turn_of_the_loop_handles_a_bounded_number_of_events(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paced_parsing, "EVENTS", paced_parsing.Pace(0.0))
+    monkeypatch.setattr(http_protocol, "EVENTS", http_protocol.Pace(0.0))
 
     async def parse_all() -> list[bytes]:
         turns: list[bytes] = [b""]
@@ -216,7 +215,7 @@ def charged(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, CpuAccounts]
     app, admission = _app(), _Admission()
     app.state.admission = admission
     clock = itertools.count()
-    monkeypatch.setattr(paced_parsing, "thread_time", lambda: float(next(clock)))
+    monkeypatch.setattr(http_protocol, "thread_time", lambda: float(next(clock)))
 
     @app.post("/keyed")
     async def keyed(request: Request) -> int:
