@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-# Client of health checks and metrics, which is never active: it leaves all permits to tenants.
+# Client of health checks and metrics, which is never active: it leaves all cores to tenants.
 PROBES = "(probes)"
 # CPU time counts half after this time, so that a client that used much is served last for some tens of seconds.
 _HALF_LIFE_S = 10.0
@@ -38,6 +38,9 @@ class _Account:
 
     def recent_at(self, now: float) -> float:
         return self.recent_s * 0.5 ** ((now - self.charged_at) / _HALF_LIFE_S)
+
+
+_NOTHING = _Account()
 
 
 class CpuAccounts:
@@ -81,8 +84,7 @@ class CpuAccounts:
 
     def refused_rest_s(self, client: str) -> float:
         """Return how long (s) queries of a client must rest now because others of it were refused."""
-        account = self._accounts.get(client)
-        return 0.0 if account is None else max(account.refused_until - self._clock(), 0.0)
+        return max(self._accounts.get(client, _NOTHING).refused_until - self._clock(), 0.0)
 
     @contextmanager
     def charged(self, client: str, *, rests: bool = False) -> Iterator[None]:
@@ -125,8 +127,7 @@ class CpuAccounts:
 
     def recent_s(self, client: str) -> float:
         """Return the CPU time (s) that a client used lately, by its weight."""
-        account = self._accounts.get(client)
-        return 0.0 if account is None else account.recent_at(self._clock()) / self.share(client)
+        return self._accounts.get(client, _NOTHING).recent_at(self._clock()) / self.share(client)
 
     def active(self) -> set[str]:
         """Return the clients that used CPU time within the last second."""
@@ -155,8 +156,7 @@ class CpuAccounts:
 
     def total_s(self, client: str) -> float:
         """Return all CPU time (s) that a client used since the start."""
-        account = self._accounts.get(client)
-        return 0.0 if account is None else account.total_s
+        return self._accounts.get(client, _NOTHING).total_s
 
     def totals(self) -> dict[str, float]:
         """Return `total_s` of every client."""

@@ -89,10 +89,9 @@ class FairQueue(Generic[T]):
     def __init__(self, accounts: CpuAccounts) -> None:
         self._accounts = accounts
         self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
-        self._length = 0
 
     def __len__(self) -> int:
-        return self._length
+        return sum(map(len, self._waiting.values()))
 
     def clients(self) -> Set[str]:
         """Return the clients with items."""
@@ -101,13 +100,11 @@ class FairQueue(Generic[T]):
     def append(self, client: str, item: T) -> None:
         """Append an item of a client."""
         self._waiting.setdefault(client, deque()).append(item)
-        self._length += 1
 
     def append_first(self, client: str, item: T) -> None:
         """Put an item before all others of its client, and the client before its equals."""
         self._waiting.setdefault(client, deque()).appendleft(item)
         self._waiting.move_to_end(client, last=False)
-        self._length += 1
 
     def take(self, may_take: Callable[[str], bool] = lambda _client: True) -> tuple[str, T] | None:
         """Remove and return the next item of the clients that `may_take` accepts; None if there is none."""
@@ -116,7 +113,6 @@ class FairQueue(Generic[T]):
         if client is None:
             return None
         item = self._waiting[client].popleft()
-        self._length -= 1
         self._waiting.move_to_end(client)
         if not self._waiting[client]:
             del self._waiting[client]
@@ -126,13 +122,13 @@ class FairQueue(Generic[T]):
         """Remove and return the items that `unwanted` selects."""
         dropped: list[T] = []
         for client, items in list(self._waiting.items()):
-            gone = [item for item in items if unwanted(item)]
-            if len(gone) == len(items):
+            kept = deque[T]()
+            for item in items:
+                (dropped if unwanted(item) else kept).append(item)
+            if kept:
+                self._waiting[client] = kept
+            else:
                 del self._waiting[client]
-            elif gone:
-                self._waiting[client] = deque(item for item in items if item not in gone)
-            dropped += gone
-        self._length -= len(dropped)
         return dropped
 
 

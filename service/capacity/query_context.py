@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from time import monotonic
 from typing import Self
 
@@ -34,13 +35,9 @@ class QueryContext:
 
     @classmethod
     def starting(cls, client: str, limit_s: float, clock: StageClock | None = None, *, spent_s: float = 0.0) -> Self:
-        """Return the context of a query that is complete now.
+        """Return the context of a query that was complete `spent_s` (s) ago, with a time limit (s) from then.
 
-        Args:
-            client: see the attribute.
-            limit_s: time limit (s) from the end of the upload.
-            clock: the clock that timed the upload; None for a new one.
-            spent_s: time (s) since the end of the upload.
+        `clock` timed its upload; None: a new one.
         """
         begin = monotonic() - spent_s
         return cls(client=client, begin=begin, deadline=begin + limit_s, clock=clock or StageClock())
@@ -77,9 +74,5 @@ class QueryContext:
         except TimeoutError as error:
             raise DeadlineExceededError(self.limit_s) from error
 
-    def __reduce__(self) -> tuple[Callable[..., QueryContext], tuple[str, float, float]]:
-        return _received, (self.client, self.deadline - self.begin, self.spent_s)
-
-
-def _received(client: str, limit_s: float, spent_s: float) -> QueryContext:
-    return QueryContext.starting(client, limit_s, spent_s=spent_s)
+    def __reduce__(self) -> tuple[Callable[..., QueryContext], tuple[str, float]]:
+        return partial(QueryContext.starting, spent_s=self.spent_s), (self.client, self.limit_s)

@@ -133,7 +133,6 @@ class BoundedReads:
             raise StoreUnavailableError()
         begun = asyncio.ensure_future(self._threads.run(tenant, work, *args, **kwargs))
         self._begun.add(begun)
-        # The callback also retrieves errors after the timeout.
         begun.add_done_callback(self._end)
         done, _ = await asyncio.wait({begun}, timeout=self._wait_s)
         if not done:
@@ -149,6 +148,7 @@ class BoundedReads:
         self._threads.close(wait=False)
 
     def _end(self, done: asyncio.Future[Any]) -> None:
+        # The result is also taken after a timeout.
         self._begun.discard(done)
         if not done.cancelled():
             done.exception()
