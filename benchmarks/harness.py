@@ -40,7 +40,7 @@ _KINDS = ("lpo", "vdr", _REFUSED)
 # A position error above this is a wrong answer: the example photographs are located to a few centimetres.
 _MAX_ERROR_M = 0.5
 # Settings under which no request of a throughput test is refused.
-UNLIMITED = {"LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
+UNLIMITED = {"LALALOC_MAX_QUERIES": "64"}
 
 
 def argument_parser(doc: str | None) -> argparse.ArgumentParser:

@@ -134,7 +134,7 @@ def _ray_service(nodes: int) -> Iterator[tuple[str, Callable[[], None]]]:
         port = _free_port()
         serve.start(http_options={"host": "127.0.0.1", "port": port})
         with tempfile.TemporaryDirectory() as data:
-            settings = Settings(data_dir=Path(data), log_level="error", max_queries=64, lpo_queue=64)
+            settings = Settings(data_dir=Path(data), log_level="error", max_queries=64)
             replicas = {f"{name}_{end}": nodes for name in ("encoder", "search", "lpo") for end in ("min", "max")}
             serve.run(application(settings, RayOptions(ingress_max=1, **replicas)))
             yield f"http://127.0.0.1:{port}", lambda: cluster.remove_node(others[-1], allow_graceful=False)

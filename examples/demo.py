@@ -29,13 +29,7 @@ from lalaloc_core.draw.canvas import MUTED, document, image, pixels, words
 _PLAN_TIMEOUT_S = 120.0
 # Long timeouts prevent a fallback to a coarser stage on a busy machine. Messages of the log would interrupt the table,
 # and that a new database is empty is no news here.
-_DEFAULTS = {
-    "LALALOC_LPO_DEADLINE_S": "30",
-    "LALALOC_LPO_STALL_S": "60",
-    "LALALOC_DECODE_STALL_S": "60",
-    "LALALOC_REQUEST_DEADLINE_S": "60",
-    "LALALOC_LOG_LEVEL": "error",
-}
+_DEFAULTS = {"LALALOC_LPO_DEADLINE_S": "30", "LALALOC_REQUEST_DEADLINE_S": "60", "LALALOC_LOG_LEVEL": "error"}
 
 # Size of a panel: width of its picture, height of its heading, and gap between panels.
 _WIDTH, _HEAD, _GAP = 1000, 96, 30

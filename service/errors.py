@@ -103,7 +103,7 @@ class TooManySessionsError(ServiceError):
     """The tenant's quota of sessions is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} sessions are open; the limit is {limit} (LALALOC_MAX_SESSIONS): delete some")
+        super().__init__(f"{limit} sessions are open; the limit is {limit} (max_sessions): delete some")
 
 
 class UnknownAlbumError(ServiceError):
@@ -144,7 +144,7 @@ class TooManyAlbumsError(ServiceError):
     """The tenant's quota of albums is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} albums is reached (LALALOC_MAX_ALBUMS); delete one")
+        super().__init__(f"the limit of {limit} albums is reached (max_albums); delete one")
 
 
 class TooManyPhotographsError(ServiceError):
@@ -152,7 +152,7 @@ class TooManyPhotographsError(ServiceError):
 
     def __init__(self, album_id: str, limit: int) -> None:
         super().__init__(
-            f"album '{album_id}' has {limit} photographs; the limit is {limit} (LALALOC_MAX_ALBUM_PHOTOGRAPHS): create "
+            f"album '{album_id}' has {limit} photographs; the limit is {limit} (max_album_photographs): create "
             "another album for the rest"
         )
 
@@ -255,7 +255,7 @@ class TooManyVenuesError(ServiceError):
     """The tenant's quota of venues is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} stored venues is reached (LALALOC_MAX_VENUES); delete one")
+        super().__init__(f"the limit of {limit} stored venues is reached (max_venues); delete one")
 
 
 class StorageQuotaError(ServiceError):
@@ -354,7 +354,7 @@ class SpoolFullError(ServiceError):
 
     def __init__(self, memory_bytes: int) -> None:
         super().__init__(
-            f"an upload of more than {memory_bytes} bytes (LALALOC_UPLOAD_MEMORY_BYTES) could not be written to a "
+            f"an upload of more than {memory_bytes} bytes (upload_memory_bytes) could not be written to a "
             "temporary file: the disk is full or read-only (TMPDIR)"
         )
 

@@ -372,7 +372,7 @@ def test_autoscaler_uses_an_existing_metric() -> None:
     assert f"\n{metric} " in telemetry.render().decode()
     # The autoscaler adds pods before the running pods refuse requests.
     cores = int(CONTAINER["resources"]["limits"]["cpu"])
-    shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
+    shares = share_cores(cores, workers=None, compute_threads=0, onnx_threads=0)
     assert shares.compute_threads == cores
     assert int(by_requests["pods"]["target"]["averageValue"]) < 2 * (shares.workers + shares.compute_threads)
 

@@ -94,7 +94,7 @@ def _check_digits(structure: str) -> None:
 class PlanLimits:
     """Limits of a floor plan; a plan outside them is refused with an error that names value and limit.
 
-    Errors name the service's setting (`LALALOC_MAX_ROOMS`) if there is one; in Python, pass a `PlanLimits` instead.
+    Errors name the service's setting (`max_rooms`) if there is one; in Python, pass a `PlanLimits` instead.
     A room's vertices are those of its outline and holes, plus one per free-standing wall; `max_plan_vertices` counts
     all rooms. `max_depth` limits the nesting of objects and lists.
     """

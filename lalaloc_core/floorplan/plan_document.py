@@ -48,13 +48,11 @@ def read_rooms(raw_rooms: Any, default_ceiling_m: float | None, limits: PlanLimi
     if not isinstance(raw_rooms, list) or not raw_rooms:
         raise InvalidFloorPlanError("'rooms' must be a list of at least one room")
     if len(raw_rooms) > limits.max_rooms:
-        raise InvalidFloorPlanError(
-            f"the plan has {len(raw_rooms)} rooms; the limit is {limits.max_rooms} (LALALOC_MAX_ROOMS)"
-        )
+        raise InvalidFloorPlanError(f"the plan has {len(raw_rooms)} rooms; the limit is {limits.max_rooms} (max_rooms)")
     vertices = sum(_count_vertices(raw) for raw in raw_rooms if isinstance(raw, Mapping))
     if vertices > limits.max_plan_vertices:
         raise InvalidFloorPlanError(
-            f"the plan has {vertices} vertices; the limit is {limits.max_plan_vertices} (LALALOC_MAX_PLAN_VERTICES)"
+            f"the plan has {vertices} vertices; the limit is {limits.max_plan_vertices} (max_plan_vertices)"
         )
     rooms = [_read_room(raw, f"room {i + 1}", default_ceiling_m, limits) for i, raw in enumerate(raw_rooms)]
     return tuple(replace(room, id=key) for room, key in zip(rooms, _unique_ids(rooms), strict=True))
@@ -94,8 +92,7 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     height_m = usual_m if ceiling is None else read_ceiling(ceiling, name, limits)
     if (vertices := _count_vertices(raw)) > limits.max_vertices_per_room:
         raise InvalidFloorPlanError(
-            f"{vertices} vertices; the limit is {limits.max_vertices_per_room} (LALALOC_MAX_VERTICES); simplify its "
-            "outline",
+            f"{vertices} vertices; the limit is {limits.max_vertices_per_room} (max_vertices); simplify its outline",
             room=name,
         )
     outline_m = _read_ring(raw.get("polygon"), "polygon", name, limits)
@@ -155,7 +152,7 @@ def _is_collinear(ring: Float[np.ndarray, "n 2"]) -> bool:
 def _read_holes(
     raw: Any, outline_m: Float[np.ndarray, "n 2"], room: str, limits: PlanLimits
 ) -> tuple[Float[np.ndarray, "_ 2"], ...]:
-    holes = read_list([] if raw is None else raw, "holes", limits.max_vertices_per_room, "LALALOC_MAX_VERTICES", room)
+    holes = read_list([] if raw is None else raw, "holes", limits.max_vertices_per_room, "max_vertices", room)
     rings = tuple(_read_ring(hole, f"hole {i}", room, limits, is_hole=True) for i, hole in enumerate(holes))
     outline = shapely.Polygon(outline_m)
     shapely.prepare(outline)
@@ -168,7 +165,7 @@ def _read_holes(
 
 
 def _read_walls(raw: Any, shape: shapely.Polygon, room: str, limits: PlanLimits) -> Float[np.ndarray, "k 4"]:
-    walls = read_list([] if raw is None else raw, "walls", limits.max_vertices_per_room, "LALALOC_MAX_VERTICES", room)
+    walls = read_list([] if raw is None else raw, "walls", limits.max_vertices_per_room, "max_vertices", room)
     if not walls:
         return frozen(np.empty((0, 4)))
     points = np.stack([read_segment(wall, f"wall {index}", limits, room) for index, wall in enumerate(walls)])
@@ -205,7 +202,7 @@ def _unique_ids(rooms: Sequence[Room]) -> list[str]:
 
 def read_openings(raw: Any, rooms: Sequence[Room], limits: PlanLimits) -> tuple[Opening, ...]:
     """Read the openings of a plan with these rooms."""
-    entries = read_list([] if raw is None else raw, "openings", limits.max_openings, "LALALOC_MAX_OPENINGS")
+    entries = read_list([] if raw is None else raw, "openings", limits.max_openings, "max_openings")
     ids = {room.id for room in rooms}
     return tuple(_read_opening(entry, f"opening {index}", ids, limits) for index, entry in enumerate(entries))
 
@@ -308,7 +305,7 @@ class FixturePlaces:
 
 def read_fixtures(raw: Any, limits: PlanLimits) -> tuple[Fixture, ...]:
     """Read the fixtures of a plan."""
-    entries = read_list([] if raw is None else raw, "fixtures", limits.max_openings, "LALALOC_MAX_OPENINGS")
+    entries = read_list([] if raw is None else raw, "fixtures", limits.max_openings, "max_openings")
     vertices = 0
     fixtures = []
     for index, entry in enumerate(entries):
@@ -316,7 +313,7 @@ def read_fixtures(raw: Any, limits: PlanLimits) -> tuple[Fixture, ...]:
         vertices += len(fixtures[-1].outline_m)
         if vertices > limits.max_plan_vertices:
             raise InvalidFloorPlanError(
-                f"the fixtures have more than {limits.max_plan_vertices} vertices (LALALOC_MAX_PLAN_VERTICES); "
+                f"the fixtures have more than {limits.max_plan_vertices} vertices (max_plan_vertices); "
                 "simplify their outlines"
             )
     return tuple(fixtures)
@@ -327,7 +324,7 @@ def _read_fixture(raw: Any, where: str, limits: PlanLimits) -> Fixture:
         raise InvalidFloorPlanError(f"{where} must be an object, not {json_kind(raw)}")
     check_keys(raw, _KEYS, where=f"{where}: ")
     kind = read_choice(raw.get("kind"), FIXTURE_KINDS, f"{where}: the kind")
-    outline = read_list(raw.get("outline"), f"{where}: outline", limits.max_vertices_per_room, "LALALOC_MAX_VERTICES")
+    outline = read_list(raw.get("outline"), f"{where}: outline", limits.max_vertices_per_room, "max_vertices")
     if len(outline) < 3:
         raise InvalidFloorPlanError(f"{where}: outline has {len(outline)} vertices; it must have at least 3")
     outline_m = read_points(outline, limits, None, f"{where}: vertex")

@@ -178,20 +178,20 @@ def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
     extent = float(np.ptp(corners, axis=0).max())
     if extent > limits.max_extent_m:
         raise InvalidFloorPlanError(
-            f"the plan is {extent:.6g} m across; the limit is {limits.max_extent_m:g} m (LALALOC_MAX_EXTENT_M); "
+            f"the plan is {extent:.6g} m across; the limit is {limits.max_extent_m:g} m (max_extent_m); "
             "check that the coordinates are in metres"
         )
     area_m2 = sum(room.area_m2 for room in rooms)
     if area_m2 > limits.max_area_m2:
         raise InvalidFloorPlanError(
-            f"the floor area is {area_m2:.6g} m²; the limit is {limits.max_area_m2:g} m² (LALALOC_MAX_AREA_M2); "
+            f"the floor area is {area_m2:.6g} m²; the limit is {limits.max_area_m2:g} m² (max_area_m2); "
             "check that the coordinates are in metres"
         )
     boxes_m2 = sum(float(np.prod(np.ptp(room.polygon_m, axis=0))) for room in rooms)
     if boxes_m2 > limits.max_bounds_area_m2:
         raise InvalidFloorPlanError(
             f"the bounding boxes of all rooms cover {boxes_m2:.6g} m²; the limit is {limits.max_bounds_area_m2:g} m² "
-            "(LALALOC_MAX_BOUNDS_AREA_M2)"
+            "(max_bounds_area_m2)"
         )
 
 

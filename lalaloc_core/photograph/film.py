@@ -250,7 +250,7 @@ def _sampled(content: bytes, tracker: FlowTracker, limits: FilmLimits) -> _Sampl
             if process_time() - begin > limits.max_cpu_s:
                 raise InvalidFilmError(
                     f"decoding took more than {limits.max_cpu_s:g} s of CPU time for the first {time_s:.1f} s of the "
-                    "film, the limit (LALALOC_MAX_FILM_CPU_S): send a film with fewer pixels, or a shorter one"
+                    "film, the limit (max_film_cpu_s): send a film with fewer pixels, or a shorter one"
                 )
             if time_s + _TIME_ROUNDED_S < next_s:
                 samples.dropped["between samples"] += 1
@@ -337,7 +337,7 @@ def _checked(capture: cv2.VideoCapture, kind: str, limits: FilmLimits) -> float:
     if width * height > limits.max_pixels:
         raise InvalidFilmError(
             f"the film has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
-            "(LALALOC_MAX_FILM_PIXELS): record in 4K or less"
+            "(max_film_pixels): record in 4K or less"
         )
     rate, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
     claimed_s = frames / rate if rate > 0.0 and frames > 0.0 and math.isfinite(rate) else 0.0
@@ -348,7 +348,7 @@ def _checked(capture: cv2.VideoCapture, kind: str, limits: FilmLimits) -> float:
 
 def _too_long(seconds: float, limits: FilmLimits) -> InvalidFilmError:
     return InvalidFilmError(
-        f"the film is longer than {limits.max_s:g} s, the limit (LALALOC_MAX_FILM_S): it has {seconds:.0f} s at least; "
+        f"the film is longer than {limits.max_s:g} s, the limit (max_film_s): it has {seconds:.0f} s at least; "
         "cut it to one turn"
     )
 

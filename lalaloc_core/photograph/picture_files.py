@@ -246,7 +246,7 @@ def _named_errors(content: bytes, limits: PhotographLimits) -> Iterator[None]:
         raise InvalidPhotographError(_unreadable(content)) from error
     except Image.DecompressionBombError as error:
         raise InvalidPhotographError(
-            f"the photograph has too many pixels; the limit is {limits.max_pixels} (LALALOC_MAX_PIXELS)"
+            f"the photograph has too many pixels; the limit is {limits.max_pixels} (max_pixels)"
         ) from error
     except MemoryError as error:
         raise InvalidPhotographError("there is not enough memory to decode the photograph; scale it down") from error
@@ -295,7 +295,7 @@ def _check_pixels(width: int, height: int, limits: PhotographLimits) -> None:
     if width * height > limits.max_pixels:
         raise InvalidPhotographError(
             f"the photograph has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
-            "(LALALOC_MAX_PIXELS)"
+            "(max_pixels)"
         )
 
 
@@ -303,6 +303,5 @@ def _check_scans(content: bytes, limits: PhotographLimits) -> None:
     """Refuse JPEGs with many scans; each visits all pixels again."""
     if count_scans(content, limits.max_scans) > limits.max_scans:
         raise InvalidPhotographError(
-            f"the photograph is a JPEG with more than {limits.max_scans} scans, the limit (LALALOC_MAX_SCANS); "
-            "save it again"
+            f"the photograph is a JPEG with more than {limits.max_scans} scans, the limit (max_scans); save it again"
         )

@@ -21,23 +21,20 @@ _M_ARENA_MAX = -8
 class CoreShares:
     """Numbers of computing threads.
 
-    LPO workers run `workers` times `worker_threads` threads, the main process `compute_threads` times `onnx_threads`.
+    LPO workers run one thread each, which is most efficient, the main process `compute_threads` times `onnx_threads`.
     """
 
     workers: int
-    worker_threads: int
     compute_threads: int
     onnx_threads: int
 
     @property
     def total(self) -> int:
         """Number of threads that compute under full load."""
-        return self.workers * self.worker_threads + self.compute_threads * self.onnx_threads
+        return self.workers + self.compute_threads * self.onnx_threads
 
 
-def share_cores(
-    cores: int, *, workers: int | None, worker_threads: int, compute_threads: int, onnx_threads: int
-) -> CoreShares:
+def share_cores(cores: int, *, workers: int | None, compute_threads: int, onnx_threads: int) -> CoreShares:
     """Return the numbers of threads, and choose those left open, with at least one thread each.
 
     On fewer than four cores there is one thread more than cores, because a single LPO worker is mostly idle.
@@ -45,17 +42,16 @@ def share_cores(
     Args:
         cores: usable cores.
         workers: LPO workers; 0 for none, None to choose by LPO's share of the cores.
-        worker_threads: threads per worker; 0 for the default of one, which is most efficient.
         compute_threads: queries at a time; 0 to use the remaining cores.
         onnx_threads: threads per network; 0 for the default of one, which is most efficient.
     """
-    worker_threads, onnx_threads = worker_threads or 1, onnx_threads or 1
+    onnx_threads = onnx_threads or 1
     if workers is None:
-        workers = min(max(int(_SHARE_OF_WORKERS * cores) // worker_threads, 1), _MAX_WORKERS)
+        workers = min(max(int(_SHARE_OF_WORKERS * cores), 1), _MAX_WORKERS)
     if not compute_threads:
-        busy = min(workers * worker_threads, int(_SHARE_OF_WORKERS * cores))
+        busy = min(workers, int(_SHARE_OF_WORKERS * cores))
         compute_threads = max((cores - busy) // onnx_threads, 1)
-    return CoreShares(workers, worker_threads, compute_threads, onnx_threads)
+    return CoreShares(workers, compute_threads, onnx_threads)
 
 
 def usable_cores() -> int:

@@ -28,7 +28,7 @@ def add_tenant_commands(commands: Any) -> None:
     listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
     listing.set_defaults(run=_list)
 
-    limit = tenants.add_parser("limit", help="set limits of a tenant; in effect within LALALOC_SWEEP_S")
+    limit = tenants.add_parser("limit", help="set limits of a tenant; in effect within 5 s")
     limit.add_argument("tenant", type=tenant_name, help="the tenant")
     for name, kind, meaning in (
         ("stored_bytes", _whole, "limit of stored bytes"),

@@ -173,7 +173,7 @@ def _add_key_commands(commands: Any) -> None:
     listing.add_argument("--json", action="store_true", help="print JSON instead of a table")
     listing.set_defaults(run=_list)
 
-    revoke = keys.add_parser("revoke", help="revoke a key; it is rejected within LALALOC_KEY_CACHE_S")
+    revoke = keys.add_parser("revoke", help="revoke a key; it is rejected within 5 s")
     revoke.add_argument("id", help="id of the key: the part between the underscores")
     revoke.set_defaults(run=_revoke)
 

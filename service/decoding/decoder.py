@@ -204,7 +204,7 @@ class Decoder:
             case "stalled":
                 return InvalidPhotographError(
                     f"decoding the photograph took more than {self._settings.decode.stall_s:g} s of CPU time "
-                    "(LALALOC_DECODE_STALL_S): save it anew, or send a smaller one"
+                    "(decode_stall_s): save it anew, or send a smaller one"
                 )
             case "fault":
                 return InvalidPhotographError("the photograph is damaged: save it anew")
@@ -222,6 +222,6 @@ class Decoder:
         return {
             "poisoned": "the film crashed the decoder twice: export it anew",
             "stalled": f"reading the film took more than {self._film_stall_s:g} s of CPU time "
-            "(LALALOC_MAX_FILM_CPU_S): send a film with fewer pixels, or a shorter one",
+            "(max_film_cpu_s): send a film with fewer pixels, or a shorter one",
             "fault": "the film is damaged: export it anew",
         }.get(lost.reason)

@@ -72,7 +72,7 @@ class LpoReplica:
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
         """Load the refiner; check the bundle as `EncoderReplica` does."""
-        self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.cores.worker_threads)
+        self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.compute.worker_threads)
 
     def refine(self, job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
         """Return the result of a job."""

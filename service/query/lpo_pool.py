@@ -36,7 +36,7 @@ class LpoPool:
         spec = WorkerSpec(
             name="lpo",
             target=run_worker,
-            arguments=(str(bundle.folder.resolve()), bundle.sha256, settings.cores.worker_threads, by_latents),
+            arguments=(str(bundle.folder.resolve()), bundle.sha256, settings.compute.worker_threads, by_latents),
             stall_s=settings.lpo.stall_s,
             start_s=_START_S,
             max_start_s=_MAX_START_S,

@@ -123,7 +123,7 @@ async def rotate_key(key_id: str, call: Call) -> Response:
     responses=problem_responses(UnknownKeyError, *READ_ERRORS),
 )
 def revoke_key(key_id: str, call: Call) -> None:
-    """Revoke an API key for good; it is rejected within `LALALOC_KEY_CACHE_S`."""
+    """Revoke an API key for good; it is rejected within 5 s."""
     key = call.store.keys.revoke(key_id) if is_id(key_id) else None
     if key is None:
         raise UnknownKeyError(key_id, "unrevoked ")
@@ -153,7 +153,7 @@ def list_tenants(call: Call, limit: Limit = 100, cursor: OfTenant = None) -> Ten
     responses=problem_responses(*_CHANGE_ERRORS),
 )
 async def limit_tenant(tenant: str, call: Call) -> TenantAnswer:
-    """Set limits of a tenant, which need not have stored anything; in effect within `LALALOC_SWEEP_S`."""
+    """Set limits of a tenant, which need not have stored anything; in effect within 5 s."""
     if not TENANT.fullmatch(tenant):
         fault = "has 1 to 64 letters, digits, '.', '_' and '-', and begins with a letter or digit"
         raise InvalidRequestError([("tenant", f"is '{tenant[:64]}'; a tenant's name {fault}")])
@@ -182,7 +182,7 @@ def list_audit_entries(
 ) -> AuditList:
     """List changes, refusals and what administrators did, newest first.
 
-    Entries are never changed; the oldest are deleted by `LALALOC_AUDIT_KEEP_S` and `LALALOC_MAX_AUDIT_ENTRIES`.
+    Entries are never changed; the oldest are deleted by `LALALOC_AUDIT_KEEP_S`, and beyond a million.
     Refusals, failed changes and reads of administrators are counted per minute; each replica adds its own.
     """
     if actor is not None and not actor.isprintable():

@@ -1,6 +1,7 @@
 """Groups of settings: fields, defaults, limits and descriptions.
 
-Units stand in the names: `_s` seconds, `_m` metres, `_bytes` bytes.
+Limits that need no setting stand beside them as constants. Units stand in the names: `_s` seconds, `_m` metres,
+`_bytes` bytes.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from lalaloc_core.importers import DEFAULT_IMPORT_LIMITS as _IMPORT
 from lalaloc_core.importers import ImportLimits
 from lalaloc_core.photograph.film_limits import FilmLimits
 from lalaloc_core.photograph.spheres import PhotographLimits
-from service.settings.setting_types import Area, Count, HostNames, IssuerUrl, Metres, Origins, PortMapping, Seconds
+from service.settings.setting_types import Count, HostNames, IssuerUrl, Origins, PortMapping, Seconds
 
 _FILM = FilmLimits()
 
@@ -42,9 +43,8 @@ class DatabaseSettings(SettingGroup):
         description="`postgresql://user:password@host/name` or `sqlite:///file`. Default: SQLite in the data folder.",
     )
     connections: int = Field(default=8, ge=1, le=1000, description="Size of the connection pool.")
-    wait_s: Seconds = Field(
-        default=2.0, description="Timeout for a database connection; the request then fails with 503."
-    )
+    # A request without a connection by then (s) fails with 503: longer waits would fill the slots of others.
+    wait_s: ClassVar[float] = 2.0
 
 
 class ComputeSettings(SettingGroup):
@@ -54,10 +54,11 @@ class ComputeSettings(SettingGroup):
         default=None,
         ge=0,
         le=64,
-        description="LPO worker processes, for sequences and for models that compare latents. Default: a quarter of "
-        "the usable cores (affinity and cgroup quota), at least 1. 0 turns LPO off; answers then end at VDR.",
+        description="LPO worker processes, for turns with unknown angles and models that compare latents. Default: a "
+        "quarter of the usable cores (affinity and cgroup quota), at least 1. 0: no LPO; answers end at VDR.",
     )
-    worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads per LPO worker. 0: one.")
+    # Torch threads per LPO worker: more use the cores less well.
+    worker_threads: ClassVar[int] = 1
     onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network. 0: one.")
     compute_threads: int = Field(
         default=0,
@@ -72,13 +73,13 @@ class LpoSettings(SettingGroup):
 
     prefix = "lpo_"
 
-    queue: Count = Field(
-        default=16, description="Maximum number of LPO jobs that wait for a worker; further queries keep the VDR pose."
-    )
+    # LPO jobs that wait for a worker: a longer wait would exceed the timeout of most.
+    queue: ClassVar[int] = 16
     deadline_s: Seconds = Field(
         default=2.0, description="LPO timeout per query; the answer then falls back to the VDR pose."
     )
-    stall_s: Seconds = Field(default=10.0, description="CPU time limit for one LPO job; its worker is then restarted.")
+    # CPU time (s) of one LPO job, several times the longest; its worker is then restarted.
+    stall_s: ClassVar[float] = 10.0
 
 
 class DecodeSettings(SettingGroup):
@@ -92,16 +93,13 @@ class DecodeSettings(SettingGroup):
         le=64,
         description="Processes that decode photographs, one at a time each. One is reserved for idle tenants.",
     )
-    stall_s: Seconds = Field(
-        default=4.0,
-        description="CPU time limit for decoding one photograph; the process is then replaced and the query fails.",
-    )
+    # CPU time (s) for decoding one photograph, several times that of the largest; the process is then replaced.
+    stall_s: ClassVar[float] = 4.0
     memory_bytes: int = Field(
         default=2**30, ge=64 * 2**20, description="Memory limit for decoding one photograph or film; enforced on Linux."
     )
-    film_workers: int = Field(
-        default=1, ge=1, le=64, description="Processes that read films, one at a time each; started on first use."
-    )
+    # Processes that read films, one at a time each; started on first use. A film occupies a core for seconds.
+    film_workers: ClassVar[int] = 1
 
 
 class ImportSettings(SettingGroup):
@@ -150,12 +148,8 @@ class AccessSettings(SettingGroup):
         description="Address on which a container publishes the port, such as `127.0.0.1:8000`; `8000` alone means "
         "every address. Without API keys it must be an address of this machine, unless `LALALOC_ALLOW_ANONYMOUS=on`.",
     )
-    key_cache_s: float = Field(
-        default=5.0,
-        ge=0.0,
-        le=60.0,
-        description="Lifetime of an API key in memory: a revoked key is rejected after this delay.",
-    )
+    # Lifetime (s) of an API key in memory: a revoked key is rejected after this delay.
+    key_cache_s: ClassVar[float] = 5.0
     rate_per_minute: int = Field(
         default=600,
         ge=0,
@@ -225,18 +219,12 @@ class UploadSettings(SettingGroup):
     prefix = "upload_"
 
     deadline_s: Seconds = Field(default=60.0, description="Timeout for an upload.")
-    idle_s: Seconds = Field(default=10.0, description="Timeout for the next bytes of an upload.")
-    bytes_per_s: float = Field(
-        default=8192.0,
-        gt=0.0,
-        allow_inf_nan=False,
-        description="Minimum upload rate; an upload can lag behind it by `LALALOC_UPLOAD_IDLE_S`.",
-    )
-    memory_bytes: Count = Field(
-        default=2**20,
-        description="Uploaded files beyond this size pass through unnamed temporary files in `TMPDIR`, which end with "
-        "the request; without such a folder they stay in memory. Mount it in memory to keep photographs off the disk.",
-    )
+    # Timeout (s) for the next bytes of an upload: slow networks pause for seconds.
+    idle_s: ClassVar[float] = 10.0
+    # Minimum rate of an upload, which can lag behind it by `idle_s`: slots are not for trickles.
+    bytes_per_s: ClassVar[float] = 8192.0
+    # Uploaded files beyond this size pass through unnamed temporary files in `TMPDIR`, which end with the request.
+    memory_bytes: ClassVar[int] = 2**20
     tenant_bytes: Count = Field(
         default=256 * 2**20,
         description="Bytes of request bodies in progress per tenant, for tenants without a limit of their own "
@@ -261,17 +249,17 @@ class RequestSettings(SettingGroup):
     max_queries: int = Field(
         default=0,
         ge=0,
-        description="Queries computed at a time; further ones wait (`LALALOC_MAX_WAITING_QUERIES`). 0: enough that one "
+        description="Queries computed at a time; further ones wait. 0: enough that one "
         "tenant can run two queries per LPO worker and compute thread.",
     )
-    max_waiting_queries: int = Field(
-        default=16, ge=0, description="Queries that wait for a slot; further ones get 503 before their upload is read."
-    )
-    max_reads: Count = Field(default=64, description="Read-only requests in progress; further ones get 503.")
-    max_streams: Count = Field(default=64, description="Open event streams; further ones get 503.")
-    max_connections: Count = Field(
-        default=1024, description="Open connections, including idle ones; further ones get 503."
-    )
+    # Queries that wait for a slot; further ones would miss their deadline, and get 503 before their upload is read.
+    max_waiting_queries: ClassVar[int] = 16
+    # Read-only requests in progress, with their answers in memory; further ones get 503.
+    max_reads: ClassVar[int] = 64
+    # Open event streams; further ones get 503.
+    max_streams: ClassVar[int] = 64
+    # Open connections, idle ones included; the limit of file descriptors must allow them.
+    max_connections: ClassVar[int] = 1024
     keep_alive_s: Seconds = Field(default=15.0, description="Timeout for an idle connection between requests.")
     stop_deadline_s: float = Field(
         default=20.0,
@@ -291,26 +279,12 @@ class GridSettings(SettingGroup):
         default=0.5, ge=0.1, le=5.0, description="Distance between neighbouring poses of a pose grid."
     )
     max_grid_poses: Count = Field(default=900_000, description="Maximum number of poses in the pose grid of one plan.")
-    inline_grid_poses: int = Field(
-        default=1000,
-        ge=0,
-        description="Pose grids up to this size are computed during the upload; larger ones in the background.",
-    )
-    grid_lease_s: float = Field(
-        default=15.0,
-        ge=0.1,
-        le=3600.0,
-        allow_inf_nan=False,
-        description="Lifetime of the lease on a pose grid: if the owner is silent for longer, another replica computes "
-        "the grid.",
-    )
-    sweep_s: float = Field(
-        default=5.0,
-        ge=0.1,
-        le=3600.0,
-        allow_inf_nan=False,
-        description="Interval at which deleted plans leave memory and abandoned pose grids are taken over.",
-    )
+    # Pose grids up to this size take less than a second, and are computed during the upload.
+    inline_grid_poses: ClassVar[int] = 1000
+    # Lease (s) on a pose grid: if its owner is silent for longer, another replica computes the grid.
+    grid_lease_s: ClassVar[float] = 15.0
+    # Interval (s) at which deleted plans leave memory, and abandoned pose grids are taken over.
+    sweep_s: ClassVar[float] = 5.0
 
 
 class StorageSettings(SettingGroup):
@@ -322,11 +296,8 @@ class StorageSettings(SettingGroup):
         "answers, sessions, albums, idempotency keys. `lalaloc-service tenants limit` sets the limit of one tenant. "
         "Default: 10 GiB, with SQLite at most half of its volume.",
     )
-    max_idempotency_bytes: int = Field(
-        default=64 * 2**20,
-        ge=2**16,
-        description="Idempotency keys and their answers per tenant; the oldest are deleted first.",
-    )
+    # Idempotency keys and their answers per tenant; the oldest are deleted first.
+    max_idempotency_bytes: ClassVar[int] = 64 * 2**20
 
     plan_cache_bytes: int = Field(
         default=64 * 2**20,
@@ -340,12 +311,8 @@ class StorageSettings(SettingGroup):
         ge=0,
         description="Search indices of large venues kept in memory: 45 bytes per prototype, about 7.5 kB per home.",
     )
-    venue_file_bytes: int = Field(
-        default=2 * 2**30,
-        ge=0,
-        description="Prototype file of large venues in `LALALOC_DATA_DIR`: 82 bytes per prototype, 14 kB per home. "
-        "Delete it only while the service is stopped.",
-    )
+    # Prototype file of large venues: 82 bytes per prototype, so 150,000 homes.
+    venue_file_bytes: ClassVar[int] = 2 * 2**30
     keep_answers_s: float = Field(
         default=0.0,
         ge=0.0,
@@ -353,72 +320,64 @@ class StorageSettings(SettingGroup):
         description="Lifetime of kept answers, which a link reopens; photographs are never kept. 0: no answers are "
         "kept.",
     )
-    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is deleted first.")
+    # Kept answers per tenant; the oldest is deleted first.
+    max_kept_answers: ClassVar[int] = 10_000
     session_ttl_s: float = Field(
         default=3600.0,
         ge=1.0,
         le=366 * 86400.0,
         description="Lifetime of a session of a tracked camera after its last photograph.",
     )
-    max_sessions: Count = Field(
-        default=1000, description="Sessions of tracked cameras per tenant; further ones get 507."
-    )
+    # Sessions of tracked cameras per tenant, of at most 100 kB each.
+    max_sessions: ClassVar[int] = 1000
     album_ttl_s: float = Field(
         default=90 * 86400.0, ge=1.0, le=3660 * 86400.0, description="Lifetime of an album after its last change."
     )
-    max_albums: Count = Field(default=1000, description="Albums per tenant; further ones get 507.")
-    max_album_photographs: int = Field(
-        default=500, ge=1, le=500, description="Photographs of an album; further ones get 507."
-    )
+    # Albums per tenant; the photographs count among the stored bytes.
+    max_albums: ClassVar[int] = 1000
+    # Photographs of an album, which is what the solver is measured with.
+    max_album_photographs: ClassVar[int] = 500
     audit_keep_s: float = Field(
         default=365 * 86400.0, ge=86400.0, le=3660 * 86400.0, description="Lifetime of entries of the audit log."
     )
-    max_audit_entries: int = Field(
-        default=10**6,
-        ge=1000,
-        le=10**8,
-        description="Entries of the audit log, about 600 bytes each; the oldest are deleted first. A tenth is for "
-        "requests of unknown callers.",
-    )
+    # Entries of the audit log, about 600 bytes each. A tenth is for requests of unknown callers.
+    max_audit_entries: ClassVar[int] = 10**6
 
 
 class PlanSettings(SettingGroup):
     """Limits of floor plans and venues."""
 
     max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
-    max_revisions: int = Field(
-        default=10, ge=2, description="Revisions kept per floor plan; the oldest is deleted first."
-    )
+    # Revisions kept per floor plan; the oldest is deleted first.
+    max_revisions: ClassVar[int] = 10
     max_plan_bytes: Count = Field(default=_IMPORT.max_plan_bytes, description="Size of a plan file, in any format.")
-    max_unpacked_bytes: Count = Field(
-        default=_IMPORT.max_unpacked_bytes,
-        description="Unpacked size of an archive, or of a compressed part of a plan file.",
-    )
-    max_entities: Count = Field(
-        default=_IMPORT.max_entities,
-        description="Drawing entities (lines, polygons, texts) of a plan file, vertices included.",
-    )
-    max_plan_pixels: Count = Field(default=_IMPORT.max_plan_pixels, description="Pixels of a floor plan picture.")
+    # Unpacked size of an archive, or of a compressed part of a plan file.
+    max_unpacked_bytes: ClassVar[int] = _IMPORT.max_unpacked_bytes
+    # Drawing entities (lines, polygons, texts) of a plan file, vertices included.
+    max_entities: ClassVar[int] = _IMPORT.max_entities
+    # Pixels of a floor plan picture.
+    max_plan_pixels: ClassVar[int] = _IMPORT.max_plan_pixels
     max_import_s: Seconds = Field(
         default=_IMPORT.max_import_s,
         description="CPU time limit for reading a plan file. The process is replaced 10 s later. With the wait for a "
         "process, an upload can take twice this time.",
     )
-    max_rooms: Count = Field(default=_PLAN.max_rooms, description="Rooms per floor plan.")
-    max_vertices: int = Field(default=_PLAN.max_vertices_per_room, ge=3, description="Vertices per room.")
-    max_plan_vertices: int = Field(
-        default=_PLAN.max_plan_vertices, ge=3, description="Vertices of all rooms of a floor plan."
-    )
-    max_extent_m: Metres = Field(default=_PLAN.max_extent_m, description="Width or height of a floor plan.")
-    max_area_m2: Area = Field(default=_PLAN.max_area_m2, description="Floor area of all rooms of a floor plan.")
-    max_bounds_area_m2: Area = Field(
-        default=_PLAN.max_bounds_area_m2,
-        description="Area of the bounding boxes of all rooms of a floor plan; its pose grid is laid over them.",
-    )
-    max_openings: int = Field(
-        default=_PLAN.max_openings, ge=0, description="Doors, windows and passages of a floor plan."
-    )
-    max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
+    # Rooms per floor plan.
+    max_rooms: ClassVar[int] = _PLAN.max_rooms
+    # Vertices per room.
+    max_vertices: ClassVar[int] = _PLAN.max_vertices_per_room
+    # Vertices of all rooms of a floor plan.
+    max_plan_vertices: ClassVar[int] = _PLAN.max_plan_vertices
+    # Width or height of a floor plan.
+    max_extent_m: ClassVar[float] = _PLAN.max_extent_m
+    # Floor area of all rooms of a floor plan.
+    max_area_m2: ClassVar[float] = _PLAN.max_area_m2
+    # Area of the bounding boxes of all rooms of a floor plan; its pose grid is laid over them.
+    max_bounds_area_m2: ClassVar[float] = _PLAN.max_bounds_area_m2
+    # Doors, windows and passages of a floor plan.
+    max_openings: ClassVar[int] = _PLAN.max_openings
+    # Stored venues per tenant.
+    max_venues: ClassVar[int] = 1000
     max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
     max_venue_bytes: Count = Field(default=4 * 2**20, description="Size of a venue document.")
 
@@ -458,38 +417,32 @@ class PhotographSettings(SettingGroup):
 
     max_photograph_bytes: Count = Field(default=40 * 2**20, description="Size of a photograph's file.")
     max_sequence_photographs: int = Field(
-        default=100,
-        ge=2,
-        le=100,
-        description="Photographs of a sequence query; more than 10 have more time, in proportion.",
+        default=100, ge=2, le=100, description="Photographs of a turn; more than 10 have more time, in proportion."
     )
-    max_sequence_bytes: Count = Field(
-        default=100 * 2**20, description="Size of all photographs of a sequence query or a batch."
-    )
+    max_sequence_bytes: Count = Field(default=100 * 2**20, description="Size of all photographs of a turn or a batch.")
     max_batch_photographs: int = Field(
         default=100,
         ge=1,
         le=1000,
         description="Photographs of a batch; `LALALOC_MAX_SEQUENCE_BYTES` limits their size.",
     )
-    max_pixels: Count = Field(default=100_000_000, description="Pixels of a photograph.")
-    max_scans: Count = Field(default=20, description="Scans of a progressive JPEG; encoders write 3 to 12.")
+    # Pixels of a photograph: as many as the memory of a decoder holds.
+    max_pixels: ClassVar[int] = 100_000_000
+    # Scans of a progressive JPEG; encoders write 3 to 12, and each takes as long as the picture.
+    max_scans: ClassVar[int] = 20
     max_film_bytes: Count = Field(default=_FILM.max_bytes, description="Size of a film's file.")
-    max_film_s: Seconds = Field(default=_FILM.max_s, description="Duration of a film.")
-    max_film_pixels: Count = Field(default=_FILM.max_pixels, description="Pixels of a film: width times height.")
-    max_film_cpu_s: Seconds = Field(
-        default=_FILM.max_cpu_s, description="CPU time limit for decoding a film; finding its angles has 40 s more."
-    )
-    film_deadline_s: Seconds = Field(
-        default=120.0, description="Timeout for reading a film, besides that of the query for its frames."
-    )
-    max_top_k: int = Field(default=10, ge=1, le=100, description="Candidates per answer.")
-    compass_tolerance_deg: float = Field(
-        default=20.0,
-        ge=0.0,
-        le=45.0,
-        description="Tolerance of the compass heading in a photograph's metadata, within which headings are searched.",
-    )
+    # Duration of a film.
+    max_film_s: ClassVar[float] = _FILM.max_s
+    # Pixels of a film: width times height, of 4K.
+    max_film_pixels: ClassVar[int] = _FILM.max_pixels
+    # CPU time limit (s) for decoding a film; finding its angles has 40 s more.
+    max_film_cpu_s: ClassVar[float] = _FILM.max_cpu_s
+    # Timeout (s) for reading a film, besides that of the query for its frames.
+    film_deadline_s: ClassVar[float] = 120.0
+    # Candidates per answer: as many as the page can show.
+    max_top_k: ClassVar[int] = 10
+    # Error of compasses indoors, within which headings are searched.
+    compass_tolerance_deg: ClassVar[float] = 20.0
 
     require_features: bool = Field(
         default=False,

@@ -57,8 +57,6 @@ def _is_loopback(host: str) -> bool:
 
 Count = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Area = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 # Lists, separated by commas.
 HostNames = Annotated[str, AfterValidator(_host_names)]
 Origins = Annotated[str, AfterValidator(_origins)]

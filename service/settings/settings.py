@@ -1,6 +1,6 @@
 """Settings of the service, read once from environment variables that start with `LALALOC_`.
 
-`setting_groups.py` defines them in groups: `LALALOC_LPO_QUEUE` is `settings.lpo.queue`.
+`setting_groups.py` defines them in groups: `LALALOC_LPO_DEADLINE_S` is `settings.lpo.deadline_s`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PHOTOGRAPHS_PER_LIMIT = 10
 # A film's frames have the time of as many photographs.
 FILM_PHOTOGRAPHS = 40
 
-# Settings of earlier versions. A variable that sets one is ignored with a warning.
+# Settings of earlier versions, besides those that are constants now. A variable of one is ignored with a warning.
 _REMOVED = frozenset(
     {
         "decode_queue",
@@ -50,13 +50,13 @@ _REMOVED = frozenset(
 
 
 # Earlier names of settings, which stay valid.
-_EARLIER_NAMES = {"max_panorama_bytes": "max_photograph_bytes", "max_sequence_panoramas": "max_sequence_photographs"}
+EARLIER_NAMES = {"max_panorama_bytes": "max_photograph_bytes", "max_sequence_panoramas": "max_sequence_photographs"}
 
 
 class Settings(BaseModel):
     """Service.
 
-    `Settings.load()` reads the environment. `Settings(lpo_queue=4)` sets values by variable name, in lower case and
+    `Settings.load()` reads the environment. `Settings(workers=4)` sets values by variable name, in lower case and
     without `LALALOC_`; the others keep their defaults.
     """
 
@@ -92,8 +92,8 @@ class Settings(BaseModel):
         Raises:
             ConfigError: an unknown name, a setting under two names, or a value outside its limits.
         """
-        for earlier in values.keys() & _EARLIER_NAMES.keys():
-            name = _EARLIER_NAMES[earlier]
+        for earlier in values.keys() & EARLIER_NAMES.keys():
+            name = EARLIER_NAMES[earlier]
             if name in values:
                 raise ConfigError(
                     f"{_variable(earlier)} is the earlier name of {_variable(name)}; set only one of them"
@@ -127,14 +127,18 @@ class Settings(BaseModel):
         """
         given = {name.upper(): value for name, value in os.environ.items() if name.upper().startswith(PREFIX) and value}
         values = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
-        for name in sorted(values.keys() & _REMOVED):
+        for name in sorted(values.keys() & (_REMOVED | CONSTANTS.keys())):
             logging.getLogger("lalaloc").warning("%s is ignored: this setting was removed", _variable(name))
             del values[name]
         return cls(**values)
 
     def value(self, name: str) -> Any:
-        """Return the value of a setting by variable name, in lower case and without `LALALOC_`; earlier names too."""
-        return attrgetter(".".join(_PATHS[_EARLIER_NAMES.get(name, name)]))(self)
+        """Return a setting by variable name, in lower case and without `LALALOC_`, or a constant beside the settings.
+
+        Earlier names are read, too.
+        """
+        name = EARLIER_NAMES.get(name, name)
+        return attrgetter(".".join(_PATHS.get(name) or CONSTANTS[name]))(self)
 
     def values(self) -> dict[str, Any]:
         """Return the value of every setting by variable name."""
@@ -205,6 +209,13 @@ def _fields() -> Iterator[tuple[str, tuple[str, ...], FieldInfo]]:
 # Attributes of all settings by name, in lower case and without `LALALOC_`.
 _PATHS = {name: path for name, path, _ in _fields()}
 SETTING_NAMES = frozenset(_PATHS)
+# Attributes of the constants beside the settings, by names of the same kind.
+CONSTANTS = {
+    field.default.prefix + inner: (name, inner)
+    for name, field in Settings.model_fields.items()
+    if isinstance(field.default, groups.SettingGroup)
+    for inner in type(field.default).__class_vars__ - {"prefix"}
+}
 
 
 def _variable(name: str) -> str:

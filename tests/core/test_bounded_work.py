@@ -162,7 +162,7 @@ def test_stored_plan_ignores_limits() -> None:
 
 
 def test_bounding_box_area_is_limited() -> None:
-    message = "the bounding boxes of all rooms cover 120030 m²; the limit is 100000 m² (LALALOC_MAX_BOUNDS_AREA_M2)"
+    message = "the bounding boxes of all rooms cover 120030 m²; the limit is 100000 m² (max_bounds_area_m2)"
     with pytest.raises(InvalidFloorPlanError) as caught:
         FloorPlan.from_dict(slivers(3), PlanLimits(max_bounds_area_m2=100_000.0))
     assert str(caught.value) == message

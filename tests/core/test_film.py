@@ -171,9 +171,9 @@ def test_dark_frames_are_dropped(tmp_path: Path) -> None:
     ("limits", "reason"),
     [
         ({"max_bytes": 1000}, "the limit is 1000 \\(LALALOC_MAX_FILM_BYTES\\)"),
-        ({"max_s": 2.0}, "longer than 2 s, the limit \\(LALALOC_MAX_FILM_S\\)"),
-        ({"max_pixels": 1000}, "270 x 480 = 129600 pixels; the limit is 1000 \\(LALALOC_MAX_FILM_PIXELS\\)"),
-        ({"max_cpu_s": 1e-4}, "more than 0.0001 s of CPU time .* \\(LALALOC_MAX_FILM_CPU_S\\)"),
+        ({"max_s": 2.0}, "longer than 2 s, the limit \\(max_film_s\\)"),
+        ({"max_pixels": 1000}, "270 x 480 = 129600 pixels; the limit is 1000 \\(max_film_pixels\\)"),
+        ({"max_cpu_s": 1e-4}, "more than 0.0001 s of CPU time .* \\(max_film_cpu_s\\)"),
     ],
 )
 def test_limits_are_named(h264: bytes, limits: dict[str, float], reason: str) -> None:

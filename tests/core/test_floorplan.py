@@ -184,7 +184,7 @@ def test_limits_are_inclusive() -> None:
     square = rectangle(1.0, 1.0)
     apart = [rectangle(1.0, 1.0, corner=(2.0 * index, 0.0)) for index in range(3)]
     assert len(FloorPlan.from_dict(plan_document(*apart[:2]), limits).rooms) == 2
-    assert "3 rooms; the limit is 2 (LALALOC_MAX_ROOMS)" in str(refused(plan_document(*apart), limits))
+    assert "3 rooms; the limit is 2 (max_rooms)" in str(refused(plan_document(*apart), limits))
     assert len(FloorPlan.from_dict(plan_document([*square, [-0.5, 0.5]]), limits).rooms) == 1
     error = refused(plan_document([*square, [-0.5, 0.5], [-0.4, 0.2]]), limits)
     assert (error.room, "6 vertices; the limit is 5" in error.reason) == ("room 1", True)
@@ -286,7 +286,7 @@ def test_brackets_in_strings_are_not_nesting() -> None:
 
 def test_million_vertices_are_refused() -> None:
     one_room = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 10**6) + "]}]}"
-    with pytest.raises(InvalidFloorPlanError, match=r"1000000 vertices; .* is 100000 \(LALALOC_MAX_PLAN_VERTICES\)"):
+    with pytest.raises(InvalidFloorPlanError, match=r"1000000 vertices; .* is 100000 \(max_plan_vertices\)"):
         FloorPlan.from_json(one_room)
 
 
@@ -298,7 +298,7 @@ def test_vertices_are_counted_over_all_rooms() -> None:
 
 def test_floor_area_limit() -> None:
     document = plan_document(rectangle(10.0, 10.0), rectangle(10.0, 10.0, corner=(20.0, 0.0)))
-    assert "200 m²; the limit is 199 m² (LALALOC_MAX_AREA_M2)" in str(refused(document, PlanLimits(max_area_m2=199.0)))
+    assert "200 m²; the limit is 199 m² (max_area_m2)" in str(refused(document, PlanLimits(max_area_m2=199.0)))
     FloorPlan.from_dict(document, PlanLimits(max_area_m2=200.0))
 
 

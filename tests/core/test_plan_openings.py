@@ -181,7 +181,7 @@ def test_tolerance_out_of_range_is_refused(value: Any) -> None:
 def test_too_many_openings_are_refused() -> None:
     line = [[0.0, 0.5], [0.0, 0.6]]
     many = {"openings": [{"kind": "window", "line": line}] * 3}
-    assert "3 openings; the limit is 2 (LALALOC_MAX_OPENINGS)" in refused(
+    assert "3 openings; the limit is 2 (max_openings)" in refused(
         FloorPlan.from_dict, ROOMS | many, PlanLimits(max_openings=2)
     )
     windows = [{"kind": "window", "line": [[0.0, 0.5 * k], [0.0, 0.5 * k + 0.4]]} for k in range(6)]

@@ -174,7 +174,7 @@ def test_round_rooms_are_simplified_within_two_centimetres():
     assert len(room.exterior.coords) <= 71
     assert shapely.hausdorff_distance(room, shapely.Polygon(round_m)) < 0.021
     assert "simplified within 2 cm" in plan.report.notes[0]
-    with pytest.raises(InvalidFloorPlanError, match=r"room 'Rotunda': .* limit is 20 \(LALALOC_MAX_VERTICES\)"):
+    with pytest.raises(InvalidFloorPlanError, match=r"room 'Rotunda': .* limit is 20 \(max_vertices\)"):
         import_plan(content, limits=ImportLimits(plan=PlanLimits(max_vertices_per_room=20)))
 
 

@@ -9,7 +9,7 @@ import os
 import shutil
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from itertools import cycle
@@ -29,7 +29,7 @@ from lalaloc_core.bundle import default_bundle
 from service.app import create_app
 from service.pools import supervisor
 from service.pools.supervisor import Watchdog
-from service.settings import Settings
+from service.settings import CONSTANTS, Settings
 from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
@@ -147,8 +147,10 @@ def start_app(
             shutil.copy(empty_database, data_dir)
         values = {"data_dir": data_dir, "bundle": tiny_bundle, "workers": 0, "onnx_threads": 1, "log_level": "error"}
         values |= {"decode_workers": 1, "import_workers": 1}
-        settings = Settings(**(values | overrides))
+        values |= overrides
+        settings = Settings(**{name: value for name, value in values.items() if name not in CONSTANTS})
         with ExitStack() as stack:
+            stack.enter_context(constants({name: value for name, value in values.items() if name in CONSTANTS}))
             if _DATABASE == "ray":
                 address = request.getfixturevalue("ray_address")
                 stack.enter_context(serving(settings))
@@ -237,6 +239,16 @@ def store(tmp_path: Path) -> Iterator[Store]:
     """Yield an empty store on SQLite."""
     with closing(Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")) as opened:
         yield opened
+
+
+@contextmanager
+def constants(values: Mapping[str, Any]) -> Iterator[None]:
+    """Give constants that stand beside the settings other values."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in values.items():
+            group, attribute = CONSTANTS[name]
+            patch.setattr(type(Settings.model_fields[group].default), attribute, value)
+        yield
 
 
 @contextmanager

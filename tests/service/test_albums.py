@@ -320,12 +320,12 @@ def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[by
         first = create(client, plan_id)
         create(client, plan_id)
         problem = assert_problem(client.post("/albums", json={"floorplan_id": plan_id}), 507, "too-many-albums")
-        assert "LALALOC_MAX_ALBUMS" in problem["detail"]
+        assert "max_albums" in problem["detail"]
         lines = add(client, first, pictures)
         assert [line["status"] for line in lines] == [201, 201, 507, 507]
         full = next(line for line in lines if line["status"] == 507)
         assert full["problem"]["type"] == "urn:lalaloc:problem:too-many-photographs"
-        assert "LALALOC_MAX_ALBUM_PHOTOGRAPHS" in full["problem"]["detail"]
+        assert "max_album_photographs" in full["problem"]["detail"]
         assert (client.get("/limits").json()["max_albums"], client.get("/limits").json()["max_album_photographs"]) == (
             2,
             2,

@@ -15,21 +15,20 @@ from service.capacity.cores import CoreShares, _quota_cores, share_cores, usable
 
 @pytest.mark.parametrize("cores", range(4, 130))
 def test_open_shares_use_every_core_once(cores: int) -> None:
-    shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
+    shares = share_cores(cores, workers=None, compute_threads=0, onnx_threads=0)
     assert shares.total == cores
     assert min(shares.workers, shares.compute_threads) >= 1
 
 
 @pytest.mark.parametrize("cores", [1, 2, 3])
 def test_single_lpo_worker_takes_no_core_of_few(cores: int) -> None:
-    shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
-    assert shares == CoreShares(1, 1, cores, 1)
+    shares = share_cores(cores, workers=None, compute_threads=0, onnx_threads=0)
+    assert shares == CoreShares(1, cores, 1)
 
 
 def test_given_numbers_are_kept() -> None:
-    assert share_cores(8, workers=0, worker_threads=0, compute_threads=0, onnx_threads=2) == CoreShares(0, 1, 4, 2)
-    assert share_cores(8, workers=None, worker_threads=2, compute_threads=0, onnx_threads=0) == CoreShares(1, 2, 6, 1)
-    assert share_cores(2, workers=3, worker_threads=1, compute_threads=5, onnx_threads=1) == CoreShares(3, 1, 5, 1)
+    assert share_cores(8, workers=0, compute_threads=0, onnx_threads=2) == CoreShares(0, 4, 2)
+    assert share_cores(2, workers=3, compute_threads=5, onnx_threads=1) == CoreShares(3, 5, 1)
 
 
 def test_usable_cores_follow_the_affinity() -> None:

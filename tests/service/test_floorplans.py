@@ -202,10 +202,10 @@ def test_upload_is_cut_off_at_its_limit(start_app: StartApp, tmp_path: Path) -> 
 def test_plan_limits_come_from_settings(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_rooms=1, max_vertices=4, max_floorplans=1) as client:
         problem = assert_problem(client.post("/floorplans", json=FLAT), 422, "invalid-floorplan")
-        assert "the limit is 1 (LALALOC_MAX_ROOMS)" in problem["detail"]
+        assert "the limit is 1 (max_rooms)" in problem["detail"]
         hexagon = _room([[0, 0], [2, 0], [3, 2], [2, 4], [0, 4], [-1, 2]])
         response = client.post("/floorplans", json=hexagon)
-        assert "the limit is 4 (LALALOC_MAX_VERTICES)" in assert_problem(response, 422, "invalid-floorplan")["detail"]
+        assert "the limit is 4 (max_vertices)" in assert_problem(response, 422, "invalid-floorplan")["detail"]
         upload(client, _room(SQUARE), wait=False)
         assert_problem(client.post("/floorplans", json=_room(SQUARE)), 507, "too-many-floorplans")
 

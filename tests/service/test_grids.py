@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -42,11 +43,21 @@ from service.grids.embedding import embed, grid_bytes
 from service.grids.grid_jobs import MAX_ON_DEMAND
 from service.grids.grid_provider import GridProvider, check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper
-from service.settings import Settings
+from service.settings import CONSTANTS, Settings
 from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import PlanLookup, Store
 from service.telemetry import Telemetry
-from tests.service.conftest import FLAT, DatabaseOf, OpenStore, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import (
+    FLAT,
+    DatabaseOf,
+    OpenStore,
+    StartApp,
+    assert_problem,
+    constants,
+    localise,
+    upload,
+    wait_for,
+)
 from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -106,15 +117,15 @@ def _begun(encoders: CountingEncoders, grids: GridProvider, record: PlanRecord) 
 
 @pytest.fixture
 def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvider]]:
-    made: list[GridProvider] = []
+    with ExitStack() as stack:
 
-    def make(store: Store, own_encoders: PhotographEncoder | None = None, **settings: Any) -> GridProvider:
-        made.append(GridProvider(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry(), _permits()))
-        return made[-1]
+        def make(store: Store, own_encoders: PhotographEncoder | None = None, **settings: Any) -> GridProvider:
+            values = {name: value for name, value in settings.items() if name not in CONSTANTS}
+            stack.enter_context(constants({name: value for name, value in settings.items() if name in CONSTANTS}))
+            grids = GridProvider(store, own_encoders or encoders, "m1", Settings(**values), Telemetry(), _permits())
+            return stack.enter_context(closing(grids))
 
-    yield make
-    for grids in made:
-        grids.close()
+        yield make
 
 
 MakeGrids = Callable[..., GridProvider]

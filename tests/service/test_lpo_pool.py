@@ -26,10 +26,10 @@ from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
 from service.query import lpo_pool
 from service.query.lpo_pool import LpoPool
-from service.settings import Settings
+from service.settings import CONSTANTS, Settings
 from service.telemetry import Telemetry
 from service.workers.lpo import warm_up_job
-from tests.service.conftest import end_time_limits, wait_for
+from tests.service.conftest import constants, end_time_limits, wait_for
 
 # Time limit of jobs that must not end by it, also on a busy machine.
 _LONG_S = 120.0
@@ -37,12 +37,14 @@ _LONG_S = 120.0
 
 @contextmanager
 def _pool(bundle: Bundle, *, by_latents: bool = True, **overrides: Any) -> Iterator[LpoPool]:
-    pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(100, CpuAccounts()), by_latents)
-    pool.start()
-    try:
-        yield pool
-    finally:
-        pool.close()
+    changed = {name: overrides.pop(name) for name in CONSTANTS if name in overrides}
+    with constants(changed):
+        pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(100, CpuAccounts()), by_latents)
+        pool.start()
+        try:
+            yield pool
+        finally:
+            pool.close()
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[httpx.Client]:
     """Yield the service on Ray with two search replicas."""
     # Deadlines as they would be on a machine that has nothing else to do are not what is tested.
-    patient: dict[str, Any] = {"request_deadline_s": 50.0, "decode_stall_s": 50.0, "lpo_deadline_s": 30.0}
+    patient: dict[str, Any] = {"request_deadline_s": 50.0, "lpo_deadline_s": 30.0}
     processes: dict[str, Any] = {"decode_workers": 1, "import_workers": 1}
     settings = Settings(data_dir=data_dir, bundle=tiny_bundle, log_level="error", **patient, **processes, **FEW_POSES)
     with serving(settings), httpx.Client(base_url=ray_address, timeout=60.0) as client:

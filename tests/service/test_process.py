@@ -18,7 +18,7 @@ from time import monotonic, sleep
 import httpx
 import pytest
 
-from service.settings import PREFIX
+from service.settings import CONSTANTS, PREFIX
 from tests.service.conftest import assert_problem, localise, upload, wait_for
 from tests.service.test_localise import HALL
 
@@ -26,10 +26,20 @@ ROOT = Path(__file__).parents[2]
 
 
 def environment_of(bundle: Path, data_dir: Path, **settings: str) -> dict[str, str]:
-    """Return the environment of a service with these settings only."""
+    """Return the environment of a service with these settings, or constants beside them, only."""
     given = {"BUNDLE": str(bundle), "DATA_DIR": str(data_dir), "ONNX_THREADS": "1"} | settings
+    changed = {name: float(given.pop(name.upper())) for name in CONSTANTS if name.upper() in given}
     clean = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
-    return clean | {PREFIX + name: value for name, value in given.items()} | {"PYTHONPATH": str(ROOT)}
+    return (
+        clean
+        | {PREFIX + name: value for name, value in given.items()}
+        | {
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'service' / 'with_constants'}"
+            if changed
+            else str(ROOT),
+            "TEST_CONSTANTS": json.dumps(changed),
+        }
+    )
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from service.http import http_protocol
 from service.http.http_protocol import bounded_protocol
 from service.http.server import Server, server_config
 from service.settings import Settings
-from tests.service.conftest import wait_for
+from tests.service.conftest import constants, wait_for
 
 
 def test_answer_body_is_not_delayed() -> None:
@@ -66,10 +66,10 @@ def _app() -> FastAPI:
 
 
 def test_idle_connections_make_room() -> None:
-    settings = Settings(max_connections=1, max_reads=4, max_streams=4, max_pending_requests=11)
+    settings, few = Settings(max_pending_requests=11), {"max_connections": 1, "max_reads": 4, "max_streams": 4}
     # One more than all slots.
     most = 4 + 4 + 11 + 1
-    with served(_app(), settings) as port, ExitStack() as stack:
+    with constants(few), served(_app(), settings) as port, ExitStack() as stack:
         address = ("127.0.0.1", port)
         idle = [stack.enter_context(socket.create_connection(address, timeout=10.0)) for _ in range(3 * most)]
         for _ in range(3):
@@ -89,8 +89,9 @@ def test_busy_connection_is_not_closed() -> None:
         assert go_on.wait(30.0)
         return "done"
 
-    settings = Settings(max_connections=1, max_reads=1, max_streams=1, max_pending_requests=1)
-    with served(app, settings) as port, ExitStack() as stack, ThreadPoolExecutor(1) as threads:
+    few = {"max_connections": 1, "max_reads": 1, "max_streams": 1}
+    settings = Settings(max_pending_requests=1)
+    with constants(few), served(app, settings) as port, ExitStack() as stack, ThreadPoolExecutor(1) as threads:
         answer = threads.submit(httpx.get, f"http://127.0.0.1:{port}/slow", timeout=30.0)
         time.sleep(0.3)
         for _ in range(20):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,11 @@ from pydantic import ValidationError
 
 from lalaloc_core.errors import ConfigError
 from service.settings import PREFIX, SETTING_NAMES, Settings, settings_table
+from service.settings.settings import EARLIER_NAMES
+
+ROOT = Path(__file__).parents[2]
+# Variables of the container's own programs, of proxies and of clients.
+OF_OTHERS = {"api_key", "database_password", "host", "http_port", "https_port", "key", "memory", "publish", "upstream"}
 
 
 def test_unknown_setting_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,12 +39,12 @@ def test_invalid_value_names_variable_and_value(monkeypatch: pytest.MonkeyPatch,
 def test_values_are_read_and_typed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LALALOC_DATA_DIR", "/srv/plans")
     monkeypatch.setenv("LALALOC_WORKERS", "3")
-    monkeypatch.setenv("LALALOC_MAX_ROOMS", "7")
+    monkeypatch.setenv("LALALOC_MAX_PLAN_BYTES", "7")
     monkeypatch.setenv("LALALOC_DATABASE_URL", "")
     settings = Settings.load()
     assert settings.data_dir == Path("/srv/plans")
     assert settings.compute.workers == 3
-    assert settings.plans.plan_limits.max_rooms == 7
+    assert settings.plans.import_limits.max_plan_bytes == 7
     assert settings.database_url == "sqlite:////srv/plans/lalaloc.sqlite3"
 
 
@@ -47,9 +53,31 @@ def test_removed_setting_is_ignored_with_a_warning(
 ) -> None:
     monkeypatch.setattr(logging.getLogger("lalaloc"), "propagate", True)
     monkeypatch.setenv("LALALOC_DECODE_QUEUE", "3")
+    monkeypatch.setenv("LALALOC_MAX_ROOMS", "7")
     with caplog.at_level(logging.WARNING, logger="lalaloc"):
         Settings.load()
     assert "LALALOC_DECODE_QUEUE is ignored" in caplog.text
+    assert "LALALOC_MAX_ROOMS is ignored" in caplog.text
+
+
+def test_settings_named_in_promises_exist() -> None:
+    named = re.findall(r"`LALALOC_([A-Z_]+)`", (ROOT / "docs" / "reference" / "promises.md").read_text())
+    assert named
+    assert {name.lower() for name in named} - EARLIER_NAMES.keys() <= SETTING_NAMES
+
+
+def test_settings_named_in_other_pages_and_in_messages_exist() -> None:
+    patterns = ("docs/**/*.md", "docker/**/*", "service/**/*.py", "lalaloc_core/**/*.py", "examples/*.py")
+    files = [path for pattern in patterns for path in ROOT.glob(pattern)]
+    known = SETTING_NAMES | EARLIER_NAMES.keys() | OF_OTHERS
+    for path in files:
+        if path.is_file() and path.suffix not in {".png", ".jpg"}:
+            named = re.findall(r"\bLALALOC_([A-Z][A-Z_]*[A-Z])\b", path.read_text(encoding="utf-8"))
+            assert {name.lower() for name in named} <= known, path
+
+
+def test_settings_are_few() -> None:
+    assert len(SETTING_NAMES) <= 55
 
 
 def test_earlier_name_of_a_setting_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -203,7 +203,7 @@ def test_repeated_request_makes_one_venue(client: httpx.Client) -> None:
     ("limits", "status", "kind", "words"),
     [
         ({"max_floorplans": 1}, 507, "too-many-floorplans", "LALALOC_MAX_FLOORPLANS"),
-        ({"max_venues": 1}, 507, "too-many-venues", "LALALOC_MAX_VENUES"),
+        ({"max_venues": 1}, 507, "too-many-venues", "max_venues"),
         ({"max_venue_plans": 1}, 422, "invalid-request", "has 2 levels; the limit is 1"),
         ({"max_grid_poses": 20}, 422, "floorplan-too-large", "the plan of level '0' needs"),
         ({"max_stored_bytes": 2000}, 507, "storage-quota", "LALALOC_MAX_STORED_BYTES"),

@@ -213,7 +213,7 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
         assert "would have 3 plans; the limit is 2" in assert_problem(grown, 422, "invalid-request")["detail"]
         moved = client.patch(f"/venues/{venue['id']}", json={"plans": full[2:], "remove": [plans[0]]})
         assert moved.json()["plans"] == 2
-        assert "LALALOC_MAX_VENUES" in assert_problem(client.post("/venues", json={}), 507, "too-many-venues")["detail"]
+        assert "max_venues" in assert_problem(client.post("/venues", json={}), 507, "too-many-venues")["detail"]
         long = client.put(f"/venues/{venue['id']}", json={"name": "x" * 600})
         assert "(LALALOC_MAX_VENUE_BYTES)" in assert_problem(long, 413, "upload-too-large")["detail"]
 

@@ -45,7 +45,7 @@ export async function checkPixels(file: File): Promise<void> {
   const share = Math.floor(100 * Math.sqrt(limits.max_plan_pixels / (width * height)));
   throw new InputError(
     `“${file.name}” has ${width} × ${height} = ${width * height} pixels; the limit is ${limits.max_plan_pixels} ` +
-      `(LALALOC_MAX_PLAN_PIXELS). Make it smaller, to ${share} % of its width.`,
+      `(max_plan_pixels). Make it smaller, to ${share} % of its width.`,
   );
 }
 

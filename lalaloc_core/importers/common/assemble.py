@@ -274,7 +274,7 @@ def _simplify(floor: shapely.Polygon, label: str, limits: PlanLimits, builder: R
         shape = floor.simplify(tolerance_m)
     if drawn > limit:
         builder.notes.append(
-            f"{label} has {drawn} vertices; the limit is {limit} (LALALOC_MAX_VERTICES), so its outline was simplified "
+            f"{label} has {drawn} vertices; the limit is {limit} (max_vertices), so its outline was simplified "
             f"within {100.0 * _SIMPLER_M[-1]:g} cm to {_vertices(shape)}"
         )
     return shape
