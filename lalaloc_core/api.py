@@ -44,7 +44,7 @@ from lalaloc_core.localise.answers.turns import Turn, compose_turn
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight, known_heading, stated_height
-from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING, check_height_m
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING, check_height_m
 from lalaloc_core.localise.search.pipeline import run_steps
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.localise.tracking import Odometry, TrackState
@@ -242,7 +242,7 @@ class LaLaLoc:
         if len(read) == 1:
             ground = AlbumGround.of_plan(ids[0], read[0], grids[0])
         else:
-            ground = AlbumGround.of_venue(ids, MergedPlans.of(read, grids, read[0].camera_height_m))
+            ground = AlbumGround(tuple(ids), MergedPlans.of(read, grids, read[0].camera_height_m))
         album = solve_album(
             ground,
             self._model.encoder,

@@ -25,7 +25,6 @@ LAYERS = {
     "lalaloc_core.conditions": 0,
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.files": 0,
-    "lalaloc_core.model_folder": 0,
     "lalaloc_core.configuration": 1,
     # The query side.
     "lalaloc_core.floorplan": 1,

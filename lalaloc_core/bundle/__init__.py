@@ -23,4 +23,4 @@ from lalaloc_core.bundle.manifest import (
     ViewManifest,
 )
 from lalaloc_core.bundle.prediction_errors import PredictionErrors
-from lalaloc_core.model_folder import MANIFEST_NAME, default_bundle
+from lalaloc_core.files import MANIFEST_NAME, default_bundle

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from lalaloc_core.bundle.manifest import CARD_NAME, FileEntry, Manifest
 from lalaloc_core.errors import BundleError
-from lalaloc_core.files import atomic_write
-from lalaloc_core.model_folder import MANIFEST_NAME
+from lalaloc_core.files import MANIFEST_NAME, atomic_write
 
 
 @dataclass(frozen=True)

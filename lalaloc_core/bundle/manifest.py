@@ -13,7 +13,7 @@ from lalaloc_core.bundle.prediction_errors import PredictionErrors
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
-from lalaloc_core.model_folder import MANIFEST_NAME
+from lalaloc_core.files import MANIFEST_NAME
 
 # The model card, which can be corrected without changing the model's digest.
 CARD_NAME = "README.md"

@@ -92,7 +92,7 @@ def add_commands(commands: Any) -> None:
 def _localise(arguments: argparse.Namespace) -> None:
     from lalaloc_core.api import LaLaLoc
     from lalaloc_core.draw.answer import drawn_answer
-    from lalaloc_core.localise.query.stated_pose import check_height_m
+    from lalaloc_core.localise.query.query import check_height_m
 
     if arguments.heading_tolerance is not None and arguments.heading is None:
         raise InvalidInputError("--heading-tolerance needs --heading, which is missing")

@@ -12,8 +12,8 @@ from typing import Any
 from lalaloc_core.cli.options import add_options, count, positive
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.files import default_bundle
 from lalaloc_core.learn.dataset_names import GALLERIES
-from lalaloc_core.model_folder import default_bundle
 
 _GROUPS = (
     "rendering",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lalaloc_core.model_folder import default_bundle
+from lalaloc_core.files import default_bundle
 
 _Number = TypeVar("_Number", int, float)
 

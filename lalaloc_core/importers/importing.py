@@ -56,7 +56,7 @@ _OPTIONS_OF_ALL_FORMATS = {"name", "ceiling_height_m"}
 ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg", "ros"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 # Bytes at the start of a file that are matched with `Format.magic`.
-HEAD_BYTES = 65536
+_HEAD_BYTES = 65536
 # Byte order mark and white space at the start of a text file.
 _START = rb"(?:\xef\xbb\xbf)?\s*"
 
@@ -358,7 +358,7 @@ def _json_format(document: Any) -> Format:
 
 
 def _format_by_magic(content: bytes) -> Format:
-    head = content[:HEAD_BYTES]
+    head = content[:_HEAD_BYTES]
     for format in FORMATS.values():
         if format.magic is not None and format.magic.match(head):
             return format

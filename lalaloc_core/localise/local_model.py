@@ -15,7 +15,7 @@ from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Query
-from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.localise.refine import RefinementJob, refine_walls, refined_by_walls
 from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise, run_steps
 from lalaloc_core.localise.sequence import SequenceJob

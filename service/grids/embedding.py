@@ -12,7 +12,7 @@ from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.match.pose_layouts import joined_layouts, layouts_of_plans
+from lalaloc_core.localise.match.pose_grid import joined_layouts, layouts_of_plans
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 from service.errors import PlanTooLargeError
 from service.settings import Settings

@@ -17,7 +17,8 @@ from lalaloc_core.localise.answers.compose import read_photograph
 from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.encode.features import encodes_spheres
 from lalaloc_core.localise.query import Query
-from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.taken import Taken
 from service.capacity.admission_control import Slots
@@ -191,10 +192,8 @@ def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
         )
 
     ids = tuple(record.id for record in ground.records)
-    if ground.merged is None:
-        return AlbumGround.of_plan(ids[0], stated(ground.plan), ground.grid)
-    merged = AlbumGround.of_venue(ids, ground.merged)
-    return replace(merged, plans=tuple(map(stated, merged.plans)), plan=stated(merged.plan))
+    merged = ground.merged or MergedPlans.of_plan(ground.plan, ground.grid)
+    return AlbumGround(ids, replace(merged, plans=tuple(map(stated, merged.plans)), plan=stated(merged.plan)))
 
 
 def _misfit(places: AlbumGround, plan_id: str | None, room_id: str | None) -> str | None:

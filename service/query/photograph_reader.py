@@ -11,7 +11,7 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
-from lalaloc_core.localise.query.stated_pose import known_heading
+from lalaloc_core.localise.query.query import known_heading
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
 from lalaloc_core.photograph.overlap import TURN_SIDE

@@ -14,7 +14,7 @@ from lalaloc_core.errors import InvalidStateError
 from lalaloc_core.localise.answers.compose import compose_tracked
 from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.localise.tracking import TrackState
 from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps

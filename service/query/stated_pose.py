@@ -6,7 +6,8 @@ import numpy as np
 
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.query import CameraHeight, Hints, Near, rooms_named, stated_pose
+from lalaloc_core.localise import query
+from lalaloc_core.localise.query import CameraHeight, Hints, Near, rooms_named
 from service.grids import check_height_m
 from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HeightFields, HintFields, PlanPoint
@@ -17,7 +18,7 @@ def stated_height(form: HeightFields, record: PlanRecord) -> CameraHeight:
     """Return the camera height in the request, else the plan's, else an unknown one."""
     if form.camera_height_m is not None:
         check_height_m(record, form.camera_height_m)
-    return stated_pose.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
+    return query.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
 
 
 def stated_hints(form: HintFields | SessionDocument, plan: FloorPlan) -> Hints:

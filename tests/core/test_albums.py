@@ -144,7 +144,7 @@ def test_memory_of_another_plan_is_not_used(
 ) -> None:
     memory = AlbumMemory()
     solve_album(ground, encoder, photographs[:1], memory=memory)
-    document = ground.plans[0].to_dict() | {"name": "changed"}
+    document = ground.plan.to_dict() | {"name": "changed"}
     changed = AlbumGround.of_plan("flat", FloorPlan.from_dict(document), ground.grid)
     seen: list[int] = []
     solve_album(changed, encoder, photographs[:1], memory=memory, progress=seen.append)

@@ -17,7 +17,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION, generate_home
 from lalaloc_core.localise.match import Layouts, layouts_at
-from lalaloc_core.localise.match.pose_layouts import layouts_of_plans
+from lalaloc_core.localise.match.pose_grid import layouts_of_plans
 from lalaloc_core.render.gradient import free_travel_m, log_distance_gradient, log_profile_gradient
 from lalaloc_core.render.layout import RenderedLayout, render_layout
 from lalaloc_core.render.profile import wall_profile

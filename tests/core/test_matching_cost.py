@@ -17,7 +17,7 @@ from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import Layouts, MatchingConfig, MatchingCost
 from lalaloc_core.localise.match.cost_terms import class_losses, precisions
-from lalaloc_core.localise.match.pose_layouts import SeenThrough
+from lalaloc_core.localise.match.pose_grid import SeenThrough
 from lalaloc_core.localise.query import (
     CameraHeight,
     PredictedCeiling,

@@ -256,7 +256,7 @@ class TestLevels:
         moves = Odometry.of_stds(0.5, 0.0, 0.0, EXACT)
         arrived = []
         for place in ((1.0, 1.0), (5.0, 1.2)):
-            start = at(ground.grid, tuple(np.add(place, ground.shift_m[0])), 0.0)
+            start = at(ground.grid, tuple(np.add(place, ground.merged.shift_m[0])), 0.0)
             belief = ground.moved(start, SECTORS, moves)
             arrived.append(belief[ground.graph.first[1] :].sum())
         assert arrived[0] == 0.0
@@ -264,7 +264,7 @@ class TestLevels:
 
     def test_levels_without_stairs_are_joined_everywhere(self, encoders: PhotographEncoder) -> None:
         ground = building(encoders, [level_of(LOWER, STAIRS, stairs=name) for name in (None, None, "stairs")])
-        start = at(ground.grid, tuple(np.add((1.0, 1.0), ground.shift_m[0])), 0.0)
+        start = at(ground.grid, tuple(np.add((1.0, 1.0), ground.merged.shift_m[0])), 0.0)
         belief = ground.moved(start, SECTORS, None)
         arrived = np.add.reduceat(belief.sum(axis=1), ground.graph.first[:-1])
         assert arrived[1] == pytest.approx(0.01)

@@ -12,7 +12,7 @@ from ezdxf.filemanagement import new as new_dxf
 from scipy import ndimage
 
 from lalaloc_core.importers import ImportedPlan, import_plan
-from lalaloc_core.importers.common.floors import find_floor
+from lalaloc_core.importers.common.geometry import find_floor
 from tests.importers.conftest import dxf_file, lines, shapes, zip_file
 from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import SETTINGS, _picture

@@ -18,7 +18,7 @@ from lalaloc_core.importers.common.geometry import cross, point_xy, polygons_fro
 from lalaloc_core.importers.common.sketch import Point, SketchedOpening
 
 # Limits of wall thickness (m), of the sine between opening and wall, and of the length of an opening (m).
-MAX_WALL_THICKNESS_M = 0.7
+_MAX_WALL_THICKNESS_M = 0.7
 _STRAIGHT = math.sin(math.radians(12.0))
 _MIN_LENGTH_M = 0.25
 # Rounding of points that should lie on a wall (m).
@@ -27,7 +27,7 @@ _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
 @dataclass(frozen=True)
-class PlacedOpenings:
+class _PlacedOpenings:
     """Openings on walls, openings on no wall, and the number left out because another takes their place."""
 
     openings: list[SketchedOpening]
@@ -35,7 +35,7 @@ class PlacedOpenings:
     overlapping: int
 
 
-def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> PlacedOpenings:
+def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> _PlacedOpenings:
     """Move every opening onto the walls beside it.
 
     If two openings overlap in a wall, a door is kept before a window and a window before a passage.
@@ -55,7 +55,7 @@ def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.
             _stack_window(placed, kept)
         else:
             kept.append(free)
-    return PlacedOpenings(kept, off_wall, overlapping)
+    return _PlacedOpenings(kept, off_wall, overlapping)
 
 
 class WallLines:
@@ -70,7 +70,7 @@ class WallLines:
 
     def line_at(self, point: Point, width_m: float) -> tuple[Point, Point] | None:
         """Return the ends of an opening of a width on the longest of the walls nearest to a point, None if none is."""
-        near = self._tree.query(shapely.Point(point), predicate="dwithin", distance=MAX_WALL_THICKNESS_M)
+        near = self._tree.query(shapely.Point(point), predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
         segments = [_segment(self._edges[index]) for index in near]
         apart = [segment.distance(shapely.Point(point)) for segment in segments]
         nearest = min(apart, default=0.0) + _ON_WALL_M
@@ -105,7 +105,7 @@ def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shap
     if length < 1e-6:
         return None
     along = (end - start) / length
-    near = tree.query(opening.line, predicate="dwithin", distance=MAX_WALL_THICKNESS_M)
+    near = tree.query(opening.line, predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
     beside: list[tuple[float, float]] = []
     for edge in edges[near]:
         first, second = edge[:2], edge[2:]
@@ -118,7 +118,7 @@ def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shap
         if shared < min(0.5 * length, 0.5):
             continue
         offset = cross(along, 0.5 * (first + second) - start)
-        if abs(offset) <= MAX_WALL_THICKNESS_M:
+        if abs(offset) <= _MAX_WALL_THICKNESS_M:
             # Rings are counter-clockwise: the room lies to the left of its edges.
             side = 1.0 if direction @ along > 0.0 else -1.0
             beside.append((offset, side))
@@ -136,7 +136,7 @@ def _offset_of_wall(beside: list[tuple[float, float]]) -> float | None:
     left = [offset for offset, side in beside if side > 0.0]
     right = [offset for offset, side in beside if side < 0.0]
     # The wall lies between the nearest pair of a room to its right and a room to its left.
-    pairs = [(a, b) for a in left for b in right if -1e-6 <= a - b <= MAX_WALL_THICKNESS_M]
+    pairs = [(a, b) for a in left for b in right if -1e-6 <= a - b <= _MAX_WALL_THICKNESS_M]
     if pairs:
         a, b = min(pairs, key=lambda pair: abs(pair[0] + pair[1]))
         return 0.5 * (a + b)
@@ -165,7 +165,7 @@ def _taken(
     ends = np.array([(*taken.start, *taken.end) for taken in kept]).reshape(-1, 2, 2) - start
     apart = np.abs(along[0] * ends[..., 1] - along[1] * ends[..., 0]).max(axis=1, initial=0.0)
     places = np.sort(ends @ along, axis=1)
-    overlaps = (apart <= 0.5 * MAX_WALL_THICKNESS_M) & (places[:, 0] < length) & (places[:, 1] > 0.0)
+    overlaps = (apart <= 0.5 * _MAX_WALL_THICKNESS_M) & (places[:, 0] < length) & (places[:, 1] > 0.0)
     return [(float(low), float(high)) for low, high in places[overlaps]]
 
 
@@ -173,7 +173,7 @@ def _stack_window(opening: SketchedOpening, kept: list[SketchedOpening]) -> None
     """Merge a window with the window below or above it, from the lowest sill to the highest head."""
     if opening.kind != "window" or opening.head_m is None:
         return
-    near = opening.line.buffer(0.5 * MAX_WALL_THICKNESS_M, cap_style="flat")
+    near = opening.line.buffer(0.5 * _MAX_WALL_THICKNESS_M, cap_style="flat")
     for index, window in enumerate(kept):
         if window.kind != "window" or window.head_m is None or near.intersection(window.line).length < _MIN_LENGTH_M:
             continue

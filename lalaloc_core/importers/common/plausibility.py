@@ -27,7 +27,7 @@ from lalaloc_core.importers.common.import_options import METRES_PER_UNIT
 
 # Usual ranges; a value outside gives a warning with the unit that would make it usual.
 USUAL_CEILING_M = (1.9, 6.0)
-USUAL_DOOR_M = (0.5, 3.0)
+_USUAL_DOOR_M = (0.5, 3.0)
 _USUAL_ROOM_M2 = (0.64, 1600.0)
 # Largest distance of two rooms that share a wall, and reach of an opening to either side (m).
 _USUAL_WALL_M, _REACH_M = 0.6, 0.45
@@ -136,7 +136,7 @@ def _door_warnings(document: Mapping[str, Any]) -> list[str]:
     widths = [_length(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == "door"]
     if not widths:
         return []
-    return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), USUAL_DOOR_M)
+    return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M)
 
 
 def _size_warnings(rooms: Sequence[shapely.Polygon]) -> list[str]:

@@ -101,7 +101,7 @@ def _given_scale(
     written = _written_scale(lettering.text for drawing in drawings for lettering in drawing.letterings)
     if written is not None and paper_m_per_unit is not None:
         return _checked(written * paper_m_per_unit, f"1:{written:g}, written in the drawing", subject)
-    if measured := next(filter(None, (drawn_scale(drawing, check_time) for drawing in drawings)), None):
+    if measured := next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None):
         return _checked(*measured, subject)
     if guessed := guess():
         return _checked(*guessed, subject)
@@ -151,7 +151,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
     return math.exp(middle), f"{count} dimensions written in the drawing"
 
 
-def drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
+def _drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
     """Return metres per unit of a drawing by the dimensions written in it, None if too few agree."""
     return scale_by_dimensions(written_dimensions(drawing, check_time), drawing.extent) if drawing.shapes else None
 

@@ -128,7 +128,7 @@ def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class PaintedWalls:
+class _PaintedWalls:
     """Visible parts of walls, and the gaps that are painted into them."""
 
     bodies: list[shapely.Polygon]
@@ -140,7 +140,7 @@ def cut_painted(
     patches: Sequence[Patch],
     thickest_m: float,
     check_time: Callable[[], None],
-) -> PaintedWalls:
+) -> _PaintedWalls:
     """Take what is hidden from walls, which come with their places in the order of painting, in metres.
 
     Gaps are in walls of at most `thickest_m`.
@@ -172,7 +172,7 @@ def cut_painted(
             gap = _gap(piece, walls, patches[k], thickest_m)
             if gap is not None:
                 gaps.append(gap)
-    return PaintedWalls(visible, gaps)
+    return _PaintedWalls(visible, gaps)
 
 
 def _gap(piece: shapely.Polygon, walls: shapely.STRtree, patch: Patch, thickest_m: float) -> Gap | None:

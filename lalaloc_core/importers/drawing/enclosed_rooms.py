@@ -60,7 +60,7 @@ class Gap:
         return math.dist(self.start, self.end)
 
 
-def rank_by_walls(gap: Gap) -> int | None:
+def _rank_by_walls(gap: Gap) -> int | None:
     """Rank a gap by the walls alone: accept sure gaps only."""
     return 0 if gap.is_sure else None
 
@@ -80,7 +80,7 @@ def enclose(
     closers: Sequence[BaseGeometry] = (),
     config: WallConfig = ROOM_BOUNDS.walls,
     check_time: Callable[[], None] = lambda: None,
-    rank: Callable[[Gap], int | None] = rank_by_walls,
+    rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> Enclosed:
     """Find the rooms between walls.
 
@@ -125,7 +125,7 @@ def find_gaps(
     walls: BaseGeometry,
     config: WallConfig,
     check_time: Callable[[], None] = lambda: None,
-    rank: Callable[[Gap], int | None] = rank_by_walls,
+    rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> list[Gap]:
     """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
     areas = WallAreas(

@@ -31,11 +31,7 @@ _MAX_MESSAGE = 300
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read the plan in the model space of a DWG drawing.
-
-    Raises:
-        InvalidFloorPlanError: no converter is installed, it fails, or the drawing is invalid.
-    """
+    """Read the plan in the model space of a DWG drawing."""
     plans = dxf.read(_convert(content, budget), options, budget)
     return tuple(replace(plan, report=replace(plan.report, format="dwg")) for plan in plans)
 

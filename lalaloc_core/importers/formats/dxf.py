@@ -71,11 +71,7 @@ class _Context:
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read the plan in the model space of a DXF drawing.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid, or neither the file nor the options give its unit.
-    """
+    """Read the plan in the model space of a DXF drawing."""
     document = _open(content)
     _check_blocks(document, budget)
     builder = ReportBuilder("dxf")

@@ -29,9 +29,6 @@ def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[Importe
 
     Coordinates are WGS84, or in the legacy `crs`, and become metres around their centre. With `units` they are lengths
     of a drawing.
-
-    Raises:
-        InvalidFloorPlanError: the document is invalid, or its coordinates cannot be converted.
     """
     features = list(parse_features(document, budget))
     units = document.get("units") if isinstance(document, Mapping) else None

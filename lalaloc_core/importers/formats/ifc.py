@@ -18,8 +18,7 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
-from lalaloc_core.importers.common.floors import find_floor, join_faces, report_floor
-from lalaloc_core.importers.common.geometry import check_coordinates, opening_line
+from lalaloc_core.importers.common.geometry import check_coordinates, find_floor, join_faces, opening_line, report_floor
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -47,11 +46,7 @@ _FIXTURES_SHARE = 0.6
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read one plan per storey with spaces, lowest first.
-
-    Raises:
-        InvalidFloorPlanError: the model is invalid or has no spaces.
-    """
+    """Read one plan per storey with spaces, lowest first."""
     try:
         return _read(content, options, budget)
     except (InvalidFloorPlanError, RecursionError):

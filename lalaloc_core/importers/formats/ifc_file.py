@@ -28,11 +28,7 @@ FURNISHINGS = ("IfcFlowTerminal", "IfcFurnishingElement", "IfcStair", "IfcStairF
 
 
 def open_model(content: bytes) -> Any:
-    """Open a model with ifcopenshell.
-
-    Raises:
-        InvalidFloorPlanError: the file is truncated or damaged, or has a number or a placement that cannot be used.
-    """
+    """Open a model with ifcopenshell."""
     import ifcopenshell
 
     if (large := _LARGE_NUMBER.search(content)) is not None:

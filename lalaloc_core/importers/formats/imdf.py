@@ -29,11 +29,7 @@ _CATEGORIES = {"corridor": "walkway", "bathroom": "restroom", "stairs": "stairs"
 
 
 def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read one plan per level of an archive, lowest first.
-
-    Raises:
-        InvalidFloorPlanError: a file of the archive is missing or invalid.
-    """
+    """Read one plan per level of an archive, lowest first."""
     by_type = {name.rpartition("/")[2].partition(".")[0].casefold(): name for name in files}
     if "unit" not in by_type:
         found = ", ".join(sorted(files)[:10]) or "no GeoJSON at all"

@@ -19,8 +19,14 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.floors import Floor, find_floor, report_floor
-from lalaloc_core.importers.common.geometry import check_coordinates, opening_line, point_xy
+from lalaloc_core.importers.common.geometry import (
+    Floor,
+    check_coordinates,
+    find_floor,
+    opening_line,
+    point_xy,
+    report_floor,
+)
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -62,11 +68,7 @@ class _Door:
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read one plan per storey, lowest first.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid, or no cell has a geometry.
-    """
+    """Read one plan per storey, lowest first."""
     root = read_xml(content, budget)
     srs = next((found for element in root.iter() if (found := element.get("srsName"))), "")
     if _SRS_UNITS.search(srs):

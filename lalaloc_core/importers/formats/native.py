@@ -27,11 +27,7 @@ _LENGTHS = ("ceiling_height_m", "camera_height_m", "camera_height_std_m", "sill_
 
 
 def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read a plan in the native format, or a document with the member `plans`: plans with an additional `level`.
-
-    Raises:
-        InvalidFloorPlanError: a plan is invalid.
-    """
+    """Read a plan in the native format, or a document with the member `plans`: plans with an additional `level`."""
     if isinstance(document, Mapping) and "plans" in document:
         return _read_plans(document, options, budget)
     plan = _read_plan(document, options, budget)

@@ -27,11 +27,7 @@ _KINDS = ("node", "way", "relation")
 
 
 def read(source: bytes | Mapping[str, Any], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read one plan per level of an OSM XML file, or of the parsed JSON of Overpass.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid or has no indoor features.
-    """
+    """Read one plan per level of an OSM XML file, or of the parsed JSON of Overpass."""
     elements = _from_xml(source, budget) if isinstance(source, bytes) else source.get("elements")
     if not isinstance(elements, list) or not all(isinstance(element, Mapping) for element in elements):
         raise InvalidFloorPlanError("'elements' must be a list of objects; export the file from Overpass again")

@@ -49,9 +49,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """Read the plan on one page of a PDF.
 
     `metres_per_pixel` is metres per point (1/72 inch); `known_distance` is in points from the page's lower left corner.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid, or neither the page nor the options give its scale.
     """
     document, page = open_page(content, options.page)
     try:

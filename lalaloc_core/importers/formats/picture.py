@@ -37,11 +37,7 @@ _MAX_EXTENT_M = 1000.0
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read the plan in a picture, as a draft.
-
-    Raises:
-        InvalidFloorPlanError: the picture is invalid, or the options give no scale.
-    """
+    """Read the plan in a picture, as a draft."""
     gray, warmth, paper_m_per_pixel = _open(content, budget)
     builder = ReportBuilder("picture", is_draft=True)
     tones = Tones.of(gray)

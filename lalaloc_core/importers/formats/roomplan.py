@@ -60,11 +60,7 @@ class _Surface:
 
 
 def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read one plan per story of a scan.
-
-    Raises:
-        InvalidFloorPlanError: the scan is invalid, or has neither floors nor walls around a room.
-    """
+    """Read one plan per story of a scan."""
     keys = ("walls", "floors", "sections", "objects", *_OPENINGS)
     surfaces = {key: list(_objects(document, key, budget)) for key in keys}
     stories = sorted({_story(raw) for key in ("walls", "floors") for raw in surfaces[key]})

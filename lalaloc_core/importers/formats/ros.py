@@ -47,9 +47,6 @@ def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Bu
         source: files of an archive by name, or a picture in PGM without its YAML file.
         options: options of the import.
         budget: limits.
-
-    Raises:
-        InvalidFloorPlanError: the map is invalid, or has no room.
     """
     # Imported late: a map is written without the libraries of pictures.
     from lalaloc_core.importers.picture.occupancy import sketch_grid

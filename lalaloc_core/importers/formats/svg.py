@@ -93,11 +93,7 @@ class _Context:
 
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read the plan in an SVG drawing.
-
-    Raises:
-        InvalidFloorPlanError: the file is invalid, or neither the file nor the options give its scale.
-    """
+    """Read the plan in an SVG drawing."""
     root = read_xml(content, budget)
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")

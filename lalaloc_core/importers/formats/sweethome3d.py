@@ -35,7 +35,7 @@ from lalaloc_core.importers.common.sketch import (
 from lalaloc_core.importers.common.vocabulary import role_from_name
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, enclose
 
-MEMBER = "Home.xml"
+_MEMBER = "Home.xml"
 _CM = 0.01
 _DEFAULT_HEIGHT_CM = 250.0
 # Sills from here on (m) are of windows, for openings whose name is not known.
@@ -55,19 +55,15 @@ class _Storey:
 
 
 def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read one plan per level of a home.
-
-    Raises:
-        InvalidFloorPlanError: the archive has no `Home.xml`, or the home has neither walls nor rooms.
-    """
-    name = next((name for name in files if name.rpartition("/")[2].casefold() == MEMBER.casefold()), None)
+    """Read one plan per level of a home."""
+    name = next((name for name in files if name.rpartition("/")[2].casefold() == _MEMBER.casefold()), None)
     if name is None:
         raise InvalidFloorPlanError(
-            f"the Sweet Home 3D file has no {MEMBER}; open it in Sweet Home 3D 5.3 or later and save it again"
+            f"the Sweet Home 3D file has no {_MEMBER}; open it in Sweet Home 3D 5.3 or later and save it again"
         )
     root = read_xml(files[name], budget)
     if local_name(root) != "home":
-        raise InvalidFloorPlanError(f"the root element of {MEMBER} is <{local_name(root)[:50]}>; it must be <home>")
+        raise InvalidFloorPlanError(f"the root element of {_MEMBER} is <{local_name(root)[:50]}>; it must be <home>")
     storeys = _storeys(root)
     if not storeys:
         raise InvalidFloorPlanError(

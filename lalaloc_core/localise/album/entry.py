@@ -30,12 +30,12 @@ from lalaloc_core.photograph.overlap import Features
 from lalaloc_core.photograph.taken import MAX_NAME, Taken
 
 MAX_ENTRY_BYTES = 20_000
-MAX_DESCRIPTORS, DESCRIPTOR_BYTES = 256, 16
-MAX_ID = 200
+_MAX_DESCRIPTORS, _DESCRIPTOR_BYTES = 256, 16
+_MAX_ID = 200
 _MAGIC, _VERSION, _PREFIX = b"LLAP", 1, struct.Struct("<4sHI")
 _MAX_HEADER_BYTES, _MAX_SIDE = 4096, 2**16
 # A descriptor with its place.
-_RECORD = np.dtype([("bits", "u1", DESCRIPTOR_BYTES), ("place", "<u2", 2)])
+_RECORD = np.dtype([("bits", "u1", _DESCRIPTOR_BYTES), ("place", "<u2", 2)])
 _WHOLE = 2**16 - 1
 # Colours: bins of each of the two axes of CIE Lab's hue plane, as OpenCV scales them, and their borders.
 _HUES = 8
@@ -122,18 +122,18 @@ class Descriptors:
     @classmethod
     def of(cls, features: Features) -> Descriptors:
         """Return the first descriptors of features: each value over the median of its descriptor is a one."""
-        values = features.descriptor[:MAX_DESCRIPTORS]
+        values = features.descriptor[:_MAX_DESCRIPTORS]
         if not len(values):
-            return NO_DESCRIPTORS
+            return _NO_DESCRIPTORS
         ones = values > np.median(values, axis=1, keepdims=True)
-        return cls(features.place[:MAX_DESCRIPTORS], np.packbits(ones, axis=1))
+        return cls(features.place[:_MAX_DESCRIPTORS], np.packbits(ones, axis=1))
 
     def __len__(self) -> int:
         return len(self.bits)
 
 
-NO_COLOURS = np.zeros(COLOURS, np.uint8)
-NO_DESCRIPTORS = Descriptors(np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_BYTES), np.uint8))
+_NO_COLOURS = np.zeros(COLOURS, np.uint8)
+_NO_DESCRIPTORS = Descriptors(np.zeros((0, 2)), np.zeros((0, _DESCRIPTOR_BYTES), np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,8 +152,8 @@ class AlbumPhotograph:
     id: str
     view: Photograph
     taken: Taken = field(default=Taken())
-    descriptors: Descriptors = field(default=NO_DESCRIPTORS)
-    colours: UInt8[np.ndarray, "64"] = field(default_factory=lambda: NO_COLOURS)
+    descriptors: Descriptors = field(default=_NO_DESCRIPTORS)
+    colours: UInt8[np.ndarray, "64"] = field(default_factory=lambda: _NO_COLOURS)
     correction: Correction | None = None
 
     @property
@@ -226,9 +226,9 @@ def photograph_entry(id: str, view: Photograph, taken: Taken | None = None) -> A
         thumbnail=None,
         overview=None,
     )
-    descriptors = NO_DESCRIPTORS if view.overview is None else Descriptors.of(view.overview.features)
+    descriptors = _NO_DESCRIPTORS if view.overview is None else Descriptors.of(view.overview.features)
     pixels = view.thumbnail if view.sphere is None else view.sphere
-    colours = NO_COLOURS if pixels is None else _colours(pixels)
+    colours = _NO_COLOURS if pixels is None else _colours(pixels)
     return AlbumPhotograph(id=id, view=light, taken=taken or Taken(), descriptors=descriptors, colours=colours)
 
 
@@ -248,7 +248,7 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
     except ValueError as error:
         raise InvalidEntryError(f"taken_at is '{header.taken_at!s:.50}', which is no time") from error
     faults = {
-        "id": not 0 < len(header.id) <= MAX_ID or not header.id.isprintable(),
+        "id": not 0 < len(header.id) <= _MAX_ID or not header.id.isprintable(),
         "taken_at": at is not None and at.tzinfo is not None,
         "make": len(header.make) > MAX_NAME or not header.make.isprintable(),
         "model": len(header.model) > MAX_NAME or not header.model.isprintable(),
@@ -260,9 +260,9 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         if is_wrong:
             raise InvalidEntryError(f"{name} of the entry is out of range")
     colours, rest = body[header.features :][:COLOURS], body[header.features + COLOURS :]
-    if len(rest) % _RECORD.itemsize or len(rest) > MAX_DESCRIPTORS * _RECORD.itemsize:
+    if len(rest) % _RECORD.itemsize or len(rest) > _MAX_DESCRIPTORS * _RECORD.itemsize:
         raise InvalidEntryError(
-            f"the descriptors have {len(rest)} bytes; they have {_RECORD.itemsize} each, at most {MAX_DESCRIPTORS}"
+            f"the descriptors have {len(rest)} bytes; they have {_RECORD.itemsize} each, at most {_MAX_DESCRIPTORS}"
         )
     records = np.frombuffer(rest, _RECORD)
     descriptors = Descriptors(records["place"] / _WHOLE, records["bits"].copy())

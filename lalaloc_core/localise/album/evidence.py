@@ -36,10 +36,10 @@ from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 
 # Finer grid for plans of at most so many poses, and the distance (m) within which its best pose counts as exact:
 # single photographs name the right room more often than with the grid of queries.
-FINE_STEP_M, _FINE_REACH_M, _MAX_FINE = 0.25, 0.08, 8000
+_FINE_STEP_M, _FINE_REACH_M, _MAX_FINE = 0.25, 0.08, 8000
 # Logs of true over usual camera height that are tried, and the height (m) that people hold cameras at.
-OFFSETS = np.linspace(-0.36, 0.36, 9)
-USUAL_HEIGHT_M, USUAL_LOG_SD = 1.5, 0.15
+_OFFSETS = np.linspace(-0.36, 0.36, 9)
+_USUAL_HEIGHT_M, _USUAL_LOG_SD = 1.5, 0.15
 # States that are kept: of every room, at least so many, and of all.
 _PER_ROOM, _MAX_STATES = 96, 8192
 # Every so many of the poses of other homes are compared: about as many as a home has.
@@ -137,10 +137,10 @@ class SearchedPlan:
     @classmethod
     def of(cls, plan: FloorPlan, grid: PoseGrid, columns: int) -> SearchedPlan:
         """Return the plan with a fine grid, or if it is too large with the given one."""
-        if grid_size(plan, FINE_STEP_M) > _MAX_FINE:
+        if grid_size(plan, _FINE_STEP_M) > _MAX_FINE:
             reach_m = _CONFIG.grid_reach * grid.step_m
             return cls(plan, grid.poses, reach_m, BinnedGround.of(grid.layouts(plan)))
-        poses = pose_grid(plan, FINE_STEP_M)
+        poses = pose_grid(plan, _FINE_STEP_M)
         layouts = layouts_at(plan, poses, np.zeros(len(poses)), columns)
         return cls(plan, poses, _FINE_REACH_M, BinnedGround.of(layouts))
 
@@ -159,18 +159,18 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
         offset; `chance`, the log likelihood of the best of as many poses of other homes.
     """
     weights = encoder.manifest.evidence_for(view=not view.is_sphere)
-    query = encoder.query(view, None, CameraHeight(USUAL_HEIGHT_M, 0.0))
-    compared = Comparison.of(searched.plan, query, searched.reach_m, weights, OFFSETS)
-    usual = (0.5 * np.square(OFFSETS / USUAL_LOG_SD)).astype(np.float32)
+    query = encoder.query(view, None, CameraHeight(_USUAL_HEIGHT_M, 0.0))
+    compared = Comparison.of(searched.plan, query, searched.reach_m, weights, _OFFSETS)
+    usual = (0.5 * np.square(_OFFSETS / _USUAL_LOG_SD)).astype(np.float32)
     ceilings = (usual + _ceilings(searched.plan, query, weights)).astype(np.float32)
     best = np.empty((len(searched.poses), len(query.roll)), np.float32)
-    heights = np.full(len(OFFSETS), -np.inf)
+    heights = np.full(len(_OFFSETS), -np.inf)
     trusts = searched.plan.class_trusts[1][searched.poses.room_index]
     pose = np.arange(len(best))
     places = PlaceCost.of(searched.plan, query, NO_HINTS, 1.0, searched.poses.position_m, searched.poses.room_index)
     for part, log in compared.log_likelihoods(searched.binned, trusts):
         log -= ceilings[searched.poses.room_index[part], None, :]
-        heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(OFFSETS))])
+        heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(_OFFSETS))])
         best[part] = log.max(axis=2)
         if places is not None:
             best[part] -= places.of_poses(pose[part])
@@ -229,9 +229,9 @@ def _room_types(searched: SearchedPlan, query: Query, weights: MatchingWeights) 
 def _ceilings(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r j"]:
     """Return the negative log likelihood of every room's ceiling at each height."""
     if query.ceiling is None:
-        return np.zeros((len(plan.rooms), len(OFFSETS)))
-    clearance_m = plan.ceiling_heights_m[:, None] - USUAL_HEIGHT_M * np.exp(OFFSETS)
-    return weights.ceiling * weights.temperature * ceiling_costs(query.ceiling, clearance_m, OFFSETS, weights.tail)
+        return np.zeros((len(plan.rooms), len(_OFFSETS)))
+    clearance_m = plan.ceiling_heights_m[:, None] - _USUAL_HEIGHT_M * np.exp(_OFFSETS)
+    return weights.ceiling * weights.temperature * ceiling_costs(query.ceiling, clearance_m, _OFFSETS, weights.tail)
 
 
 def _log_sum(values: np.ndarray) -> float:
@@ -272,22 +272,22 @@ def camera_height(ground: AlbumGround, evidence: Sequence[Arrays]) -> tuple[floa
 
     Photographs tell the height in units of the plan, so one factor is divided between both by what is known of each.
     """
-    total = np.zeros(len(OFFSETS))
-    usual = -0.5 * np.square(OFFSETS / USUAL_LOG_SD)
-    spread = np.exp(-0.5 * np.square((OFFSETS[:, None] - OFFSETS) / _HAND_SD))
+    total = np.zeros(len(_OFFSETS))
+    usual = -0.5 * np.square(_OFFSETS / _USUAL_LOG_SD)
+    spread = np.exp(-0.5 * np.square((_OFFSETS[:, None] - _OFFSETS) / _HAND_SD))
     for arrays in evidence:
         alone = arrays["heights"] - usual
         total += np.log(spread @ np.exp(alone - alone.max()) + 1e-3)
     plan = ground.plan
-    prior_m = plan.camera_height_m if plan.states_camera_height else USUAL_HEIGHT_M
+    prior_m = plan.camera_height_m if plan.states_camera_height else _USUAL_HEIGHT_M
     stated_sd_m = DEFAULT_STD_M if plan.camera_height_std_m is None else plan.camera_height_std_m
-    log_sd = max(stated_sd_m / prior_m, 1e-3) if plan.states_camera_height else USUAL_LOG_SD
-    prior = math.log(prior_m / USUAL_HEIGHT_M)
-    total -= 0.5 * np.square(OFFSETS - prior) / (log_sd**2 + _SCALE_SD**2)
+    log_sd = max(stated_sd_m / prior_m, 1e-3) if plan.states_camera_height else _USUAL_LOG_SD
+    prior = math.log(prior_m / _USUAL_HEIGHT_M)
+    total -= 0.5 * np.square(_OFFSETS - prior) / (log_sd**2 + _SCALE_SD**2)
     share = np.exp(total - total.max())
     share /= share.sum()
-    mean = float(share @ OFFSETS)
-    sd = math.sqrt(float(share @ np.square(OFFSETS - mean)) + (OFFSETS[1] - OFFSETS[0]) ** 2 / 12.0)
+    mean = float(share @ _OFFSETS)
+    sd = math.sqrt(float(share @ np.square(_OFFSETS - mean)) + (_OFFSETS[1] - _OFFSETS[0]) ** 2 / 12.0)
     # A higher camera and a smaller plan look the same.
     part = _SCALE_SD**2 / (log_sd**2 + _SCALE_SD**2)
     moved = mean - prior

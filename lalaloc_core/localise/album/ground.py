@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,49 +25,44 @@ class AlbumGround:
 
     Attributes:
         plan_ids: ids of the plans, as pins name them.
-        plans: the plans.
-        plan: the plan, or all side by side.
-        grid: its pose grid.
-        merged: the plans side by side; None for one plan.
+        merged: the plans, side by side.
     """
 
     plan_ids: tuple[str, ...]
-    plans: tuple[FloorPlan, ...]
-    plan: FloorPlan
-    grid: PoseGrid
-    merged: MergedPlans | None = None
+    merged: MergedPlans
 
     @classmethod
     def of_plan(cls, plan_id: str, plan: FloorPlan, grid: PoseGrid) -> AlbumGround:
         """Return the ground of one plan."""
-        return cls((plan_id,), (plan,), plan, grid)
+        return cls((plan_id,), MergedPlans.of_plan(plan, grid))
 
-    @classmethod
-    def of_venue(cls, plan_ids: Sequence[str], merged: MergedPlans) -> AlbumGround:
-        """Return the ground of plans side by side, with their ids in the same order."""
-        return cls(tuple(plan_ids), merged.plans, merged.plan, merged.grid, merged)
+    @property
+    def plan(self) -> FloorPlan:
+        """The plan, or all side by side."""
+        return self.merged.plan
+
+    @property
+    def grid(self) -> PoseGrid:
+        """The pose grid of `plan`."""
+        return self.merged.grid
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the plans: what is known about photographs in other plans does not hold here."""
-        document = [list(self.plan_ids), [plan.to_dict() for plan in self.plans], self.grid.step_m]
+        document = [list(self.plan_ids), [plan.to_dict() for plan in self.merged.plans], self.grid.step_m]
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
-
-    def plan_of(self, room_index: int) -> int:
-        """Return the number of the plan that a room of `plan` belongs to."""
-        return 0 if self.merged is None else self.merged.plan_of(room_index)
 
     def room_of(self, plan_id: str, room_id: str) -> int | None:
         """Return the number of a room of `plan`; None if there is none."""
         for number, room in enumerate(self.plan.rooms):
-            if room.id == room_id and self.plan_ids[self.plan_of(number)] == plan_id:
+            if room.id == room_id and self.plan_ids[self.merged.plan_of(number)] == plan_id:
                 return number
         return None
 
     def pose(self, position_m: Float[np.ndarray, "2"], room_index: int, heading: float | None) -> PinPose:
         """Return a place in the frame of `plan` as a pose of its own plan."""
-        number, room = self.plan_of(room_index), self.plan.rooms[room_index]
-        own = position_m - self.shift_m(number)
+        number, room = self.merged.plan_of(room_index), self.plan.rooms[room_index]
+        own = position_m - self.merged.shift_m[number]
         return PinPose(
             plan_id=self.plan_ids[number],
             room_id=room.id,
@@ -81,20 +75,16 @@ class AlbumGround:
     def share(self, room_index: int, probability: float) -> RoomShare:
         """Return a room's probability."""
         room = self.plan.rooms[room_index]
-        plan_id = self.plan_ids[self.plan_of(room_index)]
+        plan_id = self.plan_ids[self.merged.plan_of(room_index)]
         return RoomShare(plan_id=plan_id, room_id=room.id, room=room.name, probability=probability)
-
-    def shift_m(self, number: int) -> Float[np.ndarray, "2"]:
-        """Return the translation (m) of a plan into the frame of `plan`."""
-        return np.zeros(2) if self.merged is None else self.merged.shift_m[number]
 
     def position_of(self, plan_id: str, x_m: float, y_m: float) -> tuple[Float[np.ndarray, "2"], int] | None:
         """Return a place of a plan in the frame of `plan`, and its room, the nearest one; None for an unknown plan."""
         if plan_id not in self.plan_ids:
             return None
         number = self.plan_ids.index(plan_id)
-        position = np.array([x_m, y_m]) + self.shift_m(number)
-        own = [index for index in range(len(self.plan.rooms)) if self.plan_of(index) == number]
+        position = np.array([x_m, y_m]) + self.merged.shift_m[number]
+        own = [index for index in range(len(self.plan.rooms)) if self.merged.plan_of(index) == number]
         inside = int(self.plan.room_index_at(position[None])[0])
         if inside in own:
             return position, inside

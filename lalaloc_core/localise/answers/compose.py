@@ -37,7 +37,7 @@ from lalaloc_core.localise.belief import (
 )
 from lalaloc_core.localise.localisability.reports import step_after
 from lalaloc_core.localise.query import Query
-from lalaloc_core.localise.query.stated_pose import KnownHeading
+from lalaloc_core.localise.query.query import KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.tracking_filter import Tracked

@@ -13,7 +13,7 @@ from lalaloc_core.localise.belief import union_of_arcs
 from lalaloc_core.localise.localisability.reports import AdvisedStep
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate
-from lalaloc_core.localise.query.stated_pose import HeadingSource
+from lalaloc_core.localise.query.query import HeadingSource
 from lalaloc_core.localise.search.pipeline import Localisation, SearchStage
 from lalaloc_core.photograph import Assumed, Photograph
 

@@ -14,7 +14,7 @@ from lalaloc_core.localise.answers.compose import compose_answer
 from lalaloc_core.localise.answers.documents import Angle, FilmReading, Ground, Spot, TurnAnswer
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
-from lalaloc_core.localise.query.stated_pose import KnownHeading
+from lalaloc_core.localise.query.query import KnownHeading
 from lalaloc_core.localise.refine import RefinementJob
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
 from lalaloc_core.localise.sequence import Motion, SequenceJob

@@ -130,7 +130,7 @@ def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.nd
     return np.log(areas_m2[poses.room_index] / count[poses.room_index])
 
 
-class SortedPlaces:
+class _SortedPlaces:
     """Places sorted by x, as a venue has tens of thousands, few of which are near a candidate."""
 
     def __init__(self, position: Float[np.ndarray, "m 2"], heading: Float[np.ndarray, "m"], query: Query) -> None:
@@ -170,12 +170,12 @@ class WeightedPlaces:
     heading: Float[np.ndarray, "m"]
     weight: Float[np.ndarray, "m"]
     poses: int
-    counted: SortedPlaces | None = None
+    counted: _SortedPlaces | None = None
 
     def posterior(self, candidates: Sequence[Candidate]) -> Posterior:
         """Return the posterior with the probabilities of candidates, the answer first."""
         answer, weight, left, shares = candidates[0], self.weight, self.weight.copy(), []
-        places = self.counted or SortedPlaces(self.position, self.heading, self.query)
+        places = self.counted or _SortedPlaces(self.position, self.heading, self.query)
         for candidate in candidates:
             near = places.near(candidate, RIGHT_WITHIN_M)
             shares.append(float(left[near].sum()))
@@ -232,7 +232,7 @@ def weighted_places(
         counted = _ties_at_their_ends(position, heading, mode, ends, query)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return WeightedPlaces(query, pose, position, heading, weight, len(grid.poses), SortedPlaces(*counted, query))
+    return WeightedPlaces(query, pose, position, heading, weight, len(grid.poses), _SortedPlaces(*counted, query))
 
 
 def _modes(
@@ -243,7 +243,7 @@ def _modes(
     separation_m: float,
 ) -> Int[np.ndarray, "m"]:
     """Return the first candidate near each pair and at about its heading; -1 for none."""
-    mode, places = np.full(len(position), -1), SortedPlaces(position, heading, query)
+    mode, places = np.full(len(position), -1), _SortedPlaces(position, heading, query)
     for index, start in reversed(list(enumerate(starts))):
         mode[places.near(start, separation_m)] = index
     return mode
@@ -254,7 +254,7 @@ def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int
     head = np.arange(len(ends))
     position = np.stack([end.position_m for end in ends])
     heading = np.array([query.roll[end.hypothesis] + end.frame_heading for end in ends])
-    left, places = np.ones(len(ends), bool), SortedPlaces(position, heading, query)
+    left, places = np.ones(len(ends), bool), _SortedPlaces(position, heading, query)
     for index in ranking(np.array([end.total_cost for end in ends]), position, heading):
         if left[index]:
             same = places.near(ends[index], separation_m)

@@ -181,10 +181,10 @@ class _Belief:
 
     @cached_property
     def _near(self) -> Float[np.ndarray, "n n"]:
-        return near_each_other(self.poses.position_m).astype(float)
+        return _near_each_other(self.poses.position_m).astype(float)
 
 
-def near_each_other(position_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n n"]:
+def _near_each_other(position_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n n"]:
     """Return which places are within 1 m of each other."""
     return np.hypot(*(position_m[:, None] - position_m[None]).T) < RIGHT_WITHIN_M
 
@@ -298,7 +298,7 @@ class _Photographs:
         likelihood[passed] = 0.0
         rows = np.searchsorted(reached, drawn[passed])
         likelihood[np.ix_(passed, reached)] = self._likelihoods(behind, rows, shown)[:, 0]
-        return belief.told(likelihood, near=near_each_other(position_m))
+        return belief.told(likelihood, near=_near_each_other(position_m))
 
     def _doors(self) -> list[_Door]:
         """Return the nearest doors of the most probable place."""

@@ -101,8 +101,8 @@ class Draw(NamedTuple):
     mistaken: dict[int, float]
 
 
-# Outcomes of photographs at each place.
-Outcomes = dict[Condition, list[list[Draw]]]
+# _Outcomes of photographs at each place.
+_Outcomes = dict[Condition, list[list[Draw]]]
 
 
 def errors_of(manifest: Manifest) -> Errors:
@@ -137,7 +137,7 @@ def localisability(plan: FloorPlan, manifest: Manifest, *, coarse: bool = False,
     places = _spread(plan, max(_MIN_PLACES, round(_PLACES * share)), rng)
     search = Searches(plan, manifest, errors, step_m=step_m)
     draws = max(1, round(_DRAWS * share))
-    outcomes: Outcomes = {name: search.draws(places, name, draws, rng) for name in CONDITIONS}
+    outcomes: _Outcomes = {name: search.draws(places, name, draws, rng) for name in CONDITIONS}
     undrawn = search.draws(places, HARDEST, draws, rng, openings=False) if search.has_openings else None
     return _summary(plan, step_m, places, outcomes, undrawn)
 
@@ -285,7 +285,7 @@ def _spread(plan: FloorPlan, count: int, rng: np.random.Generator) -> PoseSet:
 
 
 def _summary(
-    plan: FloorPlan, step_m: float, places: PoseSet, outcomes: Outcomes, undrawn: list[list[Draw]] | None
+    plan: FloorPlan, step_m: float, places: PoseSet, outcomes: _Outcomes, undrawn: list[list[Draw]] | None
 ) -> Localisability:
     found: dict[Condition, Float[np.ndarray, "p"]] = {name: _shares(rows, "found") for name, rows in outcomes.items()}
     rooms: dict[Condition, Float[np.ndarray, "r"]] = {
@@ -330,7 +330,7 @@ def _mean(plan: FloorPlan, rooms: Float[np.ndarray, "r"]) -> float:
     return float(np.average(rooms[known], weights=plan.areas_m2[known]))
 
 
-def _confused(room: Int[np.ndarray, "p"], outcomes: Outcomes) -> tuple[ConfusedRooms, ...]:
+def _confused(room: Int[np.ndarray, "p"], outcomes: _Outcomes) -> tuple[ConfusedRooms, ...]:
     """Return the pairs of rooms that are confused most, each under the condition that confuses it most."""
     worst: dict[tuple[int, int], ConfusedRooms] = {}
     for condition, rows in outcomes.items():

@@ -22,8 +22,7 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match.coarse_pass import coarse_costs
 from lalaloc_core.localise.match.matching_cost import MatchingConfig, MatchingCost
-from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
-from lalaloc_core.localise.match.pose_layouts import Layouts, layouts_at
+from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts, Layouts, layouts_at
 from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import pose_grid
 

@@ -51,7 +51,7 @@ from lalaloc_core.localise.match.cost_terms import (
     room_type_losses,
     smoothed,
 )
-from lalaloc_core.localise.match.pose_layouts import Layouts
+from lalaloc_core.localise.match.pose_grid import Layouts
 from lalaloc_core.localise.query import PredictedRoomType, Query
 
 # Pairs compared at a time, few enough to stay in the processor's cache.

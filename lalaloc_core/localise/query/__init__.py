@@ -1,7 +1,6 @@
 """Query: an encoded photograph, and what is stated about its camera.
 
-Begin with `query.py`. `stated_pose.py` has the height and heading that the caller, the metadata or the plan state;
-`hints.py` has priors of the place.
+Begin with `query.py`; `hints.py` has priors of the place.
 """
 
 from lalaloc_core.localise.query.hints import (
@@ -15,7 +14,11 @@ from lalaloc_core.localise.query.hints import (
     rooms_named,
 )
 from lalaloc_core.localise.query.query import (
+    DEFAULT_STD_M,
+    UNKNOWN_RANGE_M,
+    CameraHeight,
     Candidate,
+    KnownHeading,
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,
@@ -25,13 +28,7 @@ from lalaloc_core.localise.query.query import (
     SeenObject,
     SeenObjects,
     WallDirection,
-    rolled,
-)
-from lalaloc_core.localise.query.stated_pose import (
-    DEFAULT_STD_M,
-    UNKNOWN_RANGE_M,
-    CameraHeight,
-    KnownHeading,
     known_heading,
+    rolled,
     stated_height,
 )

@@ -37,7 +37,7 @@ class DescentResult(NamedTuple):
 
 def descend(problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = lambda: True) -> RefinementResult | None:
     """Run the optimiser of the settings; None if the result is not `wanted` any more, asked before each iteration."""
-    method = adam if config.method == "adam" else levenberg_marquardt
+    method = adam if config.method == "adam" else _levenberg_marquardt
     found = method(problem, config, wanted)
     return None if found is None else problem.result(*found)
 
@@ -67,7 +67,7 @@ def refine_walls(
     return None if result is None else replace(result, latent_distance=None)
 
 
-def levenberg_marquardt(
+def _levenberg_marquardt(
     problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = lambda: True
 ) -> DescentResult | None:
     """Damped Gauss-Newton with Marquardt's scaling; each pose has its own damping and stops on its own."""

@@ -20,7 +20,7 @@ from lalaloc_core.render.gradient import ProfileJacobian
 from lalaloc_core.render.profile import wall_profile
 
 # Function of wall profiles (k, columns), camera and ceiling heights (k,), compared with the targets (k, d).
-Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
+_Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 class PoseOptimiser:
@@ -28,7 +28,7 @@ class PoseOptimiser:
 
     def __init__(
         self,
-        embedding: Embedding,
+        embedding: _Embedding,
         columns: int,
         *,
         norm: Norm = "l2",
@@ -68,7 +68,7 @@ class _EmbeddedProblem(Problem):
     """Residuals of embedded layouts, differentiated in forward mode."""
 
     def __init__(
-        self, embedding: Embedding, columns: int, norm: Norm, job: RefinementJob, device: torch.device
+        self, embedding: _Embedding, columns: int, norm: Norm, job: RefinementJob, device: torch.device
     ) -> None:
         super().__init__(columns, norm, job, torch.empty(0, device=device))
         self._embedding = embedding

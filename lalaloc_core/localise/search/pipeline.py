@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Literal, TypeVar
 
 from lalaloc_core.bundle import ConfidenceModel
@@ -237,27 +238,42 @@ def localise_steps(
     hints.check(plan)
     search = _Search(plan, grid, encoder, query, config=config, clock=clock, hints=hints, top_k=top_k)
     resampling = refine != "none" and config.vdr_candidates > 0
-    if refine != "lpo":
-        return search.localisation(search.without_lpo(resampling=resampling))
+    stages: list[_Stage] = []
     # If walls are compared, refinement begins with the grid's candidates, and VDR runs on demand.
-    before_lpo = None
-    if config.every_stage or not search.by_walls:
-        before_lpo = search.without_lpo(resampling=resampling)
-    starts = search.modes if search.by_walls or before_lpo is None else before_lpo
-    with clock.stage("lpo"):
-        result = yield search.lpo_job(starts)
-        after_lpo = None if result is None else search.after_lpo(starts, result)
-    if after_lpo is not None:
-        return search.localisation(after_lpo)
-    return search.localisation(search.without_lpo(resampling=resampling) if before_lpo is None else before_lpo)
+    if refine != "lpo" or config.every_stage or not search.by_walls:
+        stages = search.before_lpo(resampling=resampling)
+    if refine == "lpo":
+        start = search.retrieved if search.by_walls else stages[-1]
+        with clock.stage("lpo"):
+            result = yield search.lpo_job(start)
+            if result is not None:
+                stages.append(search.after_lpo(start, result))
+    return search.localisation(stages or search.before_lpo(resampling=resampling))
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """Result of a stage.
+
+    Attributes:
+        candidates: the candidates, best first.
+        modes: the mode of the grid that each of them comes from.
+        places: the probable places, if the stage moved any.
+    """
+
+    name: SearchStage
+    candidates: list[Candidate]
+    modes: list[Candidate]
+    places: WeightedPlaces | None = None
 
 
 class _Search:
-    """One query in one plan: its candidates and the results of its stages.
+    """One query in one plan: the poses of its grid that fit best, and the stages that follow.
 
     Attributes:
         query: the query, with an unknown heading if the picture contradicts the given one.
         by_walls: whether poses are compared by their wall profiles.
+        retrieved: the modes of the grid's posterior, without latent distances.
     """
 
     def __init__(
@@ -274,27 +290,25 @@ class _Search:
     ) -> None:
         """Retrieve the modes."""
         self._plan, self._grid, self._encoders, self._config = plan, grid, encoder, config
-        self._weights = encoder.manifest.evidence_for(view=query.is_view)
-        self._clock, self._hints, self._top_k = clock, hints, top_k
-        weights, matching = self._weights, config.matching
-        reach_m = matching.grid_reach * grid.step_m
+        weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
+        self._weights, self._clock, self._hints, self._top_k = weights, clock, hints, top_k
 
         def by_chance(query: Query, room: int) -> float | None:
+            reach_m = matching.grid_reach * grid.step_m
             return cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching, room=room)
 
         with clock.stage("retrieve"):
             # Of a merged plan, it depends on the room that is found.
             helper = None if plan.room_trust else encoder.helper()
             beside = None if helper is None else helper.submit(by_chance, query, 0)
-            given = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
-            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=given)
-            self.query = query = query.searched if self._doubted and query.searched is not None else query
-            if given is None or self._doubted:
-                given = grid_costs(plan, grid, query, weights, matching, hints)
-            self._costs = costs = given
+            costs = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
+            doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=costs)
+            query = query.searched if doubted and query.searched is not None else query
+            if costs is None or doubted:
+                costs = grid_costs(plan, grid, query, weights, matching, hints)
             # Refined candidates can meet and become one; spare ones then take their places.
             minimum = config.min_starts(query)
-            self.modes = retrieve(
+            modes = retrieve(
                 costs,
                 grid,
                 query,
@@ -303,31 +317,18 @@ class _Search:
                 margin=config.alike_margin,
                 limit=config.max_candidates + top_k,
             )
-            self._lpo_count = config.starts(query, self.modes)
-            self._grid_cost = float(costs.cost.min())
-            self._by_chance = (
-                by_chance(query, self.modes[0].room_index) if beside is None or self._doubted else beside.result()
-            )
+            chance = by_chance(query, modes[0].room_index) if beside is None or doubted else beside.result()
+        self.query, self._costs, self._by_chance, self._doubted = query, costs, chance, doubted
         self.by_walls = matching.compares_profiles(query)
-        self._prior = area_shares(grid.poses, plan.areas_m2)
-        # The mode that each candidate of `without_lpo` comes from.
-        self._modes_before_lpo = self.modes
-        # The modes that LPO refined and their candidates after it, in the same order; empty until then.
-        self._lpo_modes, self._lpo_candidates = list[Candidate](), list[Candidate]()
-        # Probable places after the stages so far; None until they are needed.
-        self._places: WeightedPlaces | None = None
-        self._best = dict[SearchStage, Candidate]()
-        self._signals = dict[SearchStage, Signals]()
-        self._stage: SearchStage = "retrieval"
+        self.retrieved = _Stage("retrieval", modes, modes)
+        self._refined = config.starts(query, modes)
 
-    def without_lpo(self, *, resampling: bool) -> list[Candidate]:
-        """Return the candidates after retrieval and, with `resampling`, after VDR; record both stages."""
-        config, camera_height_m = self._config, self._grid.camera_height_m
-        first = with_latents(self._plan, self._encoders, self.query, self.modes[:1], camera_height_m)
-        candidates = first + self.modes[1:]
-        self._record("retrieval", first[0], self._posterior(first))
+    def before_lpo(self, *, resampling: bool) -> list[_Stage]:
+        """Return the results of retrieval and, with `resampling`, of VDR."""
+        config, modes = self._config, self.retrieved.modes
+        retrieved = replace(self.retrieved, candidates=self._with_latents(modes[:1]) + modes[1:])
         if not resampling:
-            return candidates
+            return [retrieved]
         count = config.vdr_candidates
         with self._clock.stage("vdr"):
             resampled = [
@@ -336,82 +337,90 @@ class _Search:
                     self._encoders,
                     self.query,
                     candidate,
-                    camera_height_m=camera_height_m,
+                    camera_height_m=self._grid.camera_height_m,
                     samples=config.vdr_samples,
                     radius_m=config.vdr_radius_steps * self._grid.step_m,
                     matching=config.matching,
                     hints=self._hints,
                 )
-                for candidate in candidates[:count]
+                for candidate in retrieved.candidates[:count]
             ]
         order = ranked(resampled, self.query)
-        self._modes_before_lpo = [self.modes[index] for index in order] + self.modes[count:]
-        resampled = [resampled[index] for index in order]
-        self._record("vdr", resampled[0], self._posterior(resampled[:1]))
-        return resampled + candidates[count:]
+        candidates = [resampled[index] for index in order] + retrieved.candidates[count:]
+        return [retrieved, _Stage("vdr", candidates, [modes[index] for index in order] + modes[count:])]
 
-    def lpo_job(self, candidates: list[Candidate]) -> RefinementJob:
-        """Return the refinement job of the first candidates."""
-        matching = self._config.matching
-        starts = candidates[: self._lpo_count]
-        return refinement_job(self._plan, self.query, starts, self._grid.camera_height_m, self._weights, matching)
+    def lpo_job(self, start: _Stage) -> RefinementJob:
+        """Return the refinement job of the first candidates of a stage."""
+        candidates, matching = start.candidates[: self._refined], self._config.matching
+        return refinement_job(self._plan, self.query, candidates, self._grid.camera_height_m, self._weights, matching)
 
-    def after_lpo(self, candidates: list[Candidate], result: RefinementResult) -> list[Candidate]:
-        """Return the candidates of `lpo_job` after LPO: the refined ones, best first, then the others."""
-        starts, others = candidates[: self._lpo_count], candidates[self._lpo_count :]
-        # By walls, LPO starts at the modes themselves; otherwise at the candidates of `without_lpo`.
-        modes = self.modes if self.by_walls else self._modes_before_lpo
-        self._lpo_modes = modes[: self._lpo_count]
-        self._lpo_candidates = refined_candidates(
-            self._plan, self._encoders, self.query, starts, result, self._config.matching, self._hints
-        )
-        self._places, self._stage = None, "lpo"
-        return [self._lpo_candidates[index] for index in ranked(self._lpo_candidates, self.query)] + others
+    def after_lpo(self, start: _Stage, result: RefinementResult) -> _Stage:
+        """Return the result of LPO: the refined candidates of `lpo_job`, best first, then the others."""
+        begins, others = start.candidates[: self._refined], start.candidates[self._refined :]
+        matching, hints = self._config.matching, self._hints
+        ends = refined_candidates(self._plan, self._encoders, self.query, begins, result, matching, hints)
+        candidates = [ends[index] for index in ranked(ends, self.query)] + others
+        return _Stage("lpo", candidates, start.modes, self._places(start.modes[: self._refined], ends))
 
-    def localisation(self, candidates: list[Candidate]) -> Localisation:
-        """Return the distinct candidates of the last stage, best first, with everything that was recorded."""
-        config, hints, camera_height_m = self._config, self._hints, self._grid.camera_height_m
-        wanted = max(self._top_k, self._lpo_count) if config.by_probability else self._top_k
-        answers = distinct(candidates, self.query, config.separation_m, wanted)
-        found = self._posterior(answers)
+    def localisation(self, stages: Sequence[_Stage]) -> Localisation:
+        """Return the distinct candidates of the last stage, best first, and the evidence after every stage."""
+        config, hints, last = self._config, self._hints, stages[-1]
+        by_stage = {stage.name: self._first(stage) for stage in stages[:-1]}
+        wanted = max(self._top_k, self._refined) if config.by_probability else self._top_k
+        answers = distinct(last.candidates, self.query, config.separation_m, wanted)
+        found = self._posterior(last, answers)
         if config.by_probability:
-            answers, found = _by_probability(answers, found, self._top_k, self._posterior)
+            answers, found = _by_probability(answers, found, self._top_k, partial(self._posterior, last))
         if self.by_walls:
-            answers = with_latents(self._plan, self._encoders, self.query, answers, camera_height_m)
-        if self._stage == "lpo" or config.by_probability:
-            self._record(self._stage, answers[0], found)
+            answers = self._with_latents(answers)
+        is_recorded = last.name == "lpo" or config.by_probability
+        by_stage[last.name] = (answers[0], found) if is_recorded else self._first(last)
         missed = hints.missed(answers[0].position_m, answers[0].room_index)
         if hints.strict:
             missed = missed_hints(self._plan, self._costs, self._weights, hints)
+        grid_cost = float(self._costs.cost.min())
         return Localisation(
             query=self.query,
             candidates=answers,
             posterior=found,
-            stage=self._stage,
-            signals=self._signals,
+            stage=last.name,
+            signals={
+                name: signals_of(self.query, best, posterior, grid_cost, self._by_chance)
+                for name, (best, posterior) in by_stage.items()
+            },
             heading_contradicted=self._doubted,
             hints_missed=missed,
-            best=self._best,
+            best={name: best for name, (best, _) in by_stage.items()},
             timings_ms=self._clock.timings_ms,
         )
 
-    def _posterior(self, candidates: list[Candidate]) -> Posterior:
-        """Return the posterior after the stages so far, with the probabilities of some candidates."""
-        if self._places is None:
-            self._places = weighted_places(
-                self._costs,
-                self._prior,
-                self.query,
-                starts=self._lpo_modes,
-                ends=self._lpo_candidates,
-                temperature=self._weights.temperature,
-                separation_m=self._config.separation_m,
-            )
-        return self._places.posterior(candidates)
+    def _first(self, stage: _Stage) -> tuple[Candidate, Posterior]:
+        """Return the best candidate after a stage, with its posterior."""
+        return stage.candidates[0], self._posterior(stage, stage.candidates[:1])
 
-    def _record(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
-        self._stage, self._best[stage] = stage, candidate
-        self._signals[stage] = signals_of(self.query, candidate, found, self._grid_cost, self._by_chance)
+    def _posterior(self, stage: _Stage, candidates: list[Candidate]) -> Posterior:
+        """Return the posterior after a stage, with the probabilities of some candidates."""
+        return (stage.places or self._unmoved).posterior(candidates)
+
+    @cached_property
+    def _unmoved(self) -> WeightedPlaces:
+        """Probable places before LPO."""
+        return self._places([], [])
+
+    def _places(self, starts: Sequence[Candidate], ends: Sequence[Candidate]) -> WeightedPlaces:
+        """Return the probable places after some modes were refined."""
+        return weighted_places(
+            self._costs,
+            area_shares(self._grid.poses, self._plan.areas_m2),
+            self.query,
+            starts=starts,
+            ends=ends,
+            temperature=self._weights.temperature,
+            separation_m=self._config.separation_m,
+        )
+
+    def _with_latents(self, candidates: list[Candidate]) -> list[Candidate]:
+        return with_latents(self._plan, self._encoders, self.query, candidates, self._grid.camera_height_m)
 
 
 def _by_probability(

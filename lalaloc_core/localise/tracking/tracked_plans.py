@@ -164,22 +164,16 @@ class TrackedPlans:
     """One plan, or p plans of a venue laid side by side.
 
     Attributes:
-        plan: the plan.
-        grid: its pose grid.
+        merged: the plans, side by side.
         graph: links of the poses.
         keys: (p,) keys of the plans; they change with the plans.
-        first_room: (p,) number of the first room of each plan.
-        shift_m: (p, 2) translation (m) of each plan.
         passages: ways between the plans; None for one plan.
         left_out: plans that are not searched; None if there are none.
     """
 
-    plan: FloorPlan
-    grid: PoseGrid
+    merged: MergedPlans
     graph: WalkGraph
     keys: tuple[str, ...]
-    first_room: Int[np.ndarray, "p"]
-    shift_m: Float[np.ndarray, "p 2"]
     passages: Passages | None = None
     left_out: LeftOut | None = None
 
@@ -187,7 +181,7 @@ class TrackedPlans:
     def of_plan(cls, plan: FloorPlan, grid: PoseGrid, graph: WalkGraph | None = None) -> TrackedPlans:
         """Return one plan by itself; its links are made unless they are given."""
         graph = graph or WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m)
-        return cls(plan, grid, graph, ("",), np.zeros(1, int), np.zeros((1, 2)))
+        return cls(MergedPlans.of_plan(plan, grid), graph, ("",))
 
     @classmethod
     def of_levels(
@@ -210,8 +204,17 @@ class TrackedPlans:
             left_out: plans that are not searched.
         """
         passages = Passages.between(plans, levels, merged.grid.poses.room_index)
-        graph = WalkGraph.joined(graphs)
-        return cls(merged.plan, merged.grid, graph, tuple(keys), merged.first_room, merged.shift_m, passages, left_out)
+        return cls(merged, WalkGraph.joined(graphs), tuple(keys), passages, left_out)
+
+    @property
+    def plan(self) -> FloorPlan:
+        """The plan, or all side by side."""
+        return self.merged.plan
+
+    @property
+    def grid(self) -> PoseGrid:
+        """The pose grid of `plan`."""
+        return self.merged.grid
 
     def moved(self, states: States, sectors: int, odometry: Odometry | None) -> Float[np.ndarray, "n k"]:
         """Return the belief over all poses and sectors after a motion; see `walk_motion.moved`."""
@@ -220,10 +223,6 @@ class TrackedPlans:
         staying, arrived = self.passages.taken(self.graph, states, odometry)
         # People turn on stairs, so all headings are possible after them.
         return moved(self.graph, staying, sectors, odometry) + arrived[:, None] / sectors
-
-    def plan_of_room(self, room_index: int) -> int:
-        """Return the number of a room's plan."""
-        return int(np.searchsorted(self.first_room, room_index, side="right")) - 1
 
     def share(self, evidence: Float[np.ndarray, "n"]) -> float:
         """Return the probability that the camera is in these plans, given the evidence of a photograph at each pose."""
@@ -263,7 +262,7 @@ class TrackedPlans:
         if pose is None or number[pose.plan] < 0:
             return None
         plan = int(number[pose.plan])
-        return replace(translated(pose, self.shift_m[plan], int(self.first_room[plan])), plan=plan)
+        return replace(translated(pose, self.merged.shift_m[plan], int(self.merged.first_room[plan])), plan=plan)
 
     def left(self, state: TrackState) -> TrackState:
         """Return a state of these plans with the poses and in the frames of those that it needs."""
@@ -274,6 +273,6 @@ class TrackedPlans:
         begin = np.cumsum([0, *poses[used]])[np.searchsorted(used, plan)]
         belief = replace(state.belief, pose=state.belief.pose - self.graph.first[plan] + begin)
         own = state.pose.plan
-        pose = translated(state.pose, -self.shift_m[own], -int(self.first_room[own]))
+        pose = translated(state.pose, -self.merged.shift_m[own], -int(self.merged.first_room[own]))
         pose = replace(pose, plan=int(np.searchsorted(used, own)))
         return replace(state, plans=tuple(state.plans[number] for number in used), belief=belief, pose=pose)

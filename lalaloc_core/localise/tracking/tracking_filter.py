@@ -9,7 +9,7 @@ posterior of a single photograph (`localise.belief.posterior`). Photographs in d
 elsewhere better; f, the likelihood of an outlier, limits their effect. It is the mean of L by the prior times the odds
 of an outlier, so that an outlier is as probable in a room as in a large building. LPO refines the modes of the belief;
 its gain is evidence for a mode. The pose of the best mode is fused with the one that odometry predicts
-(`pose_fusion.py`).
+(`belief_modes.py`).
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.localise.belief import area_shares, confidence_of, signals_of
+from lalaloc_core.localise.belief import Posterior, area_shares, confidence_of, signals_of
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingCost, cost_by_chance
 from lalaloc_core.localise.query import NO_HINTS, Candidate, Hints, KnownHeading, Query
@@ -30,8 +31,16 @@ from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.refinement import refined_candidates, refinement_job, with_latents
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, SearchStage, StageClock
 from lalaloc_core.localise.search.retrieval import grid_costs
-from lalaloc_core.localise.tracking.belief_modes import ComparedStates, hypothesis_of, sector_of
-from lalaloc_core.localise.tracking.pose_fusion import carried_on, contradicted, fused, measured_pose
+from lalaloc_core.localise.tracking.belief_modes import (
+    ComparedStates,
+    Gaussian,
+    carried_on,
+    contradicted,
+    fused,
+    hypothesis_of,
+    measured_pose,
+    sector_of,
+)
 from lalaloc_core.localise.tracking.track_state import (
     COMPONENTS,
     MAX_STATES,
@@ -56,7 +65,6 @@ _LEAVING, _MAX_ODDS = 0.02, 10.0
 _LOST_BELOW, _TRACKING_FROM = 0.2, 0.5
 # Probability of its pose from which a photograph is sure by itself.
 _SURE = 0.9
-_RETRIEVAL: SearchStage = "retrieval"
 # Probability that a known heading is wrong, and the deviation (radians) of headings beyond its tolerance.
 _HEADING_DOUBT, _HEADING_STD = 0.02, math.radians(2.0)
 
@@ -118,82 +126,48 @@ def track_steps(
     Raises:
         InvalidStateError: the state is of another grid or model.
     """
-    config, clock = config or LocaliseConfig(), clock or StageClock()
-    weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
-    plan, grid = plans.plan, plans.grid
+    photograph = _Photograph(plans, encoder, query, config or LocaliseConfig())
+    clock = clock or StageClock()
     state = plans.entered(state).with_sectors(len(query.roll))
     with clock.stage("predict"):
         prediction = _predict(plans, state, odometry, known_heading, hints)
     with clock.stage("retrieve"):
-        everything, grid_cost = _compare(plans, encoder, query, prediction, config)
+        everything, grid_cost = photograph.compare(prediction)
         compared = everything.only(everything.weight > _NEGLIGIBLE_SHARE)
     starts = compared.modes()
-    refined = ends = starts
-    stage = _RETRIEVAL
     with clock.stage("lpo"):
-        job = refinement_job(plan, query, starts, grid.camera_height_m, weights, matching)
-        result = yield job
-        if result is not None:
-            refined = refined_candidates(plan, encoder, query, starts, result, matching)
-            # The photograph is rather an outlier at modes that fit worse than this.
-            followed = compared.relative_likelihood(refined) >= 2.0 * compared.outlier
-            ends = [
-                end if is_followed else start for start, end, is_followed in zip(starts, refined, followed, strict=True)
-            ]
-            stage = "lpo"
+        result = yield photograph.lpo_job(starts)
+        modes = photograph.refine(compared, starts, result)
     with clock.stage("rank"):
-        compared = compared.regained(starts, refined)
-        candidates, posterior = compared.ranked(starts, ends, top_k)
-        candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
-        by_chance = cost_by_chance(
-            encoder.cohort,
-            plan,
-            query,
-            matching.grid_reach * grid.step_m,
-            weights,
-            matching,
-            room=candidates[0].room_index,
-        )
-        model = encoder.manifest.confidence_for(view=query.is_view)
-        signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
-        confidence = confidence_of(model, stage, signals, posterior, heading_known=False)
-    fit = None if confidence is None else confidence.fit
-    in_plan = _in_plan(state.in_plan, fit)
-    probability = in_plan * posterior.position
+        compared = compared.regained(starts, modes.refined)
+        answer = photograph.rank(compared, modes, grid_cost, top_k)
+    in_plan = _in_plan(state.in_plan, answer.fit)
+    probability = in_plan * answer.posterior.position
     mode = _mode(in_plan, probability)
-    measured = measured_pose(plan, encoder, query, candidates[0])
-    own_plan = plans.plan_of_room(candidates[0].room_index)
+    best, own_plan = answer.candidates[0], plans.merged.plan_of(answer.candidates[0].room_index)
+    sure = everything.share_alone(best) >= _SURE
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
-    predicted = None if before is None or odometry is None else carried_on(before, odometry)
-    tracking = before is not None and before.mode == mode == "tracking"
-    # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
-    sure = everything.share_alone(candidates[0]) >= _SURE
-    comparable = tracking or (sure and before is not None and before.sure)
-    judged = comparable and candidates[0].information is not None
-    differing = contradicted(before, odometry, predicted, measured) if comparable else ()
-    missed = differing if judged else ()
-    # A camera that was carried elsewhere is where the photograph says.
-    if tracking and predicted is not None and not differing:
-        measured = fused(predicted, measured)
-    (x_m, y_m, heading), covariance = measured
+    measured = measured_pose(plans.plan, encoder, query, best)
+    motion = _follow(before, odometry, measured, mode, sure=sure, is_refined=best.information is not None)
+    (x_m, y_m, heading), covariance = motion.pose
     pose = TrackedPose(
         float(x_m),
         float(y_m),
         float(wrap_angle(heading)),
         covariance,
-        candidates[0].room_index,
+        best.room_index,
         probability,
         mode,
         state.number + 1,
         sure,
         own_plan,
     )
-    shares = tuple(in_plan * share for share in posterior.candidate)
-    after = _state_after(state, compared, in_plan, pose, missed, judged=judged and odometry is not None)
-    after = plans.left(after)
+    after = plans.left(_state_after(state, compared, in_plan, pose, motion))
     assert after.pose is not None
-    return Tracked(after, replace(after.pose, plan=own_plan), query, candidates, shares, fit, missed, stage)
+    pose = replace(after.pose, plan=own_plan)
+    shares = tuple(in_plan * share for share in answer.posterior.candidate)
+    return Tracked(after, pose, query, answer.candidates, shares, answer.fit, motion.missed, modes.stage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,45 +208,106 @@ def _predict(
     return _Prediction(belief * factor, prior * factor, anywhere)
 
 
-def _compare(
-    plans: TrackedPlans, encoder: LayoutEncoder, query: Query, prediction: _Prediction, config: LocaliseConfig
-) -> tuple[ComparedStates, float]:
-    """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
-    weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
-    plan, grid, sectors = plans.plan, plans.grid, len(query.roll)
-    costs = grid_costs(plan, grid, query, weights, matching)
-    number = costs.pose * sectors + sector_of(query, costs.hypothesis)
-    cost, offset = costs.cost.astype(np.float64), costs.offset
-    flat = prediction.belief.ravel()
-    likely = np.argpartition(-flat, min(_PREDICTED, len(flat) - 1))[:_PREDICTED]
-    missing = np.setdiff1d(likely, number[: costs.compared])
-    if len(missing) and matching.compares_profiles(query):
-        pose, sector = np.divmod(missing, sectors)
-        matching_cost = MatchingCost(plan, query, matching.grid_reach * grid.step_m, weights, matching)
-        more, more_offset = matching_cost.pairs(grid.layouts(plan), pose, hypothesis_of(query)[sector])
-        left = ~np.isin(number, missing)
-        number = np.append(number[left], missing)
-        cost, offset = np.append(cost[left], more), np.append(offset[left], more_offset)
-    pose, sector = np.divmod(number, sectors)
-    value = np.exp(-weights.temperature * (cost - cost.min()))
-    outlier, elsewhere = _elsewhere(plans, prediction, pose, prediction.prior.ravel()[number] * value)
-    weight = flat[number] * (value + outlier)
-    rest = max(float(flat.sum() - flat[number].sum()), 0.0) * outlier + elsewhere
-    total = float(weight.sum()) + rest
-    compared = ComparedStates(
-        grid=grid,
-        query=query,
-        pose=pose,
-        sector=sector,
-        cost=cost,
-        offset=offset,
-        weight=weight / total,
-        rest=rest / total,
-        outlier=outlier,
-        temperature=weights.temperature,
-        separation_m=config.separation_m,
-    )
-    return compared, float(costs.cost.min())
+@dataclass(frozen=True, eq=False)
+class _Modes:
+    """Modes of the belief: after LPO, followed where the photograph is no outlier; and the last stage that ran."""
+
+    starts: list[Candidate]
+    refined: list[Candidate]
+    ends: list[Candidate]
+    stage: SearchStage
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """The best poses, the answer first, their posterior, and the probability that the photograph is of the plan."""
+
+    candidates: list[Candidate]
+    posterior: Posterior
+    fit: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Photograph:
+    """A photograph, and the plans that it is compared with."""
+
+    plans: TrackedPlans
+    encoder: LayoutEncoder
+    query: Query
+    config: LocaliseConfig
+
+    @property
+    def _weights(self) -> MatchingWeights:
+        return self.encoder.manifest.evidence_for(view=self.query.is_view)
+
+    @property
+    def _reach_m(self) -> float:
+        return self.config.matching.grid_reach * self.plans.grid.step_m
+
+    def compare(self, prediction: _Prediction) -> tuple[ComparedStates, float]:
+        """Compare the photograph with the probable states; return their weights, and the cost of the best grid pose."""
+        plans, query, weights, matching = self.plans, self.query, self._weights, self.config.matching
+        plan, grid, sectors = plans.plan, plans.grid, len(query.roll)
+        costs = grid_costs(plan, grid, query, weights, matching)
+        number = costs.pose * sectors + sector_of(query, costs.hypothesis)
+        cost, offset = costs.cost.astype(np.float64), costs.offset
+        flat = prediction.belief.ravel()
+        likely = np.argpartition(-flat, min(_PREDICTED, len(flat) - 1))[:_PREDICTED]
+        missing = np.setdiff1d(likely, number[: costs.compared])
+        if len(missing) and matching.compares_profiles(query):
+            pose, sector = np.divmod(missing, sectors)
+            matching_cost = MatchingCost(plan, query, self._reach_m, weights, matching)
+            more, more_offset = matching_cost.pairs(grid.layouts(plan), pose, hypothesis_of(query)[sector])
+            left = ~np.isin(number, missing)
+            number = np.append(number[left], missing)
+            cost, offset = np.append(cost[left], more), np.append(offset[left], more_offset)
+        pose, sector = np.divmod(number, sectors)
+        value = np.exp(-weights.temperature * (cost - cost.min()))
+        outlier, elsewhere = _elsewhere(plans, prediction, pose, prediction.prior.ravel()[number] * value)
+        weight = flat[number] * (value + outlier)
+        rest = max(float(flat.sum() - flat[number].sum()), 0.0) * outlier + elsewhere
+        total = float(weight.sum()) + rest
+        compared = ComparedStates(
+            grid=grid,
+            query=query,
+            pose=pose,
+            sector=sector,
+            cost=cost,
+            offset=offset,
+            weight=weight / total,
+            rest=rest / total,
+            outlier=outlier,
+            temperature=weights.temperature,
+            separation_m=self.config.separation_m,
+        )
+        return compared, float(costs.cost.min())
+
+    def lpo_job(self, starts: list[Candidate]) -> RefinementJob:
+        """Return the refinement job of the modes."""
+        camera_height_m, matching = self.plans.grid.camera_height_m, self.config.matching
+        return refinement_job(self.plans.plan, self.query, starts, camera_height_m, self._weights, matching)
+
+    def refine(self, compared: ComparedStates, starts: list[Candidate], result: RefinementResult | None) -> _Modes:
+        """Return the modes after LPO; the same without a result."""
+        if result is None:
+            return _Modes(starts, starts, starts, "retrieval")
+        refined = refined_candidates(self.plans.plan, self.encoder, self.query, starts, result, self.config.matching)
+        # The photograph is rather an outlier at modes that fit worse than this.
+        followed = compared.relative_likelihood(refined) >= 2.0 * compared.outlier
+        ends = [end if follow else start for start, end, follow in zip(starts, refined, followed, strict=True)]
+        return _Modes(starts, refined, ends, "lpo")
+
+    def rank(self, compared: ComparedStates, modes: _Modes, grid_cost: float, top_k: int) -> _Answer:
+        """Return the modes by falling probability, and how well the photograph fits the plan at the first one."""
+        encoder, query, plan, grid = self.encoder, self.query, self.plans.plan, self.plans.grid
+        candidates, posterior = compared.ranked(modes.starts, modes.ends, top_k)
+        candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
+        matching, room = self.config.matching, candidates[0].room_index
+        by_chance = cost_by_chance(encoder.cohort, plan, query, self._reach_m, self._weights, matching, room=room)
+        signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
+        model = encoder.manifest.confidence_for(view=query.is_view)
+        confidence = confidence_of(model, modes.stage, signals, posterior, heading_known=False)
+        return _Answer(candidates, posterior, None if confidence is None else confidence.fit)
 
 
 def _elsewhere(
@@ -304,22 +339,48 @@ def _mode(in_plan: float, probability: float) -> Mode:
     return "tracking" if probability >= _TRACKING_FROM else "searching"
 
 
-def _state_after(
-    state: TrackState,
-    compared: ComparedStates,
-    in_plan: float,
-    pose: TrackedPose,
-    missed: tuple[Component, ...],
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    """Pose after a motion, the components of it that the photograph contradicts, and whether it counts for these."""
+
+    pose: Gaussian
+    missed: tuple[Component, ...]
+    counts: bool
+
+
+def _follow(
+    before: TrackedPose | None,
+    odometry: Odometry | None,
+    measured: Gaussian,
+    mode: Mode,
     *,
-    judged: bool,
+    sure: bool,
+    is_refined: bool,
+) -> _Followed:
+    """Fuse the measured pose with the one that odometry predicts, unless they contradict each other."""
+    if before is None or odometry is None:
+        return _Followed(measured, (), counts=False)
+    predicted = carried_on(before, odometry)
+    tracking = before.mode == mode == "tracking"
+    # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
+    comparable = tracking or (sure and before.sure)
+    differing = contradicted(before, predicted, measured) if comparable else ()
+    # A camera that was carried elsewhere is where the photograph says.
+    pose = fused(predicted, measured) if tracking and not differing else measured
+    judged = comparable and is_refined
+    return _Followed(pose, differing if judged else (), judged)
+
+
+def _state_after(
+    state: TrackState, compared: ComparedStates, in_plan: float, pose: TrackedPose, motion: _Followed
 ) -> TrackState:
     """Return the state for the next photograph."""
     most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
     bits = state.contradicted
-    if judged:
+    if motion.counts:
         mask = (1 << RECENT) - 1
         first, second, third = (
-            ((old << 1) | (name in missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
+            ((old << 1) | (name in motion.missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
         )
         bits = first, second, third
     return replace(

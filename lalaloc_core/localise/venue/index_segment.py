@@ -46,9 +46,9 @@ _MIN_CEILING_M, _MAX_CEILING_M = 2.0, 9.0
 # faiss rounds all tables in proportion to their largest entry; a limit on the ceiling's keeps the others precise.
 _MAX_CEILING_COST = 0.25
 _PARTS = AZIMUTHS + AZIMUTHS // 2 + 2
-CODE_BYTES = _PARTS // 2
+_CODE_BYTES = _PARTS // 2
 # Bytes of a code in an inverted list, with its 64-bit number; lists are padded to blocks of 32 codes.
-BYTES_PER_CODE = CODE_BYTES + 8
+_BYTES_PER_CODE = _CODE_BYTES + 8
 _BLOCK = 32
 _CHUNK = 65_536
 
@@ -57,7 +57,7 @@ def product_codes(rows: np.ndarray) -> UInt8[np.ndarray, "n b"]:
     """Return the codes of prototypes (records of type `prototypes.ROW`), two parts to a byte, the first one lower."""
     # Half-precision numbers are quantised by looking up their 16 bits.
     distance, ceiling = _quantiser(np.log(_EDGES_M)), _quantiser(np.array(_CEILING_EDGES_M))
-    code = np.empty((len(rows), CODE_BYTES), np.uint8)
+    code = np.empty((len(rows), _CODE_BYTES), np.uint8)
     openings = AZIMUTHS // 2
     for begin in range(0, len(rows), _CHUNK):
         part = rows[begin : begin + _CHUNK]
@@ -225,7 +225,7 @@ class Segment:
         """Bytes in memory, including the product codes; memory-mapped rows count as 0."""
         rows = 0 if isinstance(self.rows, np.memmap) else self.rows.nbytes
         lists = self.row.nbytes + self.owner.nbytes + self.owner_begin.nbytes + self.cell_begin.nbytes
-        return rows + lists + BYTES_PER_CODE * len(self.row)
+        return rows + lists + _BYTES_PER_CODE * len(self.row)
 
     @cached_property
     def cell_sizes(self) -> Int[np.ndarray, "v"]:

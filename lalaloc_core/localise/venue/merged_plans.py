@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.match.pose_layouts import joined_layouts
+from lalaloc_core.localise.match.pose_grid import joined_layouts
 from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.venue.prototypes import claims_of_trust, trust_of_claims
 from lalaloc_core.render.sampling import PoseSet
@@ -45,6 +45,11 @@ class MergedPlans:
     grid: PoseGrid
     shift_m: Float[np.ndarray, "p 2"]
     _poses: Int[np.ndarray, "p"] = field(repr=False)
+
+    @classmethod
+    def of_plan(cls, plan: FloorPlan, grid: PoseGrid) -> MergedPlans:
+        """Return one plan by itself, in its own frame."""
+        return cls((plan,), plan, grid, np.zeros((1, 2)), np.array([len(grid.poses)]))
 
     @classmethod
     def of(

@@ -245,8 +245,8 @@ def _walls(factor: Float[np.ndarray, "n a"], precision: Float[np.ndarray, "n a"]
     return mean_log(factor, factors=_FACTORS, max_factor=_MAX_FACTOR)
 
 
-class Aligned(NamedTuple):
-    """Aligned pairs of a prototype and a hypothesis.
+class _Aligned(NamedTuple):
+    """_Aligned pairs of a prototype and a hypothesis.
 
     Attributes:
         cost: (n,) cost at the aligned pose, with the prior of the unknowns.
@@ -289,9 +289,9 @@ class PrototypeAlignment:
         self._free = np.flatnonzero(sigma > 0.0)
         self._stiffness = (1.0 / np.square(sigma[self._free])).astype(np.float32)
 
-    def pairs(self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]) -> Aligned:
+    def pairs(self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]) -> _Aligned:
         """Align prototypes, each under one hypothesis; the arguments are as in `PrototypeCosts.pairs`."""
-        aligned = Aligned(np.empty(len(rows), np.float32), np.zeros((len(rows), 4), np.float32))
+        aligned = _Aligned(np.empty(len(rows), np.float32), np.zeros((len(rows), 4), np.float32))
         for begin in range(0, len(rows), _ALIGNED_CHUNK):
             part = slice(begin, begin + _ALIGNED_CHUNK)
             aligned.cost[part], step = self._pairs(rows[part], hypothesis[part], offset[part])
