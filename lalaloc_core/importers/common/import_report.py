@@ -95,11 +95,7 @@ class ImportReport:
 
 @dataclass
 class ReportBuilder:
-    """Report under construction while a file is read.
-
-    The first four fields, `turned_deg` and the last four are those of `ImportReport`; `no_room` are areas in metres
-    inside walls, the largest first.
-    """
+    """Fields of an `ImportReport` while a file is read; `no_room` are areas in metres, the largest first."""
 
     format: str = ""
     metres_per_unit: float = 1.0
@@ -124,23 +120,10 @@ class ReportBuilder:
     def build(self) -> ImportReport:
         """Return the finished report."""
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
-        return ImportReport(
-            format=self.format,
-            metres_per_unit=self.metres_per_unit,
-            scale_source=self.scale_source,
-            is_draft=self.is_draft,
-            layers=tuple(layers[:_MAX_LINES]),
-            notes=_limit_lines(self.notes),
-            warnings=_limit_lines(self.warnings),
-            unsure=_limit_lines(self.unsure),
-            no_room=tuple(_outline(area) for area in self.no_room[:_MAX_AREAS]),
-            opening_trust=self.opening_trust,
-            turned_deg=self.turned_deg,
-            scale_std=self.scale_std,
-            scale_clues=self.scale_clues,
-            scale_factor=self.scale_factor,
-            rejected_texts=_limit_lines(self.rejected_texts),
-        )
+        facts = {name: value for name, value in vars(self).items() if name != "uses"}
+        texts = {name: _limit_lines(facts[name]) for name in ("notes", "warnings", "unsure", "rejected_texts")}
+        outlines = tuple(_outline(area) for area in self.no_room[:_MAX_AREAS])
+        return ImportReport(**facts | texts | {"layers": tuple(layers[:_MAX_LINES]), "no_room": outlines})
 
 
 @dataclass

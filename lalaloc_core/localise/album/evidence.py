@@ -267,8 +267,8 @@ def shared_cameras(photographs: Sequence[AlbumPhotograph]) -> tuple[SharedCamera
     return tuple(found)
 
 
-def camera_height(ground: AlbumGround, evidence: Sequence[Arrays]) -> tuple[float, float, float, float]:
-    """Return the height of the cameras (m) and the scale of the plan, each followed by its standard deviation.
+def camera_height(ground: AlbumGround, evidence: Sequence[Arrays]) -> tuple[float, float]:
+    """Return the height of the cameras (m) and the scale of the plan.
 
     Photographs tell the height in units of the plan, so one factor is divided between both by what is known of each.
     """
@@ -286,16 +286,7 @@ def camera_height(ground: AlbumGround, evidence: Sequence[Arrays]) -> tuple[floa
     total -= 0.5 * np.square(_OFFSETS - prior) / (log_sd**2 + _SCALE_SD**2)
     share = np.exp(total - total.max())
     share /= share.sum()
-    mean = float(share @ _OFFSETS)
-    sd = math.sqrt(float(share @ np.square(_OFFSETS - mean)) + (_OFFSETS[1] - _OFFSETS[0]) ** 2 / 12.0)
     # A higher camera and a smaller plan look the same.
     part = _SCALE_SD**2 / (log_sd**2 + _SCALE_SD**2)
-    moved = mean - prior
-    height_m = prior_m * math.exp((1.0 - part) * moved)
-    left = math.sqrt((1.0 - part) * _SCALE_SD**2)
-    return (
-        height_m,
-        height_m * math.hypot(left, (1.0 - part) * sd),
-        math.exp(-part * moved),
-        math.hypot(left, part * sd),
-    )
+    moved = float(share @ _OFFSETS) - prior
+    return prior_m * math.exp((1.0 - part) * moved), math.exp(-part * moved)

@@ -103,22 +103,6 @@ class SharedCamera:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlbumLink:
-    """Two photographs that show the same things.
-
-    Attributes:
-        first, second: ids of the photographs.
-        turn: heading of the second minus that of the first, radians; None if they are not from one spot.
-        matches: number of corners and blobs that agree.
-    """
-
-    first: str
-    second: str
-    turn: float | None
-    matches: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class Album:
     """Result of a solve.
 
@@ -126,23 +110,17 @@ class Album:
         pins: a pin for every photograph, in the order in which they were given.
         cameras: the cameras and their fields of view.
         camera_height_m: height of the cameras over the floor; None without photographs.
-        camera_height_sd_m: its standard deviation.
-        scale: factor of the plan's lengths that fits the photographs best, and its standard deviation.
-        scale_sd: its standard deviation.
+        scale: factor of the plan's lengths that fits the photographs best.
         compass_bias: azimuth of the compass's north in the plan minus that of true north, radians; the azimuth itself
             if the plan does not state north. None without photographs that have a compass heading.
-        links: the links between photographs.
         warnings: what was assumed or dropped for all photographs.
     """
 
     pins: tuple[Pin, ...]
     cameras: tuple[SharedCamera, ...] = ()
     camera_height_m: float | None = None
-    camera_height_sd_m: float = math.inf
     scale: float = 1.0
-    scale_sd: float = 0.05
     compass_bias: float | None = None
-    links: tuple[AlbumLink, ...] = ()
     warnings: tuple[str, ...] = ()
 
     @property

@@ -27,7 +27,7 @@ from lalaloc_core.localise.album.evidence import (
 )
 from lalaloc_core.localise.album.ground import AlbumGround, Constraint, constraint_of
 from lalaloc_core.localise.album.links import Found, find_links, pair_odds
-from lalaloc_core.localise.album.pins import Album, AlbumLink, Pin, Suggestion
+from lalaloc_core.localise.album.pins import Album, Pin, Suggestion
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms, expected_photographs, walk_of
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
 from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, outside_odds
@@ -69,21 +69,11 @@ def solve_album(
         progress: called with the number of photographs that were compared with the plan.
         pause: called often, after at most a photograph's comparison; what it raises ends the solve.
     """
-    if len(photographs) > MAX_PHOTOGRAPHS:
-        raise InvalidInputError(f"the album has {len(photographs)} photographs; the limit is {MAX_PHOTOGRAPHS}")
-    poses, rooms = len(ground.grid.poses), len(ground.plan.rooms)
-    if poses > MAX_POSES or rooms > MAX_ROOMS:
-        raise InvalidInputError(
-            f"the place has {rooms} rooms and {poses} grid poses; albums search at most {MAX_ROOMS} rooms and "
-            f"{MAX_POSES} poses, about 16,000 m²: upload the parts as plans of their own"
-        )
-    ids = {photograph.id for photograph in photographs}
-    if len(ids) < len(photographs):
-        raise InvalidInputError("two photographs of the album have the same id; every photograph is added once")
+    _check(ground, photographs)
     constraints = {each.id: constraint_of(ground, each) for each in photographs if each.correction is not None}
     memory = AlbumMemory() if memory is None else memory
     memory.use(ground, encoder.manifest)
-    memory.keep(ids)
+    memory.keep({each.id for each in photographs})
     if not photographs:
         return Album(pins=())
     ordered = sorted(photographs, key=lambda each: (each.taken.at or datetime.max, each.id))
@@ -97,7 +87,7 @@ def solve_album(
         each.id: _pin(ground, each, state, row, constraints.get(each.id))
         for each, state, row in zip(ordered, states, share, strict=True)
     }
-    height_m, height_sd_m, scale, scale_sd = camera_height(ground, [memory.evidence[each.id] for each in ordered])
+    height_m, scale = camera_height(ground, [memory.evidence[each.id] for each in ordered])
     north = ground.plan.north
     warnings = []
     if by_time and not has_order:
@@ -109,22 +99,24 @@ def solve_album(
         pins=tuple(pins[each.id] for each in photographs),
         cameras=shared_cameras(ordered),
         camera_height_m=height_m,
-        camera_height_sd_m=height_sd_m,
         scale=scale,
-        scale_sd=scale_sd,
         compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
-        links=tuple(
-            AlbumLink(
-                first=ordered[first].id,
-                second=ordered[second].id,
-                turn=None if math.isnan(turn) else turn,
-                matches=matches,
-            )
-            for (first, second), (matches, turn) in links.items()
-            if not math.isnan(turn)
-        ),
         warnings=tuple(warnings),
     )
+
+
+def _check(ground: AlbumGround, photographs: Sequence[AlbumPhotograph]) -> None:
+    """Check the sizes of an album and its ground."""
+    if len(photographs) > MAX_PHOTOGRAPHS:
+        raise InvalidInputError(f"the album has {len(photographs)} photographs; the limit is {MAX_PHOTOGRAPHS}")
+    poses, rooms = len(ground.grid.poses), len(ground.plan.rooms)
+    if poses > MAX_POSES or rooms > MAX_ROOMS:
+        raise InvalidInputError(
+            f"the place has {rooms} rooms and {poses} grid poses; albums search at most {MAX_ROOMS} rooms and "
+            f"{MAX_POSES} poses, about 16,000 m²: upload the parts as plans of their own"
+        )
+    if len({photograph.id for photograph in photographs}) < len(photographs):
+        raise InvalidInputError("two photographs of the album have the same id; every photograph is added once")
 
 
 def _compare(
