@@ -76,7 +76,7 @@ class AlbumSearch:
                 model=taken.model or None,
                 width=taken.width or None,
                 height=taken.height or None,
-                **read_photograph(Spot(made.view)).document(),
+                **read_photograph(Spot(made.photograph)).document(),
             )
             return AlbumEntry(made.to_bytes(self._parts.bundle), facts.model_dump_json())
 
@@ -94,7 +94,7 @@ class AlbumSearch:
             await site.wait(context)
             chosen: list[Query] = []
             if isinstance(where, VenueRecord):
-                spots = [Spot(entry.view) for entry in _spread(photographs)]
+                spots = [Spot(entry.photograph) for entry in _spread(photographs)]
                 known, heights = [UNKNOWN_HEADING] * len(spots), [site.height] * len(spots)
                 chosen = await self._parts.reader.encode(spots, known, heights, context)
             ground = await site.ground(chosen, context)

@@ -77,13 +77,15 @@ def test_entry_is_small_and_read_as_it_was(bundle: Bundle, photographs: list[Alb
         assert (read.id, read.taken) == (photograph.id, photograph.taken)
         np.testing.assert_array_equal(read.colours, photograph.colours)
         np.testing.assert_array_equal(read.descriptors.bits, photograph.descriptors.bits)
-        assert read.view.features is not None
-        assert photograph.view.features is not None
+        assert read.photograph.features is not None
+        assert photograph.photograph.features is not None
         np.testing.assert_allclose(
-            read.view.features.outputs["log_profile"], photograph.view.features.outputs["log_profile"], rtol=1e-6
+            read.photograph.features.outputs["log_profile"],
+            photograph.photograph.features.outputs["log_profile"],
+            rtol=1e-6,
         )
     assert len(photographs[-1].descriptors) > 50
-    assert not photographs[0].view.features or not photographs[0].view.features.outputs["ring"].any()
+    assert not photographs[0].photograph.features or not photographs[0].photograph.features.outputs["ring"].any()
 
 
 def test_damaged_entries_are_refused(bundle: Bundle, photographs: list[AlbumPhotograph]) -> None:
@@ -220,10 +222,14 @@ def test_photograph_that_shows_no_wall_is_not_sure(
     ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
 ) -> None:
     phone = photographs[-1]
-    assert phone.view.features is not None
-    outputs = dict(phone.view.features.outputs)
+    assert phone.photograph.features is not None
+    outputs = dict(phone.photograph.features.outputs)
     outputs["seen"] = np.full_like(outputs["seen"], 0.0)
-    blind = replace(phone, id="blind", view=replace(phone.view, features=replace(phone.view.features, outputs=outputs)))
+    blind = replace(
+        phone,
+        id="blind",
+        photograph=replace(phone.photograph, features=replace(phone.photograph.features, outputs=outputs)),
+    )
     pin = solve_album(ground, encoder, [blind]).pins[0]
     assert pin.state in ("set_aside", "uncertain")
     assert pin.within_1m < 0.2

@@ -138,7 +138,7 @@ def _alone(model: LocalModel, case: AlbumCase) -> list[_Score]:
     ground, manifest = case.ground, model.bundle.manifest
     found = []
     for photograph, truth in zip(case.photographs, case.truth, strict=True):
-        query = model.encoder.query(photograph.view, None, stated_height(ground.plan, None))
+        query = model.encoder.query(photograph.photograph, None, stated_height(ground.plan, None))
         answer = model.localise(ground.plan, ground.grid, query)
         best = answer.candidates[0]
         room_share = float(answer.posterior.pose[ground.grid.poses.room_index == best.room_index].sum())

@@ -142,7 +142,7 @@ class AlbumPhotograph:
 
     Attributes:
         id: name within the album, such as the SHA-256 of the file.
-        view: the photograph with its features instead of pixels; `view.hfov` is the field of view and its origin.
+        photograph: the photograph with its features instead of pixels.
         taken: time, maker, model and size in pixels; each None or empty where unknown.
         descriptors: what tells overlap with others; none for spheres, and for features that a client computed.
         colours: (64,) square roots of the shares of hues, times 255; zeros for features that a client computed.
@@ -150,7 +150,7 @@ class AlbumPhotograph:
     """
 
     id: str
-    view: Photograph
+    photograph: Photograph
     taken: Taken = field(default=Taken())
     descriptors: Descriptors = field(default=_NO_DESCRIPTORS)
     colours: UInt8[np.ndarray, "64"] = field(default_factory=lambda: _NO_COLOURS)
@@ -165,12 +165,14 @@ class AlbumPhotograph:
     @property
     def has_stated_field(self) -> bool:
         """True if the field of view is stated or in the metadata, not estimated."""
-        return self.view.hfov.source not in ("estimated", "assumed")
+        return self.photograph.hfov.source not in ("estimated", "assumed")
 
     def to_bytes(self, bundle: Bundle) -> bytes:
         """Return the entry as a file, without the correction."""
-        assert self.view.features is not None
-        features = zlib.compress(write_features(self.view, self.view.features.outputs, bundle), _COMPRESSION)
+        assert self.photograph.features is not None
+        features = zlib.compress(
+            write_features(self.photograph, self.photograph.features.outputs, bundle), _COMPRESSION
+        )
         taken = self.taken
         header = _Header(
             id=self.id,
@@ -205,31 +207,31 @@ class _Header:
     features: int
 
 
-def photograph_entry(id: str, view: Photograph, taken: Taken | None = None) -> AlbumPhotograph:
+def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None) -> AlbumPhotograph:
     """Return the entry of a photograph that was encoded.
 
     Args:
         id: its name within the album.
-        view: the photograph with its features (`PhotographEncoder.with_features`, or features that a client sent); its
-            `overview` gives the descriptors.
+        photograph: the photograph with its features (`PhotographEncoder.with_features`, or features that a client
+            sent); its `overview` gives the descriptors.
         taken: time and camera, from `photograph.taken.read_taken`; None for features.
     """
-    assert view.features is not None
-    outputs = dict(view.features.outputs)
+    assert photograph.features is not None
+    outputs = dict(photograph.features.outputs)
     if "ring" in outputs:
         outputs["ring"] = np.zeros_like(outputs["ring"])
     light = dataclasses.replace(
-        view,
-        features=dataclasses.replace(view.features, outputs=outputs),
+        photograph,
+        features=dataclasses.replace(photograph.features, outputs=outputs),
         patches=(),
         sphere=None,
         thumbnail=None,
         overview=None,
     )
-    descriptors = _NO_DESCRIPTORS if view.overview is None else Descriptors.of(view.overview.features)
-    pixels = view.thumbnail if view.sphere is None else view.sphere
+    descriptors = _NO_DESCRIPTORS if photograph.overview is None else Descriptors.of(photograph.overview.features)
+    pixels = photograph.thumbnail if photograph.sphere is None else photograph.sphere
     colours = _NO_COLOURS if pixels is None else _colours(pixels)
-    return AlbumPhotograph(id=id, view=light, taken=taken or Taken(), descriptors=descriptors, colours=colours)
+    return AlbumPhotograph(id=id, photograph=light, taken=taken or Taken(), descriptors=descriptors, colours=colours)
 
 
 def _colours(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "64"]:
@@ -266,10 +268,14 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         )
     records = np.frombuffer(rest, _RECORD)
     descriptors = Descriptors(records["place"] / _WHOLE, records["bits"].copy())
-    view = read_features(_inflated(body[: header.features]), bundle)
+    photograph = read_features(_inflated(body[: header.features]), bundle)
     taken = Taken(at=at, make=header.make, model=header.model, width=header.width, height=header.height)
     return AlbumPhotograph(
-        id=header.id, view=view, taken=taken, descriptors=descriptors, colours=np.frombuffer(colours, np.uint8).copy()
+        id=header.id,
+        photograph=photograph,
+        taken=taken,
+        descriptors=descriptors,
+        colours=np.frombuffer(colours, np.uint8).copy(),
     )
 
 

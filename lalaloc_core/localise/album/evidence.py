@@ -150,7 +150,7 @@ class SearchedPlan:
         return np.array([ROOM_TYPES.index(room.type) for room in self.plan.rooms])
 
 
-def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Photograph) -> Arrays:
+def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photograph: Photograph) -> Arrays:
     """Compare a photograph with all poses.
 
     Returns:
@@ -158,8 +158,8 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, view: Ph
         `room_types` (r,), the log likelihood of the type of every room; `heights` (j,), the log evidence of each height
         offset; `chance`, the log likelihood of the best of as many poses of other homes.
     """
-    weights = encoder.manifest.evidence_for(view=not view.is_sphere)
-    query = encoder.query(view, None, CameraHeight(_USUAL_HEIGHT_M, 0.0))
+    weights = encoder.manifest.evidence_for(view=not photograph.is_sphere)
+    query = encoder.query(photograph, None, CameraHeight(_USUAL_HEIGHT_M, 0.0))
     compared = Comparison.of(searched.plan, query, searched.reach_m, weights, _OFFSETS)
     usual = (0.5 * np.square(_OFFSETS / _USUAL_LOG_SD)).astype(np.float32)
     ceilings = (usual + _ceilings(searched.plan, query, weights)).astype(np.float32)
@@ -243,12 +243,12 @@ def shared_cameras(photographs: Sequence[AlbumPhotograph]) -> tuple[SharedCamera
     """Return the cameras of an album, with the field of view by all photographs of each."""
     groups: dict[tuple[str, str, int, int], list[AlbumPhotograph]] = {}
     for photograph in photographs:
-        if not photograph.view.is_sphere:
+        if not photograph.photograph.is_sphere:
             groups.setdefault(photograph.camera_key, []).append(photograph)
     found = []
     for (make, model, width, height), members in groups.items():
         stated = [each for each in members if each.has_stated_field]
-        half = np.array([min(0.5 * each.view.hfov.value, 1.5) for each in stated or members])
+        half = np.array([min(0.5 * each.photograph.hfov.value, 1.5) for each in stated or members])
         log_tangent = np.log(np.tan(half))
         spread = float(np.median(np.abs(log_tangent - np.median(log_tangent)))) * 1.48
         hfov = 2.0 * math.atan(math.exp(float(np.median(log_tangent))))

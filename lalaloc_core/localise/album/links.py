@@ -102,11 +102,11 @@ def _signs(descriptors: Descriptors) -> Float[np.ndarray, "n 128"]:
 
 
 def _level_rays(photograph: AlbumPhotograph) -> Float[np.ndarray, "n 3"]:
-    view, places = photograph.view, photograph.descriptors.place
-    if view.camera is None:
+    own, places = photograph.photograph, photograph.descriptors.place
+    if own.camera is None:
         return np.zeros((len(places), 3))
-    axes = camera_axes(pitch=view.pitch.value, roll=view.roll.value)
-    return view.camera.rays(places * (view.camera.width, view.camera.height)) @ axes
+    axes = camera_axes(pitch=own.pitch.value, roll=own.roll.value)
+    return own.camera.rays(places * (own.camera.width, own.camera.height)) @ axes
 
 
 def _compared(

@@ -132,7 +132,7 @@ def _compare(
     if new:
         searched = SearchedPlan.of(ground.plan, ground.grid, encoder.manifest.profile_columns)
         for each in new:
-            memory.evidence[each.id] = single_evidence(searched, encoder, each.view)
+            memory.evidence[each.id] = single_evidence(searched, encoder, each.photograph)
             progress(len(memory.evidence))
             pause()
 
@@ -147,12 +147,14 @@ def _states(
     """Return the states of all photographs, with overlap and compasses, and the bias of the compass."""
     manifest = encoder.manifest
     states = [
-        States.of(memory.evidence[each.id], manifest.ring_sectors if each.view.is_sphere else manifest.profile_columns)
+        States.of(
+            memory.evidence[each.id], manifest.ring_sectors if each.photograph.is_sphere else manifest.profile_columns
+        )
         for each in photographs
     ]
     turns = {pair: turn for pair, (_, turn) in links.items() if not math.isnan(turn)}
     poses = max(int(state.pose.max()) for state in states) + 1
-    states, bias = by_compass(states, [each.view.compass_heading for each in photographs], ground.plan.north)
+    states, bias = by_compass(states, [each.photograph.compass_heading for each in photographs], ground.plan.north)
     return turned_together(states, turns, poses), bias
 
 
@@ -192,7 +194,7 @@ def _room_shares(
 
 def _outside(photograph: AlbumPhotograph) -> float:
     """Return the log likelihood ratio of a photograph taken outside to one of a room; 0 if no objects are known."""
-    features = photograph.view.features
+    features = photograph.photograph.features
     probability = None if features is None else features.outputs.get(OBJECT_OUTPUTS[0])
     return 0.0 if probability is None else outside_odds(probability)
 
@@ -227,7 +229,7 @@ def _pin(
         within_1m=0.0,
         rooms=listed,
         suggestions=suggestions,
-        warnings=photograph.view.warnings,
+        warnings=photograph.photograph.warnings,
     )
     if constraint is not None:
         return _corrected(ground, base, constraint)

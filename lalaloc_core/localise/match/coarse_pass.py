@@ -7,7 +7,7 @@ pose at an azimuth is one row of
 
 and its cost under all δ and hypotheses is the sum of its rows: the product of a sparse matrix, made from the plan, with
 the table, made from the query. This takes a tenth of the time per azimuth, and there are fewer
-azimuths. Openings have rows as well, the same for every δ; views through them are left to the full comparison.
+azimuths. Openings have rows as well, the same for every δ; walls seen through them are left to the full comparison.
 
 In large plans most poses are excluded before that, by a lower bound of their cost over all δ and some neighbouring
 hypotheses. The bounds come from a table of minima in short integers, which stays in the cache. Poses are compared by

@@ -118,8 +118,8 @@ class Terms(NamedTuple):
 class _Gathered(NamedTuple):
     """Layouts of m poses, ready to be compared.
 
-    `opening` is the place of each azimuth's class in w x c losses of its trust. The e azimuths `pose`, `column` have a
-    view through an opening: `log_behind` is the log distance (m) of the wall behind, and `odds` those that the
+    `opening` is the place of each azimuth's class in w x c losses of its trust. The e azimuths `pose`, `column` show a
+    wall through an opening: `log_behind` is the log distance (m) of the wall behind, and `odds` those that the
     prediction is of that wall.
     """
 

@@ -33,7 +33,7 @@ def refinement_job(
     """Return the job that refines candidates, each within its own room.
 
     The refiner compares walls, or latents if the model predicts no walls; other terms do not move poses. An azimuth
-    with a view through an opening counts by the probability that the prediction is of the pose's own wall; of two
+    that shows a wall through an opening counts by the probability that the prediction is of the pose's own wall; of two
     predicted modes, the one that the wall fits better is its target.
     """
     rooms = np.array([candidate.room_index for candidate in candidates])

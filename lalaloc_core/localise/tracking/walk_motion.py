@@ -2,7 +2,7 @@
 
 Nobody walks through walls, so a pose of the grid can move to those that are reachable by short links alone; after a way
 of many links, to all poses of the plan. Two poses are linked if they are neighbours and see each other: the wall
-profile of the first, or its view through a door or a passage, reaches as far as the second. Links join poses of one
+profile of the first, or what it sees through a door or a passage, reaches as far as the second. Links join poses of one
 plan; `tracked_plans.py` has the ways between plans.
 """
 

@@ -4,7 +4,7 @@ Differences to the matching cost of grid poses:
 
 * There are 32 azimuths, and at most 32 hypotheses of the heading.
 * The reach is that of a grid with the prototypes' spacing.
-* Views through openings are ignored.
+* Walls that are seen through openings are ignored.
 * Openings have less weight, as they appear displaced from a prototype up to half a metre away from the camera.
   `PrototypeAlignment` solves for the displacement.
 * The openings' term is relative to the best class of a plan that shows all openings, so that plans with different
