@@ -65,13 +65,7 @@ class AlbumSolver:
     ) -> None:
         """Prepare the job.
 
-        Args:
-            store: the store.
-            plans: plans in memory.
-            localiser: computes the solutions.
-            reads: threads for the database, whose calls can read and write the features of an album.
-            settings: the settings.
-            telemetry: the metrics.
+        `reads` are threads for the database, whose calls can read and write the features of an album.
         """
         self._store = store
         self._plans = plans

@@ -63,9 +63,7 @@ class _CountingLruCache(LRUCache[K, V]):
 class BoundedCache(Generic[K, V]):
     """Thread-safe `cachetools.LRUCache` that ignores values larger than the whole cache.
 
-    Args:
-        limit_bytes: size of the cache.
-        size: function that returns the bytes of a value.
+    `size` returns the bytes of a value.
     """
 
     def __init__(self, limit_bytes: int, size: Callable[[V], int]) -> None:

@@ -37,11 +37,7 @@ def max_per_client(limit: int) -> int:
 
 
 class Shares:
-    """Units held per client. Not thread-safe: for one event loop, or under the owner's lock.
-
-    Args:
-        limit: total number of units.
-    """
+    """Units held per client. Not thread-safe: for one event loop, or under the owner's lock."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
@@ -80,11 +76,7 @@ class Shares:
 
 
 class FairQueue(Generic[T]):
-    """Queue that serves the client with the least recent CPU time, oldest item first. Not thread-safe.
-
-    Args:
-        accounts: CPU time of the clients.
-    """
+    """Queue that serves the client with the least recent CPU time, oldest item first. Not thread-safe."""
 
     def __init__(self, accounts: CpuAccounts) -> None:
         self._accounts = accounts

@@ -81,10 +81,7 @@ class Threads:
 class IdleCores(Executor):
     """Threads that take over parts of the calls of `Threads` while cores are idle; charged to the calls' clients.
 
-    Args:
-        count: number of cores.
-        accounts: CPU time of the clients.
-        cores: cores to compute on; as many are busy as are held.
+    As many cores are busy as are held.
     """
 
     def __init__(self, count: int, accounts: CpuAccounts, cores: FairSemaphore) -> None:

@@ -109,11 +109,7 @@ Result = Photograph | tuple[Photograph, Taken] | Film | LevelledTurn | np.ndarra
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
     """Run decoding and rasterising jobs until the pipe closes.
 
-    Args:
-        connection: the worker's end of the pipe.
-        sizes: sizes of decoded photographs.
-        limits: limits of photographs.
-        memory_bytes: memory limit of decoding, besides what the process uses before its first picture.
+    `memory_bytes` limits decoding, besides what the process uses before its first picture.
     """
     serve_jobs(connection, lambda: _load(sizes, limits, memory_bytes))
 

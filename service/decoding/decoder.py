@@ -107,12 +107,7 @@ class Decoder:
     ) -> Photograph:
         """Decode an uploaded photograph for the encoders; one that is encoded already is returned as it is.
 
-        Args:
-            content: the file, or what was read of its features.
-            stated: the request's statements about it.
-            deadline: time limit (`monotonic`).
-            client: fairness group of the job.
-            overview: as in `open_photograph`.
+        The deadline is a time (`monotonic`).
 
         Raises:
             InvalidPhotographError: see `open_photograph`; or the file stalled a worker, or crashed two.

@@ -131,16 +131,7 @@ class GridBuilder:
         settings: Settings,
         telemetry: Telemetry,
     ) -> None:
-        """Start the thread.
-
-        Args:
-            store: the store.
-            encoders: the networks.
-            cache: receives finished grids.
-            cores: cores to compute on, which queries need as well.
-            settings: the settings.
-            telemetry: the metrics.
-        """
+        """Start the thread."""
         self._store = store
         self._encoders = encoders
         self._cache = cache

@@ -75,12 +75,6 @@ class GridJobs:
     def add(self, key: GridKey, *, plan_id: str, poses: int, on_demand: bool) -> GridJob:
         """Return the job for a grid, a new one if there is none.
 
-        Args:
-            key: key of the grid.
-            plan_id: id of the plan.
-            poses: estimated number of poses.
-            on_demand: see `GridJob`.
-
         Raises:
             OverloadedError: too many jobs wait already.
             StoppingError: the service stops.

@@ -100,16 +100,7 @@ class GridState:
 
 
 class GridProvider:
-    """Pose grids of one model at one grid step.
-
-    Args:
-        store: the store.
-        encoders: the networks.
-        model_sha256: digest of the model.
-        settings: the settings.
-        telemetry: the metrics.
-        cores: cores to compute on, which queries need as well.
-    """
+    """Pose grids of one model at one grid step."""
 
     def __init__(
         self,

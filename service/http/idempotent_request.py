@@ -51,10 +51,7 @@ _PERMANENT_ERRORS = (
 class IdempotentRequest:
     """Request with or without an idempotency key.
 
-    Args:
-        claims: stored keys.
-        request: the request.
-        tenant: tenant of the request; keys of different tenants and paths are independent.
+    Keys of different tenants and paths are independent.
     """
 
     def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str) -> None:
@@ -89,13 +86,7 @@ class IdempotentRequest:
     async def run_async(
         self, parts: Parts, work: Callable[[str], Awaitable[Response]], reads: BoundedReads
     ) -> Response:
-        """Execute the request as `run` does, for work that is cancelled if the client leaves.
-
-        Args:
-            parts: content of the request.
-            work: makes the answer from the token.
-            reads: threads for database access, with a timeout.
-        """
+        """Execute the request as `run` does, for work that is cancelled if the client leaves."""
         if self._key is None:
             return await work(uuid.uuid4().hex)
         tenant, waiting = self._place[0], _Waiting()

@@ -63,15 +63,7 @@ Parts = Sequence[Part] | AsyncIterator[Part]
 
 
 class PartsResponse(Response):
-    """Answer whose body is given in parts, which are not copied together.
-
-    Args:
-        parts: the body.
-        size_bytes: length of the body.
-        media_type: media type of the body.
-        headers: headers of the answer, without the length.
-        status: HTTP status.
-    """
+    """Answer whose body is given in parts, which are not copied together."""
 
     def __init__(
         self, parts: Parts, size_bytes: int, media_type: str, headers: Mapping[str, str], status: int = 200
@@ -102,9 +94,7 @@ async def _in_order(parts: Parts) -> AsyncIterator[Part]:
 class LinesResponse(Response):
     """Answer of lines that ends, and ends their computation, as soon as its client leaves or stops reading.
 
-    Args:
-        lines: the lines, without line breaks.
-        patience_s: time (s) in which the client must take a line.
+    It stops reading if it does not take a line within `patience_s` (s).
     """
 
     media_type = NDJSON

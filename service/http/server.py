@@ -141,12 +141,7 @@ class Server(uvicorn.Server):
 
 
 def max_connections_of(wanted: int, settings: Settings) -> int:
-    """Raise the limit of file descriptors, and return the number of connections that fit.
-
-    Args:
-        wanted: desired number of connections.
-        settings: settings of the service.
-    """
+    """Raise the limit of file descriptors, and return the number of connections that fit."""
     reserved = _RESERVED_DESCRIPTORS + _PER_DATABASE_CONNECTION * settings.database.connections
     allowed = _raised_to(wanted + reserved)
     if allowed - reserved < _MIN_CONNECTIONS:

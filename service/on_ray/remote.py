@@ -141,12 +141,7 @@ class RemotePhotographEncoder(PhotographEncoder):
 
 
 class RemoteOptimiser:
-    """Remote LPO; if a job fails for any reason, the query keeps the VDR pose, as with `LpoPool`.
-
-    Args:
-        lpo: deployment of LPO; None if LPO is off.
-        telemetry: metrics.
-    """
+    """Remote LPO; if a job fails for any reason, the query keeps the VDR pose, as with `LpoPool`."""
 
     def __init__(self, lpo: DeploymentHandle | None, telemetry: Telemetry) -> None:
         self._lpo = lpo

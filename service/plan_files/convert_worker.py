@@ -138,10 +138,7 @@ def report_of(imported: ImportedPlan) -> str:
 def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: int) -> None:
     """Run import and export jobs until the pipe closes.
 
-    Args:
-        connection: the worker's end of the pipe.
-        limits: limits of imported files.
-        memory_bytes: memory limit of a file, including the libraries that read it.
+    `memory_bytes` limits the memory for a file, including the libraries that read it.
     """
     # One thread, because every thread reserves its own part of the limited memory.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"

@@ -73,15 +73,7 @@ class RenditionCache:
     ) -> None:
         """Start the threads.
 
-        Args:
-            plans: stored plans.
-            converter: worker processes.
-            bundle: model, for localisability.
-            step_m: grid step of descriptions.
-            limit_bytes: size of the cache; 0 keeps no files.
-            max_pending: largest number of files being made or waiting, shared between clients.
-            turns: turns to predict localisability.
-            cores: cores to compute on, of which a prediction holds one.
+        `max_pending` files are made or wait, shared between clients. A prediction needs one of the `turns`, and a core.
         """
         self._plans = plans
         self._converter = converter

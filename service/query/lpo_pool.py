@@ -25,12 +25,7 @@ class LpoPool:
     ) -> None:
         """Create a pool, which `start` starts.
 
-        Args:
-            bundle: the model.
-            settings: the settings.
-            telemetry: metrics.
-            cores: cores to compute on.
-            by_latents: whether the model's poses are refined by latents; else workers load no torch.
+        Workers load no torch unless poses are refined `by_latents`.
         """
         self._telemetry = telemetry
         spec = WorkerSpec(

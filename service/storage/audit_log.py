@@ -55,13 +55,7 @@ class AuditLog:
     ) -> list[StoredAuditEntry]:
         """Return a page of the entries, newest first.
 
-        Args:
-            limit: maximum number of entries.
-            after: the last entry of the previous page.
-            tenant: only entries of this tenant.
-            actor: only entries of this actor.
-            since: only entries from this time on.
-            until: only entries before this time.
+        `after` is the last entry of the previous page; only those of a tenant or actor, or between two times.
         """
         query = _filtered(tenant, actor, since, until)
         with self._database.reading() as connection:

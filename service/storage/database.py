@@ -65,10 +65,7 @@ class Database:
     def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0) -> None:
         """Prepare the pool, which connects on first use.
 
-        Args:
-            url: URL of the database.
-            connections: maximum number of open connections.
-            wait_s: time limit (s) of waiting for a free connection, and of making one.
+        `wait_s` (s) limits waiting for a free connection, and making one.
 
         Raises:
             ConfigError: the URL is not that of an SQLite file or of PostgreSQL.

@@ -53,12 +53,7 @@ class DiskReserve:
                 self.release()
 
     def check(self, connection: Connection, growth: int) -> None:
-        """Check in a writing transaction that the disk has room for data, in the log and then in the database.
-
-        Args:
-            connection: the transaction.
-            growth: size (bytes) of the data.
-        """
+        """Check in a writing transaction that the disk has room for data, in the log and then in the database."""
         free_pages = connection.exec_driver_sql("PRAGMA freelist_count").scalar_one()
         page_bytes = connection.exec_driver_sql("PRAGMA page_size").scalar_one()
         needed = max(growth - _size(self._log), 0) + max(growth - free_pages * page_bytes, 0)

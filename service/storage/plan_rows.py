@@ -212,8 +212,7 @@ class PlanCache:
     def __init__(self, limit_bytes: int) -> None:
         """Create an empty cache.
 
-        Args:
-            limit_bytes: approximate memory limit; 0 keeps no plans.
+        `limit_bytes` is approximate; 0 keeps no plans.
         """
         self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
             limit_bytes, lambda entry: plan_bytes(entry[0].plan) + len(entry[0].report or "")

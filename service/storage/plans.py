@@ -54,10 +54,7 @@ class Plans:
     def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
         """Use a database.
 
-        Args:
-            database: the database.
-            cache: receives every plan that is read or stored at its current revision.
-            quota: counts the stored bytes.
+        The cache receives every plan that is read or stored at its current revision.
         """
         self._database = database
         self._cache = cache
@@ -110,14 +107,8 @@ class Plans:
     ) -> PlanRecord:
         """Store a new revision of a plan, and delete revisions beyond `keep`.
 
-        Grids of the new and the previous revision are kept, because running queries may need them.
-
-        Args:
-            tenant: owner of the plan.
-            plan_id: id of the plan.
-            new: the new plan.
-            keep: maximum number of revisions.
-            expected: id of the revision that the plan must have; None for any.
+        Grids of the new and the previous revision are kept, because running queries may need them. The plan must be at
+        the revision `expected`, if there is one.
         """
         record = new_record(new, plan_id, tenant, datetime.now(UTC))
         content = PlanContent.prepare(record.revision_id, new)
@@ -227,11 +218,7 @@ class Plans:
     ) -> list[PlanSummary]:
         """Return plans, newest first.
 
-        Args:
-            tenant: owner of the plans.
-            limit: maximum number of plans.
-            after: the last plan of the previous page.
-            name: part of the name, case-insensitive.
+        `name` is a part of the name, case-insensitive.
         """
         query = select_summaries().where(FLOORPLANS.c.tenant == tenant)
         return self._summaries(newest_first(query, FLOORPLANS, limit=limit, after=after, name=name))
@@ -243,10 +230,7 @@ class Plans:
     def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
         """Delete a plan with its revisions, files, grids, sessions and albums, and remove it from its venues.
 
-        Args:
-            tenant: owner of the plan.
-            plan_id: id of the plan.
-            expected: id of the revision that the plan must have; None for any.
+        The plan must be at the revision `expected`, if there is one.
 
         Returns:
             True if the plan existed.

@@ -22,12 +22,7 @@ Query = TypeVar("Query", bound=Select[Any])
 def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None, name: str | None = None) -> Query:
     """Return a page of a query about a table with `id` and `created_at`, and for searches `folded_name`.
 
-    Args:
-        query: the query.
-        table: the table.
-        limit: maximum number of rows.
-        after: the last row of the previous page.
-        name: part of the name, case-insensitive.
+    `after` is the last row of the previous page, `name` a part of the name, case-insensitive.
     """
     age, own_id = table.c.created_at, table.c.id
     if name:
@@ -40,11 +35,7 @@ def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None
 def write_chunks(connection: Connection, table: Table, owner: dict[str, Any], content: memoryview) -> None:
     """Write a value, one statement per chunk.
 
-    Args:
-        connection: the transaction.
-        table: the table of chunks.
-        owner: name and value of the column that identifies the value.
-        content: the value.
+    `owner` is name and value of the column that identifies it.
     """
     for row in _chunk_rows(owner, content):
         connection.execute(table.insert(), row)

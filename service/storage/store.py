@@ -216,23 +216,13 @@ class PlanLookup:
     """Lookup of plans for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, max_age_s: float) -> None:
-        """Create the lookup.
-
-        Args:
-            store: the store.
-            max_age_s: maximum age (s) of a plan in memory since it was last read or stored.
-        """
+        """Create the lookup."""
         self._store = store
         self._max_age_s = max_age_s
         self._breaker = CircuitBreaker()
 
     async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
         """Return a plan at its current revision, or at the last known one while the database is unavailable.
-
-        Args:
-            tenant: owner of the plan.
-            plan_id: id of the plan.
-            reads: threads for reads of the database, which may be silent.
 
         Raises:
             StoreUnavailableError: the database is unavailable, and the plan was not read recently; or too many reads

@@ -88,9 +88,7 @@ class StorageQuota:
     def __init__(self, database: Database, default_bytes: int) -> None:
         """Use the counters in a database.
 
-        Args:
-            database: the database.
-            default_bytes: limit of tenants without a limit of their own.
+        `default_bytes` is the limit of tenants without one of their own.
         """
         self._database = database
         self._default_bytes = default_bytes

@@ -25,10 +25,7 @@ class VenueImports:
     def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
         """Use a database.
 
-        Args:
-            database: the database.
-            cache: receives the plans that are stored, as far as it has room for unread ones.
-            quota: counts the stored bytes.
+        The cache receives the plans, as far as it has room for unread ones.
         """
         self._database = database
         self._cache = cache
@@ -40,14 +37,6 @@ class VenueImports:
         """Store plans and their venue in one transaction.
 
         If the id of the venue exists already, its first request was stored and the answer was lost.
-
-        Args:
-            tenant: owner of the venue.
-            venue_id: id of the venue.
-            name: name of the venue.
-            plans: its plans.
-            max_plans: limit of the tenant's plans.
-            max_venues: limit of the tenant's venues.
 
         Returns:
             The venue, and the records of its plans in order; none if an earlier request stored them.

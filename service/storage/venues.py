@@ -81,14 +81,6 @@ class Venues:
     ) -> VenueRecord:
         """Store a venue; if the id exists already, its first request was stored and the answer was lost.
 
-        Args:
-            tenant: owner of the venue.
-            venue_id: id of the venue.
-            name: name of the venue.
-            anchor: anchor of the venue.
-            members: plans of the venue.
-            limit: maximum number of the tenant's venues.
-
         Raises:
             TooManyVenuesError: the tenant has `limit` venues already.
             InvalidRequestError: a plan is not the tenant's.
@@ -164,11 +156,7 @@ class Venues:
     ) -> list[VenueRecord]:
         """Return venues, newest first.
 
-        Args:
-            tenant: owner of the venues.
-            limit: maximum number of venues.
-            after: the last venue of the previous page.
-            name: part of the name, case-insensitive.
+        `name` is a part of the name, case-insensitive.
         """
         page = newest_first(select_venues(VENUES.c.tenant == tenant), VENUES, limit=limit, after=after, name=name)
         with self._database.reading() as connection:
@@ -179,11 +167,7 @@ class Venues:
     ) -> list[VenueMember]:
         """Return the plans of a venue by level, regardless of tenant. Callers check access first.
 
-        Args:
-            venue_id: id of the venue.
-            limit: maximum number of plans.
-            after: the last plan of the previous page.
-            level: level of the plans; None for all.
+        `after` is the last plan of the previous page.
         """
         own_level, plan_id = VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id
         query = select(plan_id, own_level, VENUE_PLANS.c.name).where(VENUE_PLANS.c.venue_id == venue_id)
@@ -244,11 +228,7 @@ class Venues:
     ) -> list[Row[Any]]:
         """Return a row for every plan of a venue, regardless of tenant. Callers check access first.
 
-        Args:
-            venue_id: id of the venue.
-            model_sha256: digest of the model.
-            step_m: grid step (m).
-            plan_ids: ids of the plans, of which those in the venue are read; None for all.
+        With `plan_ids`, only those of them that are in the venue.
 
         Returns:
             Rows of `plan_id`, `revision_id`, `level`, `name`, `name_in_venue`, `camera_height_m`,

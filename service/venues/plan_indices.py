@@ -86,13 +86,7 @@ class PlanIndices:
     ) -> None:
         """Create the cache; the file is opened on first use.
 
-        Args:
-            store: the store.
-            grids: provider of pose grids.
-            reads: threads for reads of the store.
-            path: path of the prototype file; None for a temporary one.
-            file_bytes: maximum size of that file.
-            limit_bytes: memory limit of the indices.
+        Without a path, the file is a temporary one.
         """
         self._store = store
         self._grids = grids

@@ -99,12 +99,7 @@ class VenueHints:
         return found
 
     def log_prior(self, rows: _Rows, shares: Mapping[HintName, float]) -> Float[np.ndarray, "p"]:
-        """Return the log prior factors of plans by `level` and `near`; -inf for plans that a strict hint excludes.
-
-        Args:
-            rows: rows of the plans.
-            shares: see `shares`.
-        """
+        """Return the log prior factors of plans by `level` and `near`; -inf for plans that a strict hint excludes."""
         total = np.zeros(len(rows))
         if self.level is not None:
             total += log_factor(self._on_level(rows).astype(float), shares["level"], strict=self.strict)
@@ -218,11 +213,7 @@ def distances_m(
 ) -> Float[np.ndarray, "n"]:
     """Return the distances (m) from a place to the circles around plans, 0 inside; NaN for plans with an unknown place.
 
-    Args:
-        rows: rows with `centre_x_m`, `centre_y_m`, `reach_m`, `latitude` and `longitude`.
-        venue_anchor: anchor of plans without their own.
-        latitude: latitude (degrees) of the place.
-        longitude: longitude (degrees) of the place.
+    Plans without an anchor of their own have that of the venue.
     """
     lon_lat = np.array([[_number(row.longitude), _number(row.latitude)] for row in rows]).reshape(-1, 2)
     centre = np.array([[_number(row.centre_x_m), _number(row.centre_y_m)] for row in rows]).reshape(-1, 2)

@@ -72,13 +72,7 @@ class VenuePlans:
     ) -> None:
         """Create the reader.
 
-        Args:
-            store: the store.
-            grids: provider of pose grids.
-            reads: threads for reads of the store.
-            limit_bytes: memory limit of the rows.
-            max_poses: maximum number of poses in all grids of the chosen plans.
-            idle_cores: threads that take over a part of a search; None: the caller's does all.
+        `limit_bytes` limits the memory of the rows, `max_poses` the poses of the chosen plans.
         """
         self._store = store
         self._grids = grids

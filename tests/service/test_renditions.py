@@ -175,7 +175,7 @@ def test_known_tag_converts_nothing(
         url = f"/floorplans/{upload(client)}{path}"
         first = client.get(url)
         assert first.status_code == 200
-        for module in ("originals", "statements"):
+        for module in ("plan_rows", "statements"):
             monkeypatch.setattr(f"service.storage.{module}.read_chunks", None)
         converted.clear()
         answers = [client.get(url, headers={"If-None-Match": first.headers["etag"]}) for _ in range(3)]

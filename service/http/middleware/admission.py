@@ -34,9 +34,7 @@ _SCOPE_KEY = "lalaloc.read_permit"
 class AdmissionMiddleware:
     """Middleware that holds a slot for a request, or refuses it before its body is read.
 
-    Args:
-        app: the app.
-        routes: routes, of which some declare the class of their requests (`admitted_as`).
+    Some of the routes declare the class of their requests (`admitted_as`).
     """
 
     def __init__(self, app: ASGIApp, routes: Sequence[Route]) -> None:

@@ -36,12 +36,8 @@ _CLIENT_CLOSED = 499
 class TelemetryMiddleware:
     """Outermost middleware, which also sees the answers to unexpected errors.
 
-    A valid `X-Request-ID` or `traceparent` of the client is kept; both are returned.
-
-    Args:
-        app: the app.
-        telemetry: metrics and tracing.
-        routes: routes, to name requests that are refused before routing.
+    A valid `X-Request-ID` or `traceparent` of the client is kept; both are returned. The routes name requests that are
+    refused before routing.
     """
 
     def __init__(self, app: ASGIApp, telemetry: Telemetry, routes: Sequence[Route]) -> None:
