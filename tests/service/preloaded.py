@@ -2,8 +2,10 @@
 
 import cv2
 
+import lalaloc_core.localise.refine.latent_refiner  # noqa: F401
 import service.decoding.decode_worker
-import service.plan_files.convert_worker  # noqa: F401
+import service.plan_files.convert_worker
+import service.workers.lpo  # noqa: F401
 from lalaloc_core.photograph.photograph import warm_up
 
 cv2.setNumThreads(1)

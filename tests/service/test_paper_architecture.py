@@ -58,6 +58,7 @@ def test_query_reaches_each_stage(
         assert plan.rooms[int(plan.room_index_at(position)[0])].name == candidate["room"]
 
 
+@pytest.mark.slow
 def test_sequence_ends_at_retrieval(client: httpx.Client, panorama: bytes) -> None:
     files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
     fields = {"floorplan_id": upload(client), "motion": "turn"}
