@@ -78,7 +78,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
         return encoders.spheres.query(images[number], heading, CameraHeight(shot.camera_height_m))
 
     def search(number: int, *, known: bool) -> None:
-        localise(plan, grid, encoders, query(number, known=known), refiner=refiner)
+        localise(plan, grid, encoders.layouts, query(number, known=known), refiner=refiner)
 
     for known in (True, False):
         search(0, known=known)

@@ -346,7 +346,7 @@ class Track:
         query = model.encoder.query(view, None, self._height)
         state = self._state or TrackState.first(len(query.roll))
         known = known_heading(plan.north, None, 0.0, view.compass_heading)
-        steps = track_steps(self._plans, model.encoder, state, query, motion, known_heading=known)
+        steps = track_steps(self._plans, model.encoder.layouts, state, query, motion, known_heading=known)
         found: Tracked = run_steps(steps, model.refiner)
         self._state = found.state
         self.answers.append(compose_tracked(found, self._ground, Spot(view), self._owner.bundle, odometry=motion))

@@ -43,7 +43,7 @@ class LocalModel:
     def grid(self, plan: FloorPlan, camera_height_m: float, step_m: float = GRID_STEP_M) -> PoseGrid:
         """Compute the pose grid of a plan, with latents if the model compares only these."""
         latents = not self.encoder.predicts_profile
-        return build_grid(plan, self.encoder, step_m=step_m, camera_height_m=camera_height_m, latents=latents)
+        return build_grid(plan, self.encoder.layouts, step_m=step_m, camera_height_m=camera_height_m, latents=latents)
 
     def open(self, content: bytes, stated: StatedCamera | None = None, *, overview: int = 0) -> Photograph:
         """Read a photograph in the sizes that the model needs; `overview` is as for `open_photograph`.
@@ -69,7 +69,7 @@ class LocalModel:
 
     def localise(self, plan: FloorPlan, grid: PoseGrid, query: Query) -> Localisation:
         """Search a plan."""
-        return localise(plan, grid, self.encoder, query, refiner=self.refiner)
+        return localise(plan, grid, self.encoder.layouts, query, refiner=self.refiner)
 
     def localise_turn(
         self,

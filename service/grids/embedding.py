@@ -59,12 +59,14 @@ def embed(
     for first in range(0, len(poses), chunk):
         part = PoseSet(poses.position_m[first : first + chunk], poses.room_index[first : first + chunk])
         with computing():
-            seen = encoders.rendered(plan, part)
+            seen = encoders.layouts.rendered(plan, part)
             layouts.append(seen)
             is_finite = bool(np.isfinite(seen.log_profile).all())
             if not encoders.predicts_profile:
                 heights = np.full(len(part), camera_height_m)
-                latent = encoders.layouts(np.exp(seen.log_profile), heights, plan.ceiling_heights_m[part.room_index])
+                latent = encoders.layouts.latents(
+                    np.exp(seen.log_profile), heights, plan.ceiling_heights_m[part.room_index]
+                )
                 latents.append(latent.astype(np.float32, copy=False))
                 is_finite &= bool(np.isfinite(latent).all())
         if not is_finite:

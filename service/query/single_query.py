@@ -60,7 +60,7 @@ class SingleSearch:
         steps = localise_steps(
             ground.plan,
             ground.grid,
-            self._parts.encoder,
+            self._parts.encoder.layouts,
             encoded,
             refine=form.refine,
             top_k=form.top_k,

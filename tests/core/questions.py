@@ -70,7 +70,7 @@ def perfect_query(
     rolls = np.arange(hypotheses) * (TWO_PI / hypotheses)
     positions = np.tile(np.array(position_m, dtype=float), (hypotheses, 1))
     poses = PoseSet(positions, plan.room_index_at(positions))
-    latents, profile_m = encoders.poses(plan, poses, -rolls, height.height_m)
+    latents, profile_m = encoders.layouts.poses(plan, poses, -rolls, height.height_m)
     profile = None if log_scale is None else PredictedProfile(np.log(profile_m), np.full_like(profile_m, log_scale))
     return Query(latents, rolls, 0.0, heading_known=hypotheses == 1, camera_height=height, profile=profile)
 

@@ -52,7 +52,7 @@ def encoder(bundle: Bundle) -> PhotographEncoder:
 @pytest.fixture(scope="module")
 def ground(encoder: PhotographEncoder) -> AlbumGround:
     plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_text())
-    grid = build_grid(plan, encoder, step_m=0.5, camera_height_m=plan.camera_height_m, latents=False)
+    grid = build_grid(plan, encoder.layouts, step_m=0.5, camera_height_m=plan.camera_height_m, latents=False)
     return AlbumGround.of_plan("flat", plan, grid)
 
 
@@ -358,7 +358,7 @@ def test_places_that_are_too_large_are_refused(encoder: PhotographEncoder, photo
         for x, y in (divmod(number, 40) for number in range(MAX_ROOMS + 1))
     ]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": squares})
-    grid = build_grid(plan, encoder, step_m=1.0, camera_height_m=1.5, latents=False)
+    grid = build_grid(plan, encoder.layouts, step_m=1.0, camera_height_m=1.5, latents=False)
     ground = AlbumGround.of_plan("large", plan, grid)
     with pytest.raises(InvalidInputError, match=r"1001 rooms and .* at most 1000 rooms"):
         solve_album(ground, encoder, photographs)

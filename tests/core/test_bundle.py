@@ -88,18 +88,18 @@ class TestExport:
     ) -> None:
         # More than one batch shows that no batch size is fixed.
         scene = scene_of(crooked_flat(), 300, 0)
-        latents, profile_m = encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)
+        latents, profile_m = encoders.layouts.poses(scene.plan, scene.poses, scene.heading, 1.5)
         assert profile_m.shape == (300, opened_bundle.manifest.profile_columns)
         assert latents.shape == (300, opened_bundle.manifest.latent_size)
         np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1.0, atol=1e-5)
         profile = torch.empty(300, 32).uniform_(0.3, 8.0)
         heights = (torch.full((300,), 1.4), torch.full((300,), 2.6))
         expected = optimiser.encoder(profile, *heights).numpy()
-        actual = encoders.layouts(profile.numpy(), *(height.numpy() for height in heights))
+        actual = encoders.layouts.latents(profile.numpy(), *(height.numpy() for height in heights))
         np.testing.assert_allclose(actual, expected, atol=1e-4)
 
     def test_empty_batch_gives_no_latents(self, encoders: PhotographEncoder) -> None:
-        assert encoders.layouts(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
+        assert encoders.layouts.latents(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
 
     @pytest.mark.slow
     def test_exported_files_name_no_local_paths(self, tiny_run: Path) -> None:
@@ -139,7 +139,7 @@ class TestExport:
         bundle = export_bundle(tmp_path, TINY, build_layout_encoder(TINY), None, name="half", version="1")
         assert not {IMAGE_ONNX, IMAGE_WEIGHTS} & set(bundle.manifest.files)
         encoders = PhotographEncoder(bundle, threads=1)
-        assert encoders.layouts(np.full((1, 32), 2.0), np.array([1.5]), np.array([2.5])).shape == (1, 128)
+        assert encoders.layouts.latents(np.full((1, 32), 2.0), np.array([1.5]), np.array([2.5])).shape == (1, 128)
         with pytest.raises(BundleError, match="layout queries only"):
             encoders.spheres.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
 
@@ -171,11 +171,11 @@ class TestExport:
         profile = torch.empty(2, 64).uniform_(0.5, 5.0)
         heights = (torch.full((2,), 1.5), torch.full((2,), 2.5))
         np.testing.assert_allclose(
-            encoders.layouts(profile.numpy(), *(h.numpy() for h in heights)),
+            encoders.layouts.latents(profile.numpy(), *(h.numpy() for h in heights)),
             optimiser.encoder(profile, *heights).numpy(),
             atol=1e-4,
         )
-        assert encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)[0].shape == (2, 128)
+        assert encoders.layouts.poses(scene.plan, scene.poses, scene.heading, 1.5)[0].shape == (2, 128)
 
 
 class TestReading:

@@ -415,7 +415,7 @@ def cohort(encoders: PhotographEncoder) -> Cohort:
 
 def log_cost_to_cohort(encoders: PhotographEncoder, cohort: Cohort | None, plan: FloorPlan, query: Query) -> float:
     weights, config = MatchingWeights(), MatchingConfig()
-    grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+    grid = build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
     cost = float(grid_costs(plan, grid, query, weights, config).cost.min())
     expected = cost_by_chance(cohort, plan, query, config.grid_reach * 0.5, weights, config)
     return log_cost_to_chance(cost, expected)
@@ -461,9 +461,9 @@ class TestBundles:
         np.testing.assert_array_equal(found.kind, cohort.kind)
         encoders, home = PhotographEncoder(with_cohort, threads=1), crooked_flat()
         query = perfect_query(encoders, home, (5.1, 1.3), log_scale=-3.5)
-        grid = build_grid(home, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+        grid = build_grid(home, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
         config = LocaliseConfig(every_stage=True)
-        signals = localise(home, grid, encoders, query, refiner=optimiser.refine, config=config).signals
+        signals = localise(home, grid, encoders.layouts, query, refiner=optimiser.refine, config=config).signals
         expected = log_cost_to_cohort(encoders, cohort, home, query)
         assert len(signals) == 3
         for signal in signals.values():

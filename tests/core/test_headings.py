@@ -143,8 +143,8 @@ class TestPerfectEncoder:
         turned = wrap_angle(query.roll + query.frame_heading - (heading + share * tolerance))
         assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
         assert np.abs(np.diff(np.sort(np.asarray(turned, dtype=float))) - SECTOR).max(initial=0.0) < 1e-9
-        grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
-        best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
+        grid = build_grid(flat, perfect.layouts, step_m=0.25, camera_height_m=CAMERA_M)
+        best = localise(flat, grid, perfect.layouts, query, refiner=optimiser.refine).candidates[0]
         assert np.hypot(*(best.position_m - POSE.position_m[0])) < 0.02
         assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)
 
@@ -164,8 +164,8 @@ class TestPerfectEncoder:
         query = perfect.spheres.query(
             photograph_of(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M)
         )
-        grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
-        best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
+        grid = build_grid(flat, perfect.layouts, step_m=0.25, camera_height_m=CAMERA_M)
+        best = localise(flat, grid, perfect.layouts, query, refiner=optimiser.refine).candidates[0]
         assert best.room_index == pose.room_index[0]
         assert np.hypot(*(best.position_m - position)) < 0.02
         assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)

@@ -96,9 +96,9 @@ def test_low_confidence_of_a_photograph_without_household_objects_has_its_reason
 
 def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
     asked, rooms = (view("hotel_room", BED_DEG), 0.0), plan("kitchen", "bedroom")
-    grid = build_grid(rooms, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+    grid = build_grid(rooms, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     alone = query(asked)
-    found = localise(rooms, grid, encoder(), alone, refine="none")
+    found = localise(rooms, grid, encoder().layouts, alone, refine="none")
     parts: list[str] = []
 
     class Helper(ThreadPoolExecutor):
@@ -110,7 +110,7 @@ def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
         encoder().use_helper(lambda: helper)
         try:
             beside = query(asked)
-            again = localise(rooms, grid, encoder(), beside, refine="none")
+            again = localise(rooms, grid, encoder().layouts, beside, refine="none")
         finally:
             encoder().use_helper(lambda: None)
     assert parts == ["_seen_objects", "by_chance"]
@@ -124,8 +124,8 @@ def test_room_of_the_seen_type_wins_among_equal_rooms() -> None:
     types = ("kitchen", "bathroom", "bedroom", "unknown")
     equal = plan(*types)
     asked = query((view("hotel_room", BED_DEG), 0.0))
-    grid = build_grid(equal, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
-    assert types[localise(equal, grid, encoder(), asked, refine="none").candidates[0].room_index] == "bedroom"
+    grid = build_grid(equal, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
+    assert types[localise(equal, grid, encoder().layouts, asked, refine="none").candidates[0].room_index] == "bedroom"
 
 
 def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
@@ -206,8 +206,8 @@ def test_room_that_draws_the_seen_bed_wins_among_equal_rooms() -> None:
     asked = query((view("hotel_room", BED_DEG), 0.0))
     for kind, expected in (("bed", 2), ("stove", None)):
         drawn = furnished((kind, 11.7, 2.2))
-        grid = build_grid(drawn, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
-        found = localise(drawn, grid, encoder(), asked, refine="none")
+        grid = build_grid(drawn, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
+        found = localise(drawn, grid, encoder().layouts, asked, refine="none")
         by_room = np.bincount(grid.poses.room_index, found.posterior.pose)
         if expected is None:
             # Kinds that the photograph does not show, and kinds that the plan draws nowhere, tell nothing.
@@ -227,7 +227,7 @@ def seen_from_the_middle(drawn: FloorPlan, *objects: SeenObject) -> Query:
 def test_stove_ahead_and_the_stove_that_is_drawn_tell_the_heading() -> None:
     # East of the middle: the camera looks along +x, or the stove is 90 degrees to its right.
     drawn = furnished(("stove", 3.4, 1.2))
-    grid = build_grid(drawn, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+    grid = build_grid(drawn, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     for azimuth_deg, expected_deg in ((0.0, 90.0), (90.0, 0.0)):
         asked = seen_from_the_middle(drawn, SeenObject("stove", 0.9, math.radians(azimuth_deg)))
         cost = PlaceCost.of(drawn, asked, NO_HINTS, 1.0, np.array([[2.0, 1.5], [7.0, 1.5]]), np.array([0, 1]))
@@ -239,14 +239,14 @@ def test_stove_ahead_and_the_stove_that_is_drawn_tell_the_heading() -> None:
         elsewhere = cost.of_pairs(np.array([1, 1]), np.array([0, best]))
         assert elsewhere[0] == elsewhere[1] > lowest + 0.5
         assert lowest >= 0.0
-        found = localise(drawn, grid, encoder(), asked, refine="none")
+        found = localise(drawn, grid, encoder().layouts, asked, refine="none")
         assert found.candidates[0].room_index == 0
         assert found.candidates[0].place_cost < elsewhere[0] / encoder().manifest.evidence.temperature
 
 
 def test_fixtures_of_merged_plans_stay_in_their_plans() -> None:
     plans = [furnished(("stove", 3.4, 1.2)), furnished(("bed", 0.2, 0.2), ("stove", 8.4, 1.2))]
-    grids = [build_grid(each, encoder(), step_m=1.0, camera_height_m=1.5, latents=False) for each in plans]
+    grids = [build_grid(each, encoder().layouts, step_m=1.0, camera_height_m=1.5, latents=False) for each in plans]
     merged = MergedPlans.of(plans, grids, 1.5).plan
     assert sorted(merged.fixtures_by_kind) == ["bed", "stove"]
     np.testing.assert_array_equal(merged.fixtures_by_kind["stove"].room_index, [0, 5])

@@ -44,7 +44,7 @@ def search(flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimis
 
 @pytest.fixture(scope="module")
 def grid(flat: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(flat, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+    return build_grid(flat, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
 
 
 def layout_query(encoders: PhotographEncoder, plan: FloorPlan, pose: PoseSet, *, by_profile: bool = False) -> Query:
@@ -126,9 +126,9 @@ class TestCandidates:
 
     def test_small_plan_has_fewer_candidates(self, encoders: PhotographEncoder) -> None:
         plan = plan_of(rectangle(1.2, 1.2))
-        grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+        grid = build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
         query = layout_query(encoders, plan, PoseSet(np.array([[0.5, 0.6]]), np.array([0])))
-        assert len(localise(plan, grid, encoders, query, refine="vdr", top_k=5).candidates) == 1
+        assert len(localise(plan, grid, encoders.layouts, query, refine="vdr", top_k=5).candidates) == 1
 
     def test_localisation_is_deterministic(self, flat: FloorPlan, encoders: PhotographEncoder, search: Search) -> None:
         query = layout_query(encoders, flat, random_pose(flat, 1))
@@ -278,14 +278,14 @@ class TestGrid:
         assert len(present(grid.latents)) == len(grid.poses)
         index = np.array([0, 5, len(grid.poses) - 1])
         poses = PoseSet(grid.poses.position_m[index], grid.poses.room_index[index])
-        latents, profile_m = encoders.poses(flat, poses, np.zeros(3), CAMERA_M)
+        latents, profile_m = encoders.layouts.poses(flat, poses, np.zeros(3), CAMERA_M)
         np.testing.assert_allclose(latents, present(grid.latents)[index], atol=1e-5)
         np.testing.assert_array_equal(profile_m, grid.profile_m[index])
 
     def test_grid_depends_on_the_camera_height(
         self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
     ) -> None:
-        higher = build_grid(flat, encoders, step_m=0.5, camera_height_m=1.8)
+        higher = build_grid(flat, encoders.layouts, step_m=0.5, camera_height_m=1.8)
         assert dataclasses.replace(higher, latents=grid.latents).camera_height_m == 1.8
         assert np.abs(present(higher.latents) - grid.latents).max() > 1e-3
 
@@ -330,8 +330,8 @@ def localised(
     profile = present(query.profile)
     grain = np.random.default_rng(seed).normal(size=profile.log_m.shape).astype(np.float32)
     query = dataclasses.replace(query, profile=dataclasses.replace(profile, log_m=profile.log_m + noise * grain))
-    grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
-    return localise(plan, grid, encoders, query, refiner=optimiser.refine, top_k=10)
+    grid = build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
+    return localise(plan, grid, encoders.layouts, query, refiner=optimiser.refine, top_k=10)
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["heading known", "heading searched"])
@@ -395,14 +395,14 @@ def test_corridor_is_determined_across_but_not_along(encoders: PhotographEncoder
     # The ends are visible at a few azimuths only.
     plan = plan_of(rectangle(60.0, 1.8))
     position = np.array([[30.0, 0.8]])
-    _, profile_m = encoders.poses(plan, PoseSet(position, np.array([0])), np.zeros(1), CAMERA_M)
+    _, profile_m = encoders.layouts.poses(plan, PoseSet(position, np.array([0])), np.zeros(1), CAMERA_M)
     # The prediction is uncertain beyond 6 m, as in a photograph of a plain corridor.
     far = profile_m > 6.0
     profile = PredictedProfile(np.log(np.minimum(profile_m, 9.0)), np.where(far, 3.0, LOG_SCALE))
     latents = np.eye(1, encoders.manifest.latent_size)
     query = Query(latents, np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(CAMERA_M), profile=profile)
-    grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
-    found = localise(plan, grid, encoders, query, refiner=optimiser.refine)
+    grid = build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
+    found = localise(plan, grid, encoders.layouts, query, refiner=optimiser.refine)
     assert found.posterior.position < 0.2
     information = present(found.candidates[0].information)
     assert information[0, 0] < 1e-3 * information[1, 1]

@@ -290,7 +290,10 @@ STANDS_M = (1.3, 0.9)
 def encoders(opened_bundle: Bundle) -> PhotographEncoder:
     """PhotographEncoder with the temperature of the shipped model."""
     encoders = PhotographEncoder(opened_bundle, threads=1)
-    encoders.manifest = replace(encoders.manifest, evidence=replace(encoders.manifest.evidence, temperature=44.0))
+    manifest = encoders.manifest
+    encoders.manifest = encoders.layouts.manifest = replace(
+        manifest, evidence=replace(manifest.evidence, temperature=44.0)
+    )
     return encoders
 
 
@@ -303,7 +306,7 @@ def plan() -> FloorPlan:
 
 @pytest.fixture(scope="module")
 def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
+    return build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
 
 
 @pytest.fixture(scope="module")
@@ -315,7 +318,7 @@ class TestLocalisation:
     @pytest.fixture
     def ask(self, plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Ask:
         def localised(query: Query, hints: Hints = NO_HINTS, refine: Refine = "lpo") -> Localisation:
-            return localise(plan, grid, encoders, query, refine=refine, refiner=optimiser.refine, hints=hints)
+            return localise(plan, grid, encoders.layouts, query, refine=refine, refiner=optimiser.refine, hints=hints)
 
         return localised
 

@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.localise.belief import suppress
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import (
     Layouts,
     LowestCosts,
@@ -64,8 +64,8 @@ def unknown_heading_query(latents: np.ndarray) -> Query:
     return Query(latents, np.arange(len(latents)) * (2.0 * math.pi / len(latents)), 0.0, False, EXACT)
 
 
-class PlaceEncoders(PhotographEncoder):
-    """Fake encoders: the latent of a pose is a direction that depends smoothly on its position."""
+class PlaceEncoders(LayoutEncoder):
+    """Fake encoder: the latent of a pose is a direction that depends smoothly on its position."""
 
     def __init__(self) -> None:
         self.manifest = Manifest(

@@ -222,7 +222,7 @@ def plan() -> FloorPlan:
 
 @pytest.fixture(scope="module")
 def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
+    return build_grid(plan, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
 def queries_along(encoders: PhotographEncoder, plan: FloorPlan, walk: Walk, height: CameraHeight) -> list[Query]:
@@ -231,9 +231,9 @@ def queries_along(encoders: PhotographEncoder, plan: FloorPlan, walk: Walk, heig
     for place, room, heading in walk:
         pose = PoseSet(np.array([place]), np.array([room]))
         roll = np.arange(HEADINGS) * (math.tau / HEADINGS)
-        profile_m = np.concatenate([encoders.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
+        profile_m = np.concatenate([encoders.layouts.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
         profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -3.0))
-        latents = encoders.layouts(profile_m, np.full(HEADINGS, CAMERA_M), np.full(HEADINGS, 2.5))
+        latents = encoders.layouts.latents(profile_m, np.full(HEADINGS, CAMERA_M), np.full(HEADINGS, 2.5))
         queries.append(Query(latents, roll, 0.0, heading_known=False, camera_height=height, profile=profile))
     return queries
 
@@ -294,7 +294,7 @@ class TestSearch:
     ) -> None:
         together = search(walk_queries, [Motion()] * 2)
         for query, picture in zip(walk_queries, together.pictures, strict=True):
-            alone = localise(plan, grid, encoders, query, refine="none")
+            alone = localise(plan, grid, encoders.layouts, query, refine="none")
             np.testing.assert_allclose(picture.posterior.pose, alone.posterior.pose, atol=2e-3)
             assert picture.candidates[0].cost == pytest.approx(alone.candidates[0].cost, abs=1e-5)
 
@@ -305,7 +305,7 @@ class TestSearch:
         queries = queries_along(encoders, plan, spot, CameraHeight(CAMERA_M, 0.0))
         found = search(queries, [Motion(distance_m=0.0, distance_std_m=0.1)], refiner=refine_sequence)
         assert found_turns(found) == pytest.approx([0.0, 1.2], abs=0.01)
-        joint = localise(plan, grid, encoders, queries[0], refine="none")
+        joint = localise(plan, grid, encoders.layouts, queries[0], refine="none")
         judged = judged_turn(found, joint)
         for picture, before in zip(judged.pictures, found.pictures, strict=True):
             assert picture.candidates == before.candidates
@@ -402,9 +402,11 @@ class TestConfidence:
             for shot in shots
         ]
         walk = [((shot.position_m[0], shot.position_m[1]), shot.room_index, shot.heading) for shot in shots]
-        grid = build_grid(home.plan, encoders, step_m=STEP_M, camera_height_m=self.STATED_M, latents=False)
-        alone = [localise(home.plan, grid, encoders, query, refiner=refiner) for query in queries]
-        together = localise_sequence(home.plan, grid, encoders, queries, motions_along(walk), refiner=refine_sequence)
+        grid = build_grid(home.plan, encoders.layouts, step_m=STEP_M, camera_height_m=self.STATED_M, latents=False)
+        alone = [localise(home.plan, grid, encoders.layouts, query, refiner=refiner) for query in queries]
+        together = localise_sequence(
+            home.plan, grid, encoders.layouts, queries, motions_along(walk), refiner=refine_sequence
+        )
         assert together.motions_contradicted == ()
         model = shipped.manifest.confidence_for(view=False)
         sure = [present(picture.confidence(model)).position for picture in alone]

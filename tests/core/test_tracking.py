@@ -56,7 +56,7 @@ def plan() -> FloorPlan:
 
 @pytest.fixture(scope="module")
 def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
+    return build_grid(plan, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def follow(
     """Follow a walk, with the state in bytes between photographs."""
     state, found = TrackState.first(len(queries[0].roll)), []
     for query, move in zip(queries, moves, strict=True):
-        found.append(run_steps(track_steps(ground, encoders, state, query, move), lambda _job: None))
+        found.append(run_steps(track_steps(ground, encoders.layouts, state, query, move), lambda _job: None))
         state = TrackState.from_bytes(found[-1].state.to_bytes())
     return found
 
@@ -187,7 +187,7 @@ class TestFilter:
         beliefs = []
         for error in (0.0, math.radians(off_deg)):
             known = KnownHeading(heading + error, math.radians(30.0), "given")
-            steps = track_steps(ground, encoders, state, queries[0], None, known_heading=known)
+            steps = track_steps(ground, encoders.layouts, state, queries[0], None, known_heading=known)
             belief = run_steps(steps, lambda _job: None).state.belief
             beliefs.append(belief.weight[belief.sector == round(heading / (math.tau / state.sectors))].sum())
         # As probable as with the exact heading; far less probable beyond the tolerance.
@@ -199,12 +199,12 @@ class TestFilter:
         other = (StatePlan("", len(ground.grid.poses) + 1),)
         state = replace(TrackState.first(len(queries[0].roll)), plans=other)
         with pytest.raises(InvalidStateError, match="begin a new session"):
-            run_steps(track_steps(ground, encoders, state, queries[0], None), lambda _job: None)
+            run_steps(track_steps(ground, encoders.layouts, state, queries[0], None), lambda _job: None)
 
 
 def building(encoders: PhotographEncoder, plans: Sequence[FloorPlan]) -> TrackedPlans:
     """Return the ground of a building with one plan per level."""
-    grids = [build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M) for plan in plans]
+    grids = [build_grid(plan, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M) for plan in plans]
     graphs = [WalkGraph.of(grid.poses, grid.layouts(plan), STEP_M) for plan, grid in zip(plans, grids, strict=True)]
     entries = [PlanOnLevel(plan, float(level)) for level, plan in enumerate(plans)]
     levels, keys = [entry.level for entry in entries], [f"plan {level}" for level in range(len(plans))]
@@ -351,7 +351,7 @@ class TestState:
         for number, (index, move) in enumerate(zip(order, moves, strict=True)):
             state = TrackState.from_bytes(content)
             content = run_steps(
-                track_steps(ground, encoders, state, queries[index], move), lambda _job: None
+                track_steps(ground, encoders.layouts, state, queries[index], move), lambda _job: None
             ).state.to_bytes()
             sizes.append(len(content))
             if number == 500:

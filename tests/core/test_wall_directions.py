@@ -119,12 +119,12 @@ def test_headings_across_the_walls_cost_more_than_those_along_them() -> None:
 
 def test_direction_tells_a_turned_room_among_equal_ones() -> None:
     plan = rooms(0.0, 30.0)
-    grid = build_grid(plan, encoder(), step_m=0.5, camera_height_m=1.5, latents=False)
+    grid = build_grid(plan, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     # Predictions that tell nothing, at heading 0.
     asked = perfect_query(encoder(), plan, (10.0, 0.0), log_scale=3.0)
     for walls_deg, expected in ((30.0, 1), (90.0, 0)):
         told = replace(asked, wall_directions=(WallDirection(math.radians(walls_deg), math.radians(1.0)),))
-        assert localise(plan, grid, encoder(), told, refine="none").candidates[0].room_index == expected
+        assert localise(plan, grid, encoder().layouts, told, refine="none").candidates[0].room_index == expected
 
 
 def test_uncertain_directions_tell_nothing_and_several_count_by_their_mean() -> None:
@@ -147,7 +147,7 @@ def test_uncertain_directions_tell_nothing_and_several_count_by_their_mean() -> 
 
 def test_merged_plans_keep_the_directions_of_their_rooms() -> None:
     plans = [rooms(0.0), rooms(30.0, 60.0)]
-    grids = [build_grid(each, encoder(), step_m=1.0, camera_height_m=1.5, latents=False) for each in plans]
+    grids = [build_grid(each, encoder().layouts, step_m=1.0, camera_height_m=1.5, latents=False) for each in plans]
     merged = MergedPlans.of(plans, grids, 1.5).plan
     np.testing.assert_allclose(
         merged.wall_directions, np.concatenate([each.wall_directions for each in plans]), atol=1e-6

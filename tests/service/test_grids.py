@@ -75,6 +75,7 @@ class CountingEncoders(PhotographEncoder):
 
     def __init__(self, bundle: Bundle) -> None:
         super().__init__(bundle, threads=1)
+        self._render, self.layouts.rendered = self.layouts.rendered, self.rendered
         self.embedded = 0
         self.pause_s = 0.0
         self.go_on = threading.Event()
@@ -82,7 +83,7 @@ class CountingEncoders(PhotographEncoder):
 
     def rendered(self, *arguments: Any, **named: Any) -> Any:
         """Render as the encoders do."""
-        result = super().rendered(*arguments, **named)
+        result = self._render(*arguments, **named)
         self.embedded += len(result)
         assert self.go_on.wait(30.0)
         time.sleep(self.pause_s)
@@ -133,7 +134,7 @@ MakeGrids = Callable[..., GridProvider]
 
 def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: PhotographEncoder) -> None:
     computed = make_grids(store).compute(_add(store, HALL), 1.5).result(30.0)
-    expected = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5, latents=False)
+    expected = build_grid(HALL, encoders.layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     np.testing.assert_array_equal(computed.poses.position_m, expected.poses.position_m)
     np.testing.assert_array_equal(computed.profile_m, expected.profile_m)
     np.testing.assert_array_equal(computed.layouts(HALL).log_profile, expected.layouts(HALL).log_profile)
@@ -359,7 +360,7 @@ def test_overtaken_replica_gives_way(open_store: OpenStore, make_grids: MakeGrid
     encoders.go_on.set()
     wait_for(lambda: len(grids._jobs.remote()) == 1)
     assert encoders.embedded < 1521
-    grid = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5)
+    grid = build_grid(HALL, encoders.layouts, step_m=0.5, camera_height_m=1.5)
     assert store.grids.put(key, grid, keep=8, always_keep_mm=1500)
     wait_for(lambda: _looked(grids) or future.done())
     np.testing.assert_array_equal(future.result().profile_m, grid.profile_m)

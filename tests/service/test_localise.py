@@ -317,8 +317,8 @@ def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipel
     image = read_sphere(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
     query = encoders.spheres.query(image, None if heading_deg is None else np.radians(heading_deg), CameraHeight(1.5))
     plan = FloorPlan.from_dict(FLAT)
-    grid = build_grid(plan, encoders, step_m=Settings().grids.grid_step_m, camera_height_m=1.5)
-    return pipeline.localise(plan, grid, encoders, query, refine="none")
+    grid = build_grid(plan, encoders.layouts, step_m=Settings().grids.grid_step_m, camera_height_m=1.5)
+    return pipeline.localise(plan, grid, encoders.layouts, query, refine="none")
 
 
 def test_confidence_is_null_without_a_model(client: httpx.Client, flat: str, panorama: bytes) -> None:

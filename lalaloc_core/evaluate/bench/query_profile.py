@@ -40,7 +40,7 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
         with clock.stage("encode"):
             heading = shot.heading if known else None
             query = model.encoder.spheres.query(images[index], heading, CameraHeight(shot.camera_height_m))
-        localise(home.plan, grid, model.encoder, query, refiner=model.refiner, clock=clock)
+        localise(home.plan, grid, model.encoder.layouts, query, refiner=model.refiner, clock=clock)
         return clock.timings_ms
 
     lines = [f"| stage, median of {queries} queries | known heading | unknown heading |", "|---|---|---|"]

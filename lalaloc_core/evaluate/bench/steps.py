@@ -151,7 +151,9 @@ class _Visit:
         queries = [
             self.model.encoder.query(view, None, self.height) for view in (self.photograph, self._view(sphere, 0.0))
         ]
-        found = localise_sequence(plan, self.grid, self.model.encoder, queries, [motion], refiner=refine_sequence)
+        found = localise_sequence(
+            plan, self.grid, self.model.encoder.layouts, queries, [motion], refiner=refine_sequence
+        )
         confidence = self._confidence(found.pictures[1])
         assert confidence is not None
         return confidence.position, float(np.linalg.norm(found.pictures[1].candidates[0].position_m - place))
@@ -163,7 +165,7 @@ class _Visit:
 
     def _localised(self, query: Query, hints: Hints = NO_HINTS) -> Localisation:
         plan = self.shot.home.plan
-        return localise(plan, self.grid, self.model.encoder, query, refiner=self.model.refiner, hints=hints)
+        return localise(plan, self.grid, self.model.encoder.layouts, query, refiner=self.model.refiner, hints=hints)
 
     def _confidence(self, found: Localisation) -> Confidence | None:
         return found.confidence(self.model.bundle.manifest.confidence_for(view=True, turn=found.query.is_turn))

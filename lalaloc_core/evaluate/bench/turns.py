@@ -63,7 +63,7 @@ def _at_spot(spot: Spot, model: LocalModel) -> dict[str, _Answer]:
     believed = known.confidence(manifest.confidence_for(view=True, turn=True))
     motions = [Motion(distance_m=0.0, distance_std_m=_TURNED_STD_M)] * (len(views) - 1)
     queries = [encoder.query(view, None, height) for view in opened]
-    unknown = localise_sequence(plan, grid, model.encoder, queries, motions, refiner=refine_sequence)
+    unknown = localise_sequence(plan, grid, model.encoder.layouts, queries, motions, refiner=refine_sequence)
     unknown = judged_turn(unknown, as_one(found_turns(unknown)))
     return {
         "known_angles": _answer(known, views[0], None if believed is None else believed.position),

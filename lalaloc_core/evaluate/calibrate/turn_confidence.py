@@ -212,7 +212,7 @@ class _Turn:
             self._photographs[0], shot.heading if known else None, CameraHeight(height_m), others=others
         )
         grid: PoseGrid = model.grid(plan, height_m)
-        found = localise(plan, grid, model.encoder, query, refiner=model.refiner, config=_CONFIG)
+        found = localise(plan, grid, model.encoder.layouts, query, refiner=model.refiner, config=_CONFIG)
         stages = {stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()}
         return Prediction(
             scene=scene,

@@ -44,7 +44,7 @@ class VdrDecode:
         with clock.stage("encode"):
             query = encode(encoders, question, image)
         grid = self._lalaloc.grid(question)
-        found = localise(plan, grid, encoders, query, refine="vdr", config=self._config)
+        found = localise(plan, grid, encoders.layouts, query, refine="vdr", config=self._config)
         clock.timings_ms.update(found.timings_ms)
         with clock.stage("decode"):
             start = found.candidates[0]

@@ -86,7 +86,7 @@ class LaLaLoc:
         found = localise(
             question.plan,
             grid,
-            self.encoders,
+            self.encoders.layouts,
             query,
             refine=self._refine,
             # The number of returned candidates does not change the search.
@@ -139,7 +139,7 @@ class LaLaLoc:
     def grid(self, question: Question) -> PoseGrid:
         """Return the pose grid of a question at its stated camera height; the last few are cached."""
         height_m, poses = self._stated.of(question).height_m, question.grid
-        latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height_m)
+        latents, profile_m = self.encoders.layouts.poses(question.plan, poses, np.zeros(len(poses)), height_m)
         return PoseGrid(poses, latents, profile_m, question.grid_step_m, height_m)
 
 
@@ -175,7 +175,7 @@ def encode(
         sectors = encoders.manifest.ring_sectors or _HEADINGS
         rolls = np.arange(sectors) * (TWO_PI / sectors)
     poses = PoseSet(np.repeat(camera.position_m[None], len(rolls), axis=0), np.full(len(rolls), camera.room_index))
-    latents, profile_m = encoders.poses(question.plan, poses, camera.heading - rolls, camera.camera_height_m)
+    latents, profile_m = encoders.layouts.poses(question.plan, poses, camera.heading - rolls, camera.camera_height_m)
     profile = None
     if encoders.predicts_profile:
         profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, _TRUE_LAYOUT_LOG_SCALE))

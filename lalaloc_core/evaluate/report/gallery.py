@@ -181,7 +181,7 @@ def _maps(question: Question, encoders: PhotographEncoder | None, left_out: list
             left_out.append(f"A map of latent distances is left out: {error}.")
         else:
             heading = np.full(len(cells.poses), query.frame_heading)
-            latents, _ = encoders.poses(plan, cells.poses, heading, camera.camera_height_m)
+            latents, _ = encoders.layouts.poses(plan, cells.poses, heading, camera.camera_height_m)
             # The best heading hypothesis of each place.
             distances = latent_distances(latents, query.latents).min(axis=0)
             maps.append(DrawnMap("latent distance", "latent distance (log scale)", cells, distances))

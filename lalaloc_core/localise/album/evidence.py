@@ -192,7 +192,7 @@ def _by_chance(
     encoder: PhotographEncoder, compared: Comparison, usual: Float[np.ndarray, "j"], trust_number: int
 ) -> float:
     """Return the log likelihood of the best pose of other homes, under one trust; -inf if the model has none."""
-    cohort = encoder.cohort
+    cohort = encoder.layouts.cohort
     if cohort is None:
         return -math.inf
     layouts = cohort.layouts.rows(np.arange(0, len(cohort.layouts), _EVERY))

@@ -162,14 +162,16 @@ class Turn:
         plan, grid = ground.plan, ground.grid
 
         def joint_steps(query: Query) -> Generator[RefinementJob, Any, Localisation]:
-            return localise_steps(plan, grid, encoder, query, refine=refine, top_k=top_k, config=config, clock=clock)
+            return localise_steps(
+                plan, grid, encoder.layouts, query, refine=refine, top_k=top_k, config=config, clock=clock
+            )
 
         if self.is_one_query and self.turns is not None:
             return localised_turn((yield from joint_steps(queries[0])), self.turns)
         order = range(len(queries)) if self.linked is None else self.linked.order
         ordered = [queries[index] for index in order]
         found = yield from localise_sequence_steps(
-            plan, grid, encoder, ordered, self.motions, refine=refine, top_k=top_k, clock=clock
+            plan, grid, encoder.layouts, ordered, self.motions, refine=refine, top_k=top_k, clock=clock
         )
         found = found if self.linked is None else self.linked.in_order(found)
         if not self.is_one_query:

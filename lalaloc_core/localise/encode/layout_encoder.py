@@ -39,7 +39,7 @@ class LayoutEncoder:
         self.helper: Callable[[], Executor | None] = lambda: None
         self._session = open_session(bundle.read(LAYOUT_ONNX), threads)
 
-    def layouts(
+    def latents(
         self,
         profile_m: Float[np.ndarray, "b c"],
         camera_height_m: Float[np.ndarray, "b"],
@@ -63,7 +63,7 @@ class LayoutEncoder:
         """Render and encode the layout of every pose of a plan; return latents and wall profiles (m)."""
         profile_m = self.profiles(plan, poses, heading)
         heights = np.full(len(poses), camera_height_m)
-        return self.layouts(profile_m, heights, plan.ceiling_heights_m[poses.room_index]), profile_m
+        return self.latents(profile_m, heights, plan.ceiling_heights_m[poses.room_index]), profile_m
 
     def rendered(self, plan: FloorPlan, poses: PoseSet) -> Layouts:
         """Render the layouts of grid poses at heading 0, with the networks' number of columns."""

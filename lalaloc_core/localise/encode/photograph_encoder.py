@@ -22,12 +22,12 @@ from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeat
 from lalaloc_core.photograph.patches import joined_patches
 
 
-class PhotographEncoder(LayoutEncoder):
-    """Networks of one bundle for photographs and for the layouts that they are compared with.
-
-    It is safe to share between threads.
+class PhotographEncoder:
+    """Networks of one bundle for photographs and for the layouts that they are compared with; safe to share.
 
     Attributes:
+        manifest: the bundle's manifest.
+        layouts: encoder of layouts, and what searches need beside it.
         spheres: encoder of full spheres.
     """
 
@@ -39,7 +39,8 @@ class PhotographEncoder(LayoutEncoder):
         Raises:
             BundleError: see `LayoutEncoder`, `SphereEncoder` and `ViewEncoder`.
         """
-        super().__init__(bundle, threads=threads)
+        self.manifest = bundle.manifest
+        self.layouts = LayoutEncoder(bundle, threads=threads)
         self.spheres = SphereEncoder(bundle, threads=threads)
         self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
         self._objects = None if bundle.manifest.objects is None else ObjectEncoder(bundle, threads=threads)
@@ -84,7 +85,7 @@ class PhotographEncoder(LayoutEncoder):
         self.check(photograph)
         assert self._views is not None
         turned = [(photograph, 0.0), *others]
-        helper = None if photograph.features is not None or self._objects is None else self.helper()
+        helper = None if photograph.features is not None or self._objects is None else self.layouts.helper()
         beside = None if helper is None else helper.submit(self._seen_objects, turned)
         if photograph.features is None:
             patches = self._patches(turned)
@@ -168,13 +169,13 @@ class PhotographEncoder(LayoutEncoder):
 
     def use_helper(self, helper: Callable[[], Executor | None]) -> None:
         """Share the work of a query with a second thread whenever `helper` returns one."""
-        self.helper = self.spheres.helper = helper
+        self.layouts.helper = self.spheres.helper = helper
 
     def warm_up(self) -> None:
         """Run each network once, because the first run allocates memory."""
         manifest, height = self.manifest, CameraHeight(1.5)
         self.spheres.query(np.zeros((*sphere_size(manifest), 3), np.uint8), None, height)
-        self.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
+        self.layouts.latents(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
         if self._views is not None:
             size = patch_size(manifest)
             outputs = self._views.outputs([np.zeros((size.height, size.width, 4), np.uint8)], height.height_m)
