@@ -53,8 +53,6 @@ from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film, read_film
-from lalaloc_core.photograph.overlap import ALBUM_SIDE
-from lalaloc_core.photograph.taken import read_taken
 from lalaloc_core.photograph.turned import open_turn
 
 PlanSource = FloorPlan | ImportedPlan | str | PathLike[str] | bytes | Image.Image | UInt8[np.ndarray, "h w *c"]
@@ -286,8 +284,8 @@ class LaLaLoc:
             content = photograph_content(source)
             id = hashlib.sha256(content).hexdigest()
             if id not in entries:
-                view = self._model.encoder.with_features(self._model.open(content, stated, overview=ALBUM_SIDE))
-                entries[id] = photograph_entry(id, view, read_taken(content))
+                view = self._model.encoder.with_features(self._model.open(content, stated, purpose="album"))
+                entries[id] = photograph_entry(id, view)
         except InvalidPhotographError as error:
             return PinnedPhotograph(number, name, None, reason=str(error))
         taken = entries[id].taken.at

@@ -1,12 +1,10 @@
 """Model bundle: manifest, fitted parameters, measured errors, and the files of the networks.
 
-Begin with `bundle.py`, which reads a bundle; `manifest.py` describes it. `fitted_parameters.py` has the parameters of
-the matching cost and the confidence, `prediction_errors.py` the measured errors of the networks.
+Begin with `bundle.py`, which reads and describes a bundle. `fitted_parameters.py` has the parameters of the matching
+cost and the confidence, and the measured errors of the networks.
 """
 
-from lalaloc_core.bundle.bundle import Bundle, write_manifest
-from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, LogisticModel, MatchingWeights
-from lalaloc_core.bundle.manifest import (
+from lalaloc_core.bundle.bundle import (
     BUNDLE_FILES,
     COHORT,
     DECODER_WEIGHTS,
@@ -18,9 +16,11 @@ from lalaloc_core.bundle.manifest import (
     OBJECTS_ONNX,
     VIEW_ONNX,
     VIEW_WEIGHTS,
+    Bundle,
     Manifest,
     ObjectsManifest,
     ViewManifest,
+    write_manifest,
 )
-from lalaloc_core.bundle.prediction_errors import PredictionErrors
+from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, LogisticModel, MatchingWeights, PredictionErrors
 from lalaloc_core.files import MANIFEST_NAME, default_bundle

@@ -1,4 +1,9 @@
-"""Parameters that calibration fits: those of the matching cost, and of the confidence and covariance of answers."""
+"""What calibration fits and measures: parameters of matching cost, confidence and covariance, errors of predictions.
+
+Predictions are drawn from the measured errors. Those of log distances are normal scores with the measured correlation
+around the horizon, mapped to the measured quantiles. Their correlation at large angles is that of the error of scale,
+which all azimuths of one photograph share. The predicted scales and the opening classes are drawn likewise.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +11,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float, Integer
+
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import ConfigError
+
+# Quantiles of errors and of predicted scales.
+LEVELS = (0.0, 0.005, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.995, 1.0)
+_MIN_PROBABILITY = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,3 +116,83 @@ class ConfidenceModel:
         """Return the probability that a picture is of the plan; None for a stage that the model was not fitted on."""
         model = (self.known_heading if heading_known else self.searched_heading).get(stage)
         return None if model is None else model.probability(**signals)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictionErrors:
+    """Errors of the predictions of spheres or of views.
+
+    Attributes:
+        error_quantiles: of the error of the log distance over the predicted scale, at `LEVELS`.
+        error_correlation: correlation of the normal scores of these errors by difference of azimuth, in columns from 0.
+        scale_quantiles, scale_correlation: the same for the logs of the predicted scales.
+        seen: for every opening class of a plan (rows) the probabilities of the class predicted (columns).
+        seen_correlation: correlation of the scores that the predicted classes are drawn by.
+        class_probability: for every class of a plan and every class predicted, the mean predicted probabilities.
+        spread: factor of the errors, fitted so that as many validation photographs are found as are predicted to be.
+    """
+
+    error_quantiles: tuple[float, ...]
+    error_correlation: tuple[float, ...]
+    scale_quantiles: tuple[float, ...]
+    scale_correlation: tuple[float, ...]
+    seen: tuple[tuple[float, ...], ...]
+    seen_correlation: tuple[float, ...]
+    class_probability: tuple[tuple[tuple[float, ...], ...], ...]
+    spread: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the lengths."""
+        for name in ("error_quantiles", "scale_quantiles"):
+            if len(getattr(self, name)) != len(LEVELS):
+                raise ConfigError(f"{name} has {len(getattr(self, name))} values; it must have {len(LEVELS)}")
+        classes = len(OPENING_CLASSES)
+        table = np.shape(self.seen), np.shape(self.class_probability)
+        if table != ((classes, classes), (classes, classes, classes)):
+            raise ConfigError(f"seen and class_probability have the shapes {table}; there are {classes} classes")
+        if not self.spread > 0.0:
+            raise ConfigError(f"spread is {self.spread:g}; it must be positive")
+
+    def profile(
+        self, log_m: Float[np.ndarray, "n w"], rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n w"], Float[np.ndarray, "n w"]]:
+        """Draw predicted log distances (m) and logs of their scales for layouts."""
+        count, columns = log_m.shape
+        scale_level, error_level = (
+            _normal_probability(correlated(correlation, count, columns, rng))
+            for correlation in (self.scale_correlation, self.error_correlation)
+        )
+        log_scale = np.interp(scale_level, LEVELS, self.scale_quantiles)
+        error = np.interp(error_level, LEVELS, self.error_quantiles)
+        return log_m + self.spread * np.exp(log_scale) * error, log_scale
+
+    def openings(self, kind: Integer[np.ndarray, "n w"], rng: np.random.Generator) -> Float[np.ndarray, "n w c"]:
+        """Draw log probabilities of the opening classes for layouts, by their codes."""
+        level = _normal_probability(correlated(self.seen_correlation, len(kind), kind.shape[1], rng))
+        above = np.cumsum(np.array(self.seen), axis=1)[kind]
+        seen = np.minimum((level[..., None] > above).sum(axis=-1), len(OPENING_CLASSES) - 1)
+        return np.log(np.maximum(np.array(self.class_probability)[kind, seen], _MIN_PROBABILITY))
+
+
+def _normal_probability(score: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return the probability of a smaller standard normal score."""
+    # Loading it takes as long as a query, and every program that opens a bundle loads this module.
+    from scipy.special import ndtr
+
+    return ndtr(score)
+
+
+def correlated(
+    correlation: tuple[float, ...], count: int, columns: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n w"]:
+    """Draw standard normal scores around the horizon with a correlation by difference of azimuth.
+
+    Differences beyond the last measured one have its correlation.
+    """
+    lag = np.minimum(np.arange(columns), columns - np.arange(columns))
+    covariance = np.asarray(correlation)[np.minimum(lag, len(correlation) - 1)]
+    # Measured correlations are not exactly those of a process.
+    power = np.maximum(np.fft.fft(covariance).real, 0.0)
+    power *= columns / power.sum()
+    noise = np.fft.fft(rng.standard_normal((count, columns)), axis=1)
+    return np.fft.ifft(noise * np.sqrt(power), axis=1).real

@@ -126,7 +126,7 @@ def _write(out: Path, content: bytes) -> None:
 def _features(arguments: argparse.Namespace) -> None:
     from lalaloc_core.api import named, photograph_content
     from lalaloc_core.bundle import Bundle
-    from lalaloc_core.draw.seen_room import draw_seen_room, seen_room
+    from lalaloc_core.draw.plan_overlays import draw_seen_room, seen_room
     from lalaloc_core.localise.encode.features import read_features
     from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
     from lalaloc_core.localise.query import CameraHeight

@@ -18,7 +18,7 @@ from lalaloc_core.cli.plan_files import write_text
 from lalaloc_core.errors import InvalidPhotographError
 
 if TYPE_CHECKING:
-    from lalaloc_core.draw.pin_report import ReportRow
+    from lalaloc_core.draw.pins import ReportRow
     from lalaloc_core.floorplan import FloorPlan
     from lalaloc_core.localise.answers.pinned import PinnedAlbum
 
@@ -47,8 +47,7 @@ def write_pin_files(
         OSError: a file cannot be written.
     """
     from lalaloc_core.draw.pdf import write_pdf
-    from lalaloc_core.draw.pin_report import DPI, report_pages
-    from lalaloc_core.draw.pins import draw_pins
+    from lalaloc_core.draw.pins import DPI, draw_pins, report_pages
 
     plans = dict(zip(pinned.plan_ids, pinned.plans, strict=True))
     document = pinned.document() | {"moved": list(moved)}
@@ -120,8 +119,7 @@ def _collection(plans: Mapping[str, FloorPlan], entries: Sequence[dict[str, Any]
 
 
 def _report_row(plan_ids: Sequence[str], path: Path, entry: dict[str, Any]) -> ReportRow:
-    from lalaloc_core.draw.pin_report import ReportRow
-    from lalaloc_core.draw.pins import DrawnPin
+    from lalaloc_core.draw.pins import DrawnPin, ReportRow
 
     pin = None
     if entry["room"] is not None:
@@ -147,7 +145,7 @@ def _report_row(plan_ids: Sequence[str], path: Path, entry: dict[str, Any]) -> R
 
 
 def _thumbnail(path: Path) -> np.ndarray | None:
-    from lalaloc_core.draw.pin_report import THUMBNAIL
+    from lalaloc_core.draw.pins import THUMBNAIL
     from lalaloc_core.photograph.photograph import open_picture
 
     try:

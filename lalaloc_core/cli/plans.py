@@ -74,7 +74,7 @@ def _import(arguments: argparse.Namespace) -> None:
 
 def _read_traced(arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
     """Read the plans in a file, and draw what was read, also of a file that is refused."""
-    from lalaloc_core.draw.trace import trace_svg
+    from lalaloc_core.draw.plan_overlays import trace_svg
     from lalaloc_core.importers import Trace
 
     check_picture_name(arguments.debug, "--debug")
@@ -143,7 +143,7 @@ def _check(arguments: argparse.Namespace) -> None:
 def _localisability(plan: FloorPlan, arguments: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the report of a plan's localisability, and its summary; draw it on request."""
     from lalaloc_core.bundle import Bundle
-    from lalaloc_core.draw.localisability import localisability_svg
+    from lalaloc_core.draw.heat import localisability_svg
     from lalaloc_core.localise.localisability.predicted_localisability import localisability
     from lalaloc_core.localise.localisability.reports import report_of, summary_of
 

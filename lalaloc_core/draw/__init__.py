@@ -2,7 +2,7 @@
 
 All pictures are SVG; resvg rasterises them with the fonts in `fonts/`, so they are the same on every machine. Begin
 with `answer.py`: it turns a localisation into a picture of the plan (`plan.py`), a heat map (`heat.py`) and the
-photograph with the predicted layout (`outline.py`, `photograph.py`). Worker processes load only `canvas.py`, so nothing
+photograph with the predicted layout (`outline.py`). Worker processes load only `canvas.py`, so nothing
 else is re-exported.
 """
 

@@ -13,8 +13,7 @@ from PIL import Image
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
-from lalaloc_core.draw.outline import Outline, layout_outline
-from lalaloc_core.draw.photograph import photograph_key, photograph_part
+from lalaloc_core.draw.outline import Outline, layout_outline, photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.answers.documents import Answer

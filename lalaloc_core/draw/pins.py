@@ -1,14 +1,20 @@
-"""Numbered pins of an album on a plan, coloured by how sure they are."""
+"""Numbered pins of an album on a plan, and the pages of the report: the plans, and the photographs room by room.
+
+Pages are drawings (A4, 150 pixels per inch), so that text looks the same on every machine.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
-from lalaloc_core.draw.canvas import INK, xml_text
-from lalaloc_core.draw.plan import extent_m, plan_with
+import numpy as np
+from jaxtyping import UInt8
+
+from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, shortened, words, xml_text
+from lalaloc_core.draw.plan import extent_m, plan_part, plan_with
 from lalaloc_core.floorplan import FloorPlan
 
 # Blue, orange and green of Okabe and Ito's palette, distinct for colour-blind readers.
@@ -16,6 +22,15 @@ PIN_COLOURS: Final = {"sure": "#0072b2", "uncertain": "#e69f00", "corrected": "#
 _PINS_PER_EXTENT = 58.0
 # Pins nearer than this many radii are moved apart, around their place.
 _APART = 2.1
+# Pages.
+WIDTH, HEIGHT, DPI = 1240, 1754, 150
+_MARGIN = 80
+_INNER = WIDTH - 2 * _MARGIN
+# Photographs of a page: columns, rows, the space between, the height of the caption, and of the plan above.
+_COLUMNS, _ROWS, _GAP, _CAPTION, _PLAN = 2, 3, 36, 64, 380
+_TOP = _MARGIN + 70
+_LINES = 46
+THUMBNAIL = (800, 600)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,3 +93,120 @@ def _free(place: tuple[float, float], placed: Sequence[tuple[float, float]], rad
             if all(math.hypot(x - a, y - b) >= _APART * radius for a, b in placed):
                 return x, y
     return place
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportRow:
+    """A photograph of the report.
+
+    Attributes:
+        number: its number in the report.
+        name: name of the file.
+        date: when it was taken; empty if unknown.
+        plan: number of its plan; None if it is set aside.
+        pin: its pin; None if it is set aside.
+        room: name of its room, and `room_key`, by which rooms are told apart.
+        note: probability of the room, or why it is set aside.
+        picture: returns its pixels, no larger than `THUMBNAIL`; None if they cannot be read.
+    """
+
+    number: int
+    name: str
+    date: str
+    plan: int | None
+    pin: DrawnPin | None
+    room: str
+    room_key: str
+    note: str
+    picture: Callable[[], UInt8[np.ndarray, "h w 3"] | None] = field(repr=False)
+
+
+def report_pages(
+    title: str, plans: Sequence[FloorPlan], rows: Sequence[ReportRow], notes: Sequence[str]
+) -> Iterator[str]:
+    """Yield the pages as SVG: each plan, then each room with photographs, then what was set aside."""
+    for number, plan in enumerate(plans):
+        own = [row for row in rows if row.plan == number]
+        yield _plan_page(title, plan, own, len(rows), notes if number == 0 else ())
+    by_room: dict[str, list[ReportRow]] = {}
+    for row in rows:
+        if row.pin is not None:
+            by_room.setdefault(row.room_key, []).append(row)
+    for members in by_room.values():
+        plan = plans[members[0].plan or 0]
+        for first in range(0, len(members), _COLUMNS * _ROWS):
+            yield _room_page(plan, members, members[first : first + _COLUMNS * _ROWS])
+    aside = [row for row in rows if row.pin is None]
+    for first in range(0, len(aside), _LINES // 2):
+        yield _aside_page(aside[first : first + _LINES // 2])
+
+
+def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: int, notes: Sequence[str]) -> str:
+    pins = [row.pin for row in rows if row.pin is not None]
+    parts = [_heading(shortened(title, 60), f"{plan.name}: {len(rows)} of {count} photographs")]
+    foot = 120 + 30 * len(notes)
+    box = (_MARGIN, _TOP + 10, _INNER, HEIGHT - _TOP - _MARGIN - foot)
+    parts.append(plan_part(plan, box, pins_svg(plan, pins)))
+    y = HEIGHT - _MARGIN - foot + 60
+    x = float(_MARGIN)
+    names = (("sure", "room is probably right"), ("uncertain", "to be checked"), ("corrected", "stated by a person"))
+    for state, meaning in names:
+        parts.append(f'<circle cx="{x + 10:.0f}" cy="{y - 8:.0f}" r="10" fill="{PIN_COLOURS[state]}"/>')
+        parts.append(words(x + 30, y, f"{state}: {meaning}", 20, fill=INK))
+        x += 360
+    for line, note in enumerate(notes):
+        parts.append(words(_MARGIN, y + 40 + 30 * line, shortened(note, 105), 18, fill=MUTED))
+    return document(WIDTH, HEIGHT, title, parts)
+
+
+def _room_page(plan: FloorPlan, members: Sequence[ReportRow], rows: Sequence[ReportRow]) -> str:
+    room = members[0].room
+    numbers = f"{len(members)} photograph{'s' if len(members) > 1 else ''}"
+    parts = [_heading(shortened(room, 60), f"{plan.name}, {numbers}")]
+    pins = [row.pin for row in members if row.pin is not None]
+    parts.append(plan_part(plan, (_MARGIN, _TOP, _INNER, _PLAN), pins_svg(plan, pins)))
+    width = (_INNER - (_COLUMNS - 1) * _GAP) / _COLUMNS
+    height = (HEIGHT - _TOP - _PLAN - _MARGIN - 30) / _ROWS
+    for place, row in enumerate(rows):
+        x = _MARGIN + (place % _COLUMNS) * (width + _GAP)
+        y = _TOP + _PLAN + 30 + (place // _COLUMNS) * height
+        parts.append(_photograph(row, (x, y, width, height - _CAPTION - 14)))
+    return document(WIDTH, HEIGHT, room, parts)
+
+
+def _photograph(row: ReportRow, box: tuple[float, float, float, float]) -> str:
+    x, y, width, height = box
+    parts, shown = list[str](), row.picture()
+    if shown is not None:
+        scale = min(width / shown.shape[1], height / shown.shape[0])
+        size = shown.shape[1] * scale, shown.shape[0] * scale
+        parts.append(image(jpeg(shown), "jpeg", (x + 0.5 * (width - size[0]), y + 0.5 * (height - size[1]), *size)))
+    else:
+        parts.append(f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{height:.0f}" fill="{RULE}"/>')
+    pin = row.pin
+    assert pin is not None
+    middle = y + height + 40
+    arrow = "" if pin.heading_deg is None else arrow_svg(pin.heading_deg, 15.0)
+    parts.append(
+        f'<g transform="translate({x + 34:.0f} {middle:.0f})" fill="{PIN_COLOURS[pin.state]}">{arrow}'
+        f'<circle r="15" /><text y="6" font-size="17" fill="#fff" font-weight="bold" text-anchor="middle">'
+        f"{row.number}</text></g>"
+    )
+    parts.append(words(x + 76, middle - 4, shortened(row.name, 34), 20))
+    parts.append(words(x + 76, middle + 20, shortened(f"{row.date}   {row.note}".strip(), 52), 16, fill=MUTED))
+    return "".join(parts)
+
+
+def _aside_page(rows: Sequence[ReportRow]) -> str:
+    parts = [_heading("Set aside", "photographs without a pin")]
+    for line, row in enumerate(rows):
+        y = _TOP + 40 + line * 66
+        parts.append(words(_MARGIN, y, f"{row.number}   {shortened(row.name, 70)}", 20))
+        parts.append(words(_MARGIN + 40, y + 26, shortened(row.note, 112), 16, fill=MUTED))
+    return document(WIDTH, HEIGHT, "Set aside", parts)
+
+
+def _heading(text: str, under: str) -> str:
+    rule = f'<path d="M{_MARGIN} {_TOP - 14}H{WIDTH - _MARGIN}" stroke="{RULE}" stroke-width="2"/>'
+    head = words(_MARGIN, _MARGIN + 24, text, 34, more='font-weight="bold"')
+    return head + words(WIDTH - _MARGIN, _MARGIN + 24, shortened(under, 50), 20, fill=MUTED, anchor="end") + rule

@@ -23,6 +23,7 @@ from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import open_turn
 
@@ -45,13 +46,13 @@ class LocalModel:
         latents = not self.encoder.predicts_profile
         return build_grid(plan, self.encoder.layouts, step_m=step_m, camera_height_m=camera_height_m, latents=latents)
 
-    def open(self, content: bytes, stated: StatedCamera | None = None, *, overview: int = 0) -> Photograph:
-        """Read a photograph in the sizes that the model needs; `overview` is as for `open_photograph`.
+    def open(self, content: bytes, stated: StatedCamera | None = None, *, purpose: Purpose = "single") -> Photograph:
+        """Read a photograph in the sizes that the model needs; `purpose` is as for `open_photograph`.
 
         Raises:
             InvalidPhotographError: the photograph cannot be read.
         """
-        return open_photograph(content, stated=stated, overview=overview, **self._sizes)
+        return open_photograph(content, stated=stated, purpose=purpose, **self._sizes)
 
     def open_any(self, content: bytes, stated: StatedCamera) -> Photograph:
         """Read a photograph, or the one whose features a file has."""

@@ -1,4 +1,4 @@
-"""Focal length of a photograph by its EXIF metadata.
+"""Focal length, time and camera of a photograph by its EXIF metadata, without its position or owner.
 
 Phones write `FocalLengthIn35mmFilm`, which is preferred: it holds after scaling, and phones include digital zoom.
 Otherwise `FocalLength` is divided by the width of the sensor, from `FocalPlaneXResolution` or a table, and multiplied
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from datetime import datetime
 
 from PIL import ExifTags, Image
 
@@ -55,6 +56,13 @@ _CROPPED = 0.03
 _STRIP = 6
 # Relative standard deviations of the focal length: rounding and lens of the usual shapes, and of cropped sensors.
 _SD, _CROPPED_SD = 0.03, 0.06
+# Characters of a maker's or model's name.
+MAX_NAME = 60
+_TIME_FORMAT = "%Y:%m:%d %H:%M:%S"
+_TIMES = (
+    (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal),
+    (ExifTags.Base.DateTimeDigitized, ExifTags.Base.SubsecTimeDigitized),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +84,23 @@ class ExifLens:
     fisheye: float | None = None
     camera: str = ""
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taken:
+    """Time and camera of a photograph; None, empty or 0 for what is unknown.
+
+    Attributes:
+        at: time by the camera's clock, without a time zone.
+        make, model: maker and model of the camera.
+        width, height: size of the upright picture, pixels.
+    """
+
+    at: datetime | None = None
+    make: str = ""
+    model: str = ""
+    width: int = 0
+    height: int = 0
 
 
 def read_exif_lens(exif: Image.Exif, *, width: int, height: int) -> ExifLens:
@@ -184,3 +209,28 @@ def finite_number(value: object) -> float | None:
 def _integer(value: object) -> int:
     number = finite_number(value)
     return 0 if number is None else round(number)
+
+
+def read_taken(exif: Image.Exif, *, width: int, height: int) -> Taken:
+    """Read time and camera of an upright picture of `width` x `height` pixels."""
+    make, model = (_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
+    return Taken(at=_time(exif), make=make, model=model, width=width, height=height)
+
+
+def _time(exif: Image.Exif) -> datetime | None:
+    """Return when a photograph was taken; the time of the file's last change is not used."""
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    for tag, subseconds in _TIMES:
+        try:
+            at = datetime.strptime(_text(tags.get(tag)), _TIME_FORMAT)
+        except ValueError:
+            continue
+        digits = _text(tags.get(subseconds))[:6]
+        return at.replace(microsecond=int(digits.ljust(6, "0"))) if digits.isascii() and digits.isdigit() else at
+    return None
+
+
+def _text(value: object) -> str:
+    """Return a text of the metadata as it is printed, empty if there is none."""
+    text = "" if value is None else str(value)[: 2 * MAX_NAME]
+    return "".join(filter(str.isprintable, text)).strip()[:MAX_NAME]

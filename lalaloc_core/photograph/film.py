@@ -24,16 +24,14 @@ from jaxtyping import UInt8
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.photograph.exif import ExifLens
-from lalaloc_core.photograph.film_limits import FilmLimits
 from lalaloc_core.photograph.film_motion import FlowTracker
-from lalaloc_core.photograph.overlap import TURN_SIDE
+from lalaloc_core.photograph.overlap import LIKELY_SD, Step
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
 from lalaloc_core.photograph.projection import find_lens
 from lalaloc_core.photograph.stated_camera import StatedCamera
 from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
-from lalaloc_core.photograph.turn_order import LIKELY_SD, Step
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 
 # Demuxers of FFmpeg by the kind of file; a kind is told by its first bytes.
@@ -177,9 +175,7 @@ def _turned(
     Frames that do not overlap are joined by the turns that the tracker tells.
     """
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
-    photographs = [
-        photograph_of_picture(sample.picture, full_size, lens, stated, size, overview=TURN_SIDE) for sample in kept
-    ]
+    photographs = [photograph_of_picture(sample.picture, full_size, lens, stated, size, "turn") for sample in kept]
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
     numbers = [sample.number for sample in kept]
@@ -356,3 +352,20 @@ def _too_long(seconds: float, limits: FilmLimits) -> InvalidFilmError:
 def _field(stated: StatedCamera) -> float | None:
     """Return the stated horizontal field of view (radians)."""
     return None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmLimits:
+    """Limits of films.
+
+    Attributes:
+        max_bytes: size of the file.
+        max_s: duration.
+        max_pixels: width times height.
+        max_cpu_s: CPU time of decoding.
+    """
+
+    max_bytes: int = 100 * 2**20
+    max_s: float = 60.0
+    max_pixels: int = 4096 * 2304
+    max_cpu_s: float = 20.0

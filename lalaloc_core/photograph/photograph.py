@@ -1,33 +1,38 @@
-"""Reader for photographs of any kind: from encoded bytes and statements to what the encoders expect."""
+"""Reader for photographs of any kind: from encoded bytes and statements to what the encoders expect.
+
+`open_photograph` opens a file once, and decides from what it reads: what is known of the camera (`_Opened`), the format
+of a sphere (`sphere_formats.py`), the projection (`projection.py`), and the pixels: level spheres or patches.
+"""
 
 from __future__ import annotations
 
 import io
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.file_kinds import is_drawing
-from lalaloc_core.photograph.bent_lines import bend_warnings
 from lalaloc_core.photograph.cameras import Around, Camera, Perspective, camera_axes
-from lalaloc_core.photograph.exif import ExifLens, read_exif_lens
-from lalaloc_core.photograph.layouts import Layout, find_layout
+from lalaloc_core.photograph.exif import ExifLens, Taken, read_exif_lens, read_taken
 from lalaloc_core.photograph.levelling import (
     MAX_ESTIMATED_SD,
+    bend_warnings,
     estimate_attitude,
     estimate_calibration,
     find_segments,
     lines_of,
 )
-from lalaloc_core.photograph.overlap import TURN_SIDE, find_features
+from lalaloc_core.photograph.overlap import find_features
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
-from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
+from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.picture_files import (
     FORMATS,
     NEUTRAL,
@@ -36,11 +41,22 @@ from lalaloc_core.photograph.picture_files import (
     opened_picture,
     scaled,
 )
-from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_closed, is_sphere
-from lalaloc_core.photograph.spheres import convert_layout, read_layout, read_sphere
+from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_closed
+from lalaloc_core.photograph.sphere_formats import (
+    THUMBNAIL_SIDE,
+    SphereFormat,
+    Thumbnail,
+    find_sphere_format,
+    looks_spherical,
+)
+from lalaloc_core.photograph.spheres import level_sphere
 from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
 from lalaloc_core.photograph.turn_angles import Overview
 
+# Use of a photograph: by itself, in an album, or in a turn, where `turned.py` finds its tilt and cuts its patches.
+Purpose = Literal["single", "album", "turn"]
+# Longer side (pixels) at which to find what other photographs show too: those of one spot differ little in scale.
+_OVERVIEW_SIDES = {"turn": 420, "album": 640}
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
@@ -92,7 +108,8 @@ class Photograph:
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
-        overview: parts that tell its angles to photographs that overlap it, if they were asked for.
+        taken: time and camera by the metadata; None without a file.
+        overview: parts that tell its angles to photographs that overlap it, in albums and turns.
         warnings: metadata that were ignored, and estimates to be checked.
     """
 
@@ -110,6 +127,7 @@ class Photograph:
     axes: Float[np.ndarray, "3 3"] | None = None
     features: PhotographFeatures | None = None
     compass_heading: float | None = None
+    taken: Taken | None = None
     overview: Overview | None = None
     warnings: tuple[str, ...] = ()
 
@@ -172,7 +190,7 @@ def open_photograph(
     stated: StatedCamera | None = None,
     patch_size: PatchSize | None = None,
     limits: PhotographLimits | None = None,
-    overview: int = 0,
+    purpose: Purpose = "single",
     refuse_drawings: bool = True,
 ) -> Photograph:
     """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
@@ -183,71 +201,135 @@ def open_photograph(
         stated: the caller's statements; None for none.
         patch_size: size of the patches of other photographs.
         limits: limits of the file.
-        overview: longer side (pixels) at which to find what other photographs show too (`overlap.py`); 0 for nothing.
-            With `TURN_SIDE`, patches are left to `turned.py`, which finds the tilt.
+        purpose: its use; photographs of albums and turns get an overview, and those of turns no patches.
         refuse_drawings: refuse a plan or a page of text; an overexposed white wall can be taken for one.
 
     Raises:
         InvalidPhotographError: the file is not readable or too large, a statement is invalid, or nothing says what the
             picture shows.
     """
-    stated, limits = stated or StatedCamera(), limits or PhotographLimits()
-    size = patch_size or PatchSize()
+    stated, limits, size = stated or StatedCamera(), limits or PhotographLimits(), patch_size or PatchSize()
     stated.check()
-
-    @cache
-    def sphere(height: int = sphere_size[0], width: int = sphere_size[1]) -> UInt8[np.ndarray, "h w 3"]:
-        pitch, roll = (None if angle is None else math.radians(angle) for angle in (stated.pitch_deg, stated.roll_deg))
-        return read_sphere(content, height=height, width=width, limits=limits, pitch=pitch, roll=roll)
-
-    def judged() -> UInt8[np.ndarray, "h w 3"]:
-        return sphere() if sphere_size[0] >= COARSEST[0] else sphere(*COARSEST)
-
     with opened_picture(content, limits) as file:
+        opened = _Opened.of(file, stated, sphere_size, limits)
+        taken = read_taken(file.exif, width=opened.width, height=opened.height)
+        found = opened.sphere_format()
+        if found is not None and found.box is not None:
+            opened = opened.taken_out(found)
+            lens = Lens(projection="equirectangular", projection_source="estimated")
+        elif found is not None and stated.projection == AUTO:
+            raise InvalidPhotographError(found.text)
+        else:
+            lens = opened.lens()
+        named = () if found is None else (found.text,)
+        lens = replace(lens, warnings=(*named, *file.warnings, *opened.metadata.warnings, *lens.warnings))
+        pixels = opened.sphere if lens.is_sphere else opened.picture(lens.camera, size)
+    if refuse_drawings and is_drawing(pixels):
+        raise InvalidPhotographError(
+            "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
+            "photograph taken in one of its rooms"
+        )
+    if lens.is_sphere:
+        photograph = _photograph_of_sphere(pixels, lens, stated, opened.metadata)
+    else:
+        photograph = photograph_of_picture(pixels, (opened.width, opened.height), lens, stated, size, purpose)
+    return replace(photograph, taken=taken)
+
+
+@dataclass(eq=False)
+class _Opened:
+    """An opened photograph: what is known of its camera, and its pixels, which are decoded when they are needed."""
+
+    file: PictureFile
+    stated: StatedCamera
+    sphere_size: tuple[int, int]
+    limits: PhotographLimits
+    width: int
+    height: int
+    metadata: PhotoSphere
+    exif: ExifLens
+    _pictures: dict[tuple[int, int], UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, file: PictureFile, stated: StatedCamera, sphere_size: tuple[int, int], limits: PhotographLimits
+    ) -> _Opened:
+        """Read the metadata of a file; a stated tilt replaces that of the metadata."""
         width, height = file.upright_size
         if min(width, height) < limits.min_height:
             raise InvalidPhotographError(
                 f"the photograph is {width} x {height}; the minimum is {limits.min_height} pixels on each side"
             )
         metadata = read_photo_sphere(file.packets, width=width, height=height)
+        if stated.pitch_deg is not None:
+            metadata = replace(metadata, pitch=math.radians(stated.pitch_deg))
+        if stated.roll_deg is not None:
+            metadata = replace(metadata, roll=math.radians(stated.roll_deg))
         exif = read_exif_lens(file.exif, width=width, height=height)
-        layout = None
-        if _may_hold_sphere(stated, metadata, exif, width, height):
-            # The pixels of a level sphere are decoded in any case.
-            is_plain = file.orientation == 1 and width == 2 * height and metadata.level and _is_unturned(stated)
-            layout = find_layout(judged(), orientation=1) if is_plain else read_layout(content, limits)
-        if layout is not None and layout.is_usable:
-            return _photograph_of_layout(content, layout, file, stated, sphere_size, limits)
-        if layout is not None and stated.projection == AUTO:
-            raise InvalidPhotographError(layout.text)
-        lens = find_lens(
-            width,
-            height,
-            stated=stated,
-            sphere=metadata,
-            exif=exif,
-            orientation=file.orientation,
-            looks_spherical=lambda: is_sphere(judged()),
-            closes=lambda: is_closed(open_picture(content, max_size=(_LONG_SIDE, _LONG_SIDE), limits=limits)),
-        )
-        named = () if layout is None else (layout.text,)
-        lens = replace(lens, warnings=(*named, *file.warnings, *metadata.warnings, *lens.warnings))
-        if lens.is_sphere:
-            if refuse_drawings:
-                _refuse_drawing(sphere())
-            return _photograph_of_sphere(sphere(), lens, stated, metadata)
-        picture = np.asarray(scaled(file, _decoded_size(width, height, lens, size), oversampling=1))
-    if refuse_drawings:
-        _refuse_drawing(picture)
-    return photograph_of_picture(picture, (width, height), lens, stated, size, overview=overview)
+        return cls(file, stated, sphere_size, limits, width, height, metadata, exif)
 
+    @cached_property
+    def sphere(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Pixels of the level sphere."""
+        return level_sphere(self.file, self.metadata, self.sphere_size, self.limits)
 
-def _refuse_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Refuse a plan or a page of text."""
-    if is_drawing(picture):
-        raise InvalidPhotographError(
-            "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
-            "photograph taken in one of its rooms"
+    def picture(self, camera: Camera | None, patch_size: PatchSize) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the upright picture at a size at which a JPEG decodes fast, fine enough for lines and patches."""
+        most = max(self.width, self.height) / _LONG_SIDE
+        if camera is not None:
+            most = min(most, camera.resolution / (FINER * patch_size.resolution))
+        eighth = next((factor for factor in _JPEG_FACTORS if most >= factor), 1)
+        factor = eighth * max(1, int(most / eighth))
+        size = -(-self.width // factor), -(-self.height // factor)
+        if size not in self._pictures:
+            self._pictures[size] = np.asarray(scaled(self.file, size, oversampling=1))
+        return self._pictures[size]
+
+    @cached_property
+    def thumbnail(self) -> Thumbnail:
+        """Small upright picture by which the format is told; of pixels that are decoded in any case, if possible."""
+        orientation = self.file.orientation
+        is_plain = orientation == 1 and self.width == 2 * self.height and self.metadata.level
+        is_fine = self.sphere_size[0] >= COARSEST[0]
+        picture = self.sphere if is_plain and is_fine else self.picture(None, PatchSize())
+        share = min((COARSEST[1] if is_plain else THUMBNAIL_SIDE) / max(picture.shape), 1.0)
+        if share < 1.0:
+            size = (max(1, round(share * side)) for side in (picture.shape[1], picture.shape[0]))
+            picture = cv2.resize(picture, tuple(size), interpolation=cv2.INTER_AREA)
+        return Thumbnail(picture, orientation)
+
+    def sphere_format(self) -> SphereFormat | None:
+        """Return the format of a sphere that the picture holds, unless statements or metadata tell its camera."""
+        stated, metadata = self.stated, self.metadata
+        is_known = stated.hfov_deg is not None or stated.intrinsics is not None or metadata.part is not None
+        if is_known or stated.projection not in (AUTO, "equirectangular") or metadata.refusal is not None:
+            return None
+        ratio = max(self.width, self.height) / min(self.width, self.height)
+        # Cameras write a focal length into usual photographs.
+        if self.exif.focal is not None and any(abs(ratio / usual - 1.0) <= _USUAL_TOLERANCE for usual in _USUAL_RATIOS):
+            return None
+        return find_sphere_format(self.thumbnail)
+
+    def taken_out(self, found: SphereFormat) -> _Opened:
+        """Return the sphere that the picture holds; GPano metadata count if they are of the same picture."""
+        if found.is_stored:
+            file = replace(self.file, exif=Image.Exif())
+        else:
+            assert found.box is not None
+            file = replace(self.file, box=found.box, packets=[])
+        return _Opened.of(file, self.stated, self.sphere_size, self.limits)
+
+    def lens(self) -> Lens:
+        """Return the projection and the camera."""
+        return find_lens(
+            self.width,
+            self.height,
+            stated=self.stated,
+            sphere=self.metadata,
+            exif=self.exif,
+            orientation=self.file.orientation,
+            looks_spherical=lambda: looks_spherical(self.thumbnail.pixels),
+            closes=lambda: is_closed(self.thumbnail.pixels),
         )
 
 
@@ -260,6 +342,10 @@ def _photograph_of_sphere(
         for angle in (metadata.pitch, metadata.roll)
     )
     pitch, roll = map(_stated_or, (stated.pitch_deg, stated.roll_deg), by_metadata)
+    heading = metadata.compass_heading
+    if heading is not None and metadata.part is not None:
+        # That of the picture's centre, which is not that of the full sphere in a part beside it.
+        heading = (heading + metadata.part.azimuth) % math.tau
     return Photograph(
         projection=lens.projection,
         projection_source=lens.projection_source,
@@ -268,53 +354,9 @@ def _photograph_of_sphere(
         roll=roll,
         azimuths=(-half, half),
         sphere=sphere,
-        compass_heading=_heading_of_centre(metadata),
+        compass_heading=heading,
         warnings=lens.warnings,
     )
-
-
-def _heading_of_centre(metadata: PhotoSphere) -> float | None:
-    """Return the compass heading of the picture's centre, which is not that of the full sphere in a part beside it."""
-    if metadata.compass_heading is None or metadata.part is None:
-        return metadata.compass_heading
-    return (metadata.compass_heading + metadata.part.azimuth) % math.tau
-
-
-def _may_hold_sphere(stated: StatedCamera, metadata: PhotoSphere, exif: ExifLens, width: int, height: int) -> bool:
-    """Return whether a picture is to be judged by its pixels; cameras write a focal length into usual photographs."""
-    is_known = stated.hfov_deg is not None or stated.intrinsics is not None or metadata.part is not None
-    if is_known or stated.projection not in (AUTO, "equirectangular") or metadata.refusal is not None:
-        return False
-    ratio = max(width, height) / min(width, height)
-    return exif.focal is None or all(abs(ratio / usual - 1.0) > _USUAL_TOLERANCE for usual in _USUAL_RATIOS)
-
-
-def _is_unturned(stated: StatedCamera) -> bool:
-    return stated.pitch_deg is None and stated.roll_deg is None
-
-
-def _photograph_of_layout(
-    content: bytes,
-    layout: Layout,
-    file: PictureFile,
-    stated: StatedCamera,
-    sphere_size: tuple[int, int],
-    limits: PhotographLimits,
-) -> Photograph:
-    """Return the sphere that a picture holds; GPano metadata count if they are of the same picture."""
-    width, height = file.image.size
-    metadata = read_photo_sphere(file.packets, width=width, height=height) if layout.is_stored else PhotoSphere()
-    pitch, roll = (
-        found if given is None else math.radians(given)
-        for given, found in ((stated.pitch_deg, metadata.pitch), (stated.roll_deg, metadata.roll))
-    )
-    pixels = convert_layout(
-        content, layout, height=sphere_size[0], width=sphere_size[1], limits=limits, pitch=pitch, roll=roll
-    )
-    part = SpherePart(left=0.25, top=0.0, width=0.5, height=1.0) if layout.is_half else None
-    warnings = (layout.text, *file.warnings, *metadata.warnings)
-    lens = Lens(projection="equirectangular", projection_source="estimated", warnings=warnings)
-    return _photograph_of_sphere(pixels, lens, stated, replace(metadata, part=part))
 
 
 def photograph_of_picture(
@@ -323,8 +365,7 @@ def photograph_of_picture(
     lens: Lens,
     stated: StatedCamera,
     size: PatchSize,
-    *,
-    overview: int = 0,
+    purpose: Purpose,
 ) -> Photograph:
     """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
@@ -335,7 +376,7 @@ def photograph_of_picture(
         attitude, focal_sd = found.attitude, found.focal_sd
         camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
         small = camera.scaled(columns, rows)
-        if overview != TURN_SIDE:
+        if purpose != "turn":
             origin = "was estimated from straight lines" if len(segments) else "is only usual"
             warnings = (*warnings, field_warning(camera.hfov, _hfov_sd(camera, focal_sd), origin))
     else:
@@ -356,11 +397,11 @@ def photograph_of_picture(
     hfov = Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source)
     walls = Assumed(value=attitude.yaw, sd=attitude.yaw_sd, source="estimated")
     # Strips are not turned by the tilt that others tell.
-    is_of_turn = overview == TURN_SIDE and not isinstance(camera, Around)
+    is_of_turn = purpose == "turn" and not isinstance(camera, Around)
     overlapping = None
-    if overview:
+    if purpose != "single":
         overlapping = Overview(
-            find_features(picture, overview),
+            find_features(picture, _OVERVIEW_SIDES[purpose]),
             segments / (columns, rows, columns, rows),
             attitude,
             reduced(picture, small, size)[0] if is_of_turn else None,
@@ -392,16 +433,6 @@ def field_warning(hfov: float, sd: float, origin: str) -> str:
 
 def _stated_or(stated_deg: float | None, otherwise: Assumed) -> Assumed:
     return otherwise if stated_deg is None else Assumed(value=math.radians(stated_deg), sd=_GIVEN_SD, source="given")
-
-
-def _decoded_size(width: int, height: int, lens: Lens, size: PatchSize) -> tuple[int, int]:
-    """Return a size at which a JPEG decodes fast, fine enough for lines and patches if the picture is."""
-    most = max(width, height) / _LONG_SIDE
-    if lens.camera is not None:
-        most = min(most, lens.camera.resolution / (FINER * size.resolution))
-    eighth = next((factor for factor in _JPEG_FACTORS if most >= factor), 1)
-    factor = eighth * max(1, int(most / eighth))
-    return -(-width // factor), -(-height // factor)
 
 
 def _hfov_sd(camera: Camera, focal_sd: float) -> float:

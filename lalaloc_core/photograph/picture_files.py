@@ -7,11 +7,12 @@ little extra memory.
 from __future__ import annotations
 
 import io
+import math
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -44,7 +45,8 @@ _UPRIGHT = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-_SIDEWAYS = {5, 6, 7, 8}
+SIDEWAYS = {5, 6, 7, 8}
+_WHOLE = 0.0, 0.0, 1.0, 1.0
 # Largest share of rows that a JPEG without its end can lack.
 _MAX_MISSING = 0.5
 # Decoders raise these for damaged files; their words are not those of users.
@@ -73,16 +75,22 @@ class PictureFile:
     """An opened picture file.
 
     Attributes:
-        image: the picture, whose pixels are not decoded yet.
+        open: returns the picture, whose pixels are not decoded yet.
+        kind: Pillow's name of its format.
+        size: width and height of the stored picture.
         exif: its Exif metadata, empty if they are damaged.
         packets: its XMP packets.
+        box: part of the upright picture that counts, as shares (left, top, right, bottom).
         is_cut: it is a JPEG whose end is missing.
         warnings: parts of the file that are damaged, or that were ignored.
     """
 
-    image: Image.Image
+    open: Callable[[], Image.Image]
+    kind: str | None
+    size: tuple[int, int]
     exif: Image.Exif
     packets: list[bytes | str]
+    box: tuple[float, float, float, float] = _WHOLE
     is_cut: bool = False
     warnings: list[str] = field(default_factory=list)
 
@@ -94,8 +102,10 @@ class PictureFile:
 
     @property
     def upright_size(self) -> tuple[int, int]:
-        """Width and height after applying the orientation."""
-        return turned(self.image.size, self.orientation)
+        """Width and height of the part that counts, after applying the orientation."""
+        width, height = turned(self.size, self.orientation)
+        left, top, right, bottom = self.box
+        return round((right - left) * width), round((bottom - top) * height)
 
 
 @contextmanager
@@ -114,11 +124,19 @@ def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Picture
     with _named_errors(content, limits), Image.open(io.BytesIO(readable), formats=_formats(content)) as image:
         _check_pixels(*image.size, limits)
         _check_scans(content, limits)
-        yield _file_of(image, content, is_cut=is_cut, left_out=left_out)
+        yield _file_of(image, content, readable, left_out)
 
 
-def _file_of(image: Image.Image, content: bytes, *, is_cut: bool, left_out: int) -> PictureFile:
-    """Return the picture with its metadata and what is wrong with them."""
+def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int) -> PictureFile:
+    """Return the picture with its metadata and what is wrong with them; `readable` is what the decoder reads."""
+    size, is_cut = image.size, len(readable) > len(content)
+
+    def opened() -> Image.Image:
+        # A JPEG that was decoded at a fraction of its size is read again.
+        if image.size == size:
+            return image
+        return Image.open(io.BytesIO(readable), formats=_formats(content))
+
     packets, unread = xmp_packets(content)
     exif, is_damaged = _exif_of(image)
     faults = {
@@ -128,7 +146,9 @@ def _file_of(image: Image.Image, content: bytes, *, is_cut: bool, left_out: int)
         "the Exif metadata are damaged and were ignored; send the camera's original file": is_damaged,
     }
     return PictureFile(
-        image=image,
+        open=opened,
+        kind=image.format,
+        size=size,
         exif=exif,
         packets=[*packets] or [packet for packet in [image.info.get("xmp")] if packet],
         is_cut=is_cut,
@@ -160,18 +180,20 @@ def _formats(content: bytes) -> tuple[str, ...]:
 
 def turned(size: tuple[int, int], orientation: int) -> tuple[int, int]:
     """Return (width, height) after applying an EXIF orientation, or before it."""
-    return (size[1], size[0]) if orientation in _SIDEWAYS else size
+    return (size[1], size[0]) if orientation in SIDEWAYS else size
 
 
 def scaled(file: PictureFile, size: tuple[int, int], *, oversampling: int = 2) -> Image.Image:
-    """Scale the whole picture to a size as RGB, and rotate it upright.
+    """Scale the part of a picture that counts to a size as RGB, and rotate it upright.
 
     Args:
         file: file of `opened_picture`.
         size: width and height of the upright picture.
         oversampling: least ratio of the decoded to the requested size, for pictures that are large enough.
     """
-    image, stored_size = file.image, turned(size, file.orientation)
+    if file.box != _WHOLE:
+        return _scaled_part(file, size)
+    image, stored_size = file.open(), turned(size, file.orientation)
     # JPEGs can be decoded directly at a fraction of their size.
     image.draft("RGB", (oversampling * stored_size[0], oversampling * stored_size[1]))
     width, height = image.size
@@ -186,6 +208,15 @@ def scaled(file: PictureFile, size: tuple[int, int], *, oversampling: int = 2) -
         _check_missing(np.asarray(picture))
     turn = _UPRIGHT.get(file.orientation)
     return picture if turn is None else picture.transpose(turn)
+
+
+def _scaled_part(file: PictureFile, size: tuple[int, int]) -> Image.Image:
+    left, top, right, bottom = file.box
+    width, height = turned(file.size, file.orientation)
+    finest = math.ceil(size[0] / (right - left)), math.ceil(size[1] / (bottom - top))
+    picture = scaled(replace(file, box=_WHOLE), (min(width, finest[0]), min(height, finest[1])))
+    pixels = left * picture.width, top * picture.height, right * picture.width, bottom * picture.height
+    return picture.resize(size, Image.Resampling.BOX, box=pixels)
 
 
 def _check_missing(pixels: np.ndarray) -> None:

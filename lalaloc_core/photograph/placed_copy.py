@@ -67,7 +67,7 @@ def placed_copy(content: bytes, place: Place, limits: PhotographLimits | None = 
     Positions and directions that the file states are replaced, keywords are added to its own.
     """
     with opened_picture(content, limits or PhotographLimits()) as file:
-        kind, exif = file.image.format, file.exif
+        kind, exif = file.kind, file.exif
         packet = next((packet for packet in file.packets if packet), None)
         xmp = _xmp(packet, place)
         stated = _exif(exif, place)

@@ -14,7 +14,6 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.exif import ExifLens
-from lalaloc_core.photograph.intrinsics_fit import compare_focal_lengths, fit_intrinsics
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.stated_camera import (
     AUTO,
@@ -23,6 +22,8 @@ from lalaloc_core.photograph.stated_camera import (
     StatedCamera,
     camera_of_hfov,
     camera_of_intrinsics,
+    compare_focal_lengths,
+    fit_intrinsics,
 )
 
 # Origins of a value: the caller, GPano metadata, EXIF metadata, the picture, or a usual value.

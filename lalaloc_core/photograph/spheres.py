@@ -7,7 +7,6 @@ Three kinds of metadata are used: the EXIF orientation, the visible part of the 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -16,10 +15,8 @@ from PIL import Image
 from lalaloc_core.conventions import column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import camera_axes
-from lalaloc_core.photograph.cube_maps import to_sphere
-from lalaloc_core.photograph.layouts import JUDGED_SIDE, Layout, find_layout
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
-from lalaloc_core.photograph.picture_files import NEUTRAL, PhotographLimits, opened_picture, scaled
+from lalaloc_core.photograph.picture_files import NEUTRAL, PhotographLimits, PictureFile, opened_picture, scaled
 
 # Oversampling of pictures that are placed or levelled, relative to the encoder's input.
 _FINER = 2
@@ -30,86 +27,39 @@ _ROWS = 64
 
 
 def read_sphere(
-    content: bytes,
-    *,
-    height: int,
-    width: int,
-    limits: PhotographLimits | None = None,
-    pitch: float | None = None,
-    roll: float | None = None,
+    content: bytes, *, height: int, width: int, limits: PhotographLimits | None = None
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """Decode an equirectangular JPEG, PNG or WebP (the first picture of several) and scale it to `height` x `width`.
 
-    Args:
-        content: the file.
-        height: rows of the result.
-        width: columns of the result.
-        limits: limits of the file.
-        pitch: elevation of the centre (radians), instead of the metadata's.
-        roll: clockwise rotation of the camera (radians), instead of the metadata's.
-
-    Returns:
-        pixels whose centre is that of the file's picture, also of a part that is not in the middle of the sphere.
-
     Raises:
-        InvalidPhotographError: empty, unsupported format, damaged, too large, too many segments or scans, or neither
-            the full sphere nor a part of it that the metadata describe.
+        InvalidPhotographError: the file is not readable or too large, or neither the full sphere nor a part of it that
+            the metadata describe.
     """
     limits = limits or PhotographLimits()
     with opened_picture(content, limits) as file:
-        upright = file.upright_size
-        sphere = read_photo_sphere(file.packets, width=upright[0], height=upright[1])
-        _check_shape(*upright, sphere, limits)
-        sphere = replace(
-            sphere, pitch=sphere.pitch if pitch is None else pitch, roll=sphere.roll if roll is None else roll
-        )
-        part, turn = sphere.part, 0.0 if sphere.part is None else sphere.part.azimuth
-        if part is not None and sphere.level:
-            part, turn = part.centred, 0.0
-        finer = 1 if part is None and sphere.level else _FINER
-        canvas_size = (width * finer, height * finer)
-        picture = scaled(file, _shown_size(part, canvas_size))
-        canvas = picture if part is None else _placed(picture, part, canvas_size)
-        return _levelled(canvas, (width, height), pitch=sphere.pitch, roll=sphere.roll, turn=turn)
+        columns, rows = file.upright_size
+        return level_sphere(file, read_photo_sphere(file.packets, width=columns, height=rows), (height, width), limits)
 
 
-def read_layout(content: bytes, limits: PhotographLimits) -> Layout | None:
-    """Return the layout of a picture that holds a sphere otherwise than usual; see `find_layout`."""
-    with opened_picture(content, limits) as file:
-        share = min(JUDGED_SIDE / max(file.image.size), 1.0)
-        size = round(file.image.width * share), round(file.image.height * share)
-        stored = scaled(replace(file, exif=Image.Exif()), (max(size[0], 1), max(size[1], 1)))
-        return find_layout(np.asarray(stored), orientation=file.orientation)
-
-
-def convert_layout(
-    content: bytes, layout: Layout, *, height: int, width: int, limits: PhotographLimits, pitch: float, roll: float
-) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Return the level sphere that a picture with a usable layout holds."""
-    box = layout.box or (0.0, 0.0, 1.0, 1.0)
-    shown = (_FINER * width // (2 if layout.is_half else 1), _FINER * height)
-    with opened_picture(content, limits) as opened:
-        file = replace(opened, exif=Image.Exif()) if layout.is_stored else opened
-        finest = (math.ceil(shown[0] / (box[2] - box[0])), math.ceil(shown[1] / (box[3] - box[1])))
-        size = tuple(map(min, zip(file.upright_size, finest, strict=True)))
-        picture = scaled(file, (size[0], size[1]))
-        if layout.cube is not None:
-            canvas = Image.fromarray(to_sphere(np.asarray(picture), layout.cube, shown[1], shown[0]))
-        else:
-            pixels = tuple(share * side for share, side in zip(box, size + size, strict=True))
-            canvas = picture.resize(shown, Image.Resampling.BOX, box=(pixels[0], pixels[1], pixels[2], pixels[3]))
-        if layout.is_half:
-            half, canvas = canvas, Image.new("RGB", (_FINER * width, _FINER * height), NEUTRAL)
-            canvas.paste(half, (_FINER * width // 4, 0))
-        return _levelled(canvas, (width, height), pitch=pitch, roll=roll)
-
-
-def _levelled(
-    canvas: Image.Image, size: tuple[int, int], *, pitch: float, roll: float, turn: float = 0.0
+def level_sphere(
+    file: PictureFile, sphere: PhotoSphere, size: tuple[int, int], limits: PhotographLimits
 ) -> UInt8[np.ndarray, "h w 3"]:
-    if pitch or roll or turn:
-        canvas = Image.fromarray(level(np.asarray(canvas), pitch=pitch, roll=roll, turn=turn))
-    return np.asarray(canvas if canvas.size == size else canvas.resize(size, Image.Resampling.BOX))
+    """Return the pixels of a sphere at a size (height, width), level.
+
+    Their centre is that of the file's picture, also of a part that is not in the middle of the sphere.
+    """
+    _check_shape(*file.upright_size, sphere, limits)
+    height, width = size
+    part, turn = sphere.part, 0.0 if sphere.part is None else sphere.part.azimuth
+    if part is not None and sphere.level:
+        part, turn = part.centred, 0.0
+    finer = 1 if part is None and sphere.level else _FINER
+    canvas_size = (width * finer, height * finer)
+    picture = scaled(file, _shown_size(part, canvas_size))
+    canvas = picture if part is None else _placed(picture, part, canvas_size)
+    if not sphere.level or turn:
+        canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll, turn=turn))
+    return np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
 
 
 def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PhotographLimits) -> None:

@@ -24,8 +24,16 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.photograph.cameras import Camera, Perspective
 from lalaloc_core.photograph.levelling import Attitude, estimate_attitude, lines_of
-from lalaloc_core.photograph.overlap import Features, Link, find_links, grouped
-from lalaloc_core.photograph.turn_order import Step, agreeing_links, headings_in_order, usual_steps
+from lalaloc_core.photograph.overlap import (
+    Features,
+    Link,
+    Step,
+    agreeing_links,
+    find_links,
+    grouped,
+    headings_in_order,
+    usual_steps,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -12,7 +12,6 @@ import numpy as np
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Camera, Perspective, camera_axes
 from lalaloc_core.photograph.levelling import MAX_ESTIMATED_SD
-from lalaloc_core.photograph.overlap import TURN_SIDE
 from lalaloc_core.photograph.patches import PatchSize, cut_patches, seen_azimuths
 from lalaloc_core.photograph.photograph import Assumed, Photograph, field_warning, open_photograph
 from lalaloc_core.photograph.stated_camera import HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG, StatedCamera
@@ -29,7 +28,7 @@ def open_turn(
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells."""
     read = partial(open_photograph, sphere_size=sphere_size, patch_size=patch_size)
-    photographs = [read(content, stated=stated, overview=TURN_SIDE) for content in contents]
+    photographs = [read(content, stated=stated, purpose="turn") for content in contents]
     if any(photograph.overview is None for photograph in photographs):
         raise InvalidPhotographError("a full sphere is among the photographs; localise it by itself")
     return level_turn(photographs, patch_size or PatchSize())

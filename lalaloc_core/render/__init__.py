@@ -1,12 +1,18 @@
 """Layout renderer: bare walls, floor and ceiling of a plan from the pose of a camera, in closed form.
 
 Begin with `sweep.py`, which renders many poses of a plan at once, for numpy only; search and training use it.
-`profile.py` casts rays from poses of one room at walls, and adds floor and ceiling; `layout.py` adds openings and the
-rooms behind them, and `gradient.py` computes derivatives by the pose. These run on numpy and on torch alike, for the
-encoders and for refinement. `sampling.py` draws poses.
+`profile.py` casts rays from poses at walls, adds floor, ceiling, openings and the rooms behind them, and computes
+derivatives by the pose. It runs on numpy and on torch alike, for the encoders and for refinement. `sampling.py` draws
+poses.
 `reference.py` is a slow ray tracer that tests compare with (extra `oracle`). Photographs are rendered by `learn/synth`.
 """
 
-from lalaloc_core.render.layout import RenderedLayout, render_layout
-from lalaloc_core.render.profile import back_project, cast_rays, layout_depth, wall_profile
+from lalaloc_core.render.profile import (
+    RenderedLayout,
+    back_project,
+    cast_rays,
+    layout_depth,
+    render_layout,
+    wall_profile,
+)
 from lalaloc_core.render.sweep import profiles_at

@@ -16,12 +16,9 @@ import numpy as np
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.film import Film, read_film
-from lalaloc_core.photograph.film_limits import FilmLimits
-from lalaloc_core.photograph.overlap import ALBUM_SIDE
-from lalaloc_core.photograph.photograph import open_picture, warm_up
+from lalaloc_core.photograph.film import Film, FilmLimits, read_film
+from lalaloc_core.photograph.photograph import Purpose, open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
-from lalaloc_core.photograph.taken import Taken, read_taken
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import level_turn
 from service.uploaded_file import UploadedFile
@@ -39,19 +36,11 @@ class DecodeSizes:
 
 @dataclass(frozen=True)
 class DecodeJob:
-    """Uploaded photograph to read for the encoders; the worker gets it as bytes. `overview` as in `open_photograph`."""
+    """Uploaded photograph to read for the encoders; the worker gets it as bytes."""
 
     content: bytes | UploadedFile
     stated: StatedCamera
-    overview: int = 0
-
-
-@dataclass(frozen=True)
-class AlbumJob:
-    """Uploaded photograph of an album to read for the encoders, with what tells its overlap with others."""
-
-    content: bytes | UploadedFile
-    stated: StatedCamera
+    purpose: Purpose = "single"
 
 
 @dataclass(frozen=True)
@@ -102,8 +91,8 @@ class DecodeRefusal:
     is_film: bool = False
 
 
-Job = DecodeJob | AlbumJob | FilmJob | TurnJob | ShowJob | RasteriseJob
-Result = Photograph | tuple[Photograph, Taken] | Film | LevelledTurn | np.ndarray | DecodeRefusal | bytes
+Job = DecodeJob | FilmJob | TurnJob | ShowJob | RasteriseJob
+Result = Photograph | Film | LevelledTurn | np.ndarray | DecodeRefusal | bytes
 
 
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
@@ -129,17 +118,15 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
         try:
             if isinstance(job, FilmJob):
                 return read_film(job.content, stated=job.stated, patch_size=sizes.patch, limits=sizes.film)
-            if isinstance(job, DecodeJob | AlbumJob):
-                is_of_album = isinstance(job, AlbumJob)
-                photograph = open_photograph(
+            if isinstance(job, DecodeJob):
+                return open_photograph(
                     job.content,
                     sphere_size=sizes.sphere,
                     stated=job.stated,
                     patch_size=sizes.patch,
                     limits=limits,
-                    overview=ALBUM_SIDE if is_of_album else job.overview,
+                    purpose=job.purpose,
                 )
-                return (photograph, read_taken(job.content, limits)) if is_of_album else photograph
             return _shown(job, job.content, limits)
         except (InvalidPhotographError, InvalidFilmError) as error:
             return DecodeRefusal(str(error), isinstance(error, InvalidFilmError))

@@ -18,12 +18,11 @@ from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
-from lalaloc_core.photograph.taken import Taken
+from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import (
-    AlbumJob,
     DecodeJob,
     DecodeRefusal,
     DecodeSizes,
@@ -103,7 +102,7 @@ class Decoder:
         deadline: float,
         client: str = "",
         *,
-        overview: int = 0,
+        purpose: Purpose = "single",
     ) -> Photograph:
         """Decode an uploaded photograph for the encoders; one that is encoded already is returned as it is.
 
@@ -114,16 +113,8 @@ class Decoder:
         """
         if isinstance(content, Photograph):
             return content
-        result = await self._run_job(DecodeJob(content, stated, overview), deadline, client)
+        result = await self._run_job(DecodeJob(content, stated, purpose), deadline, client)
         assert isinstance(result, Photograph)
-        return result
-
-    async def decode_for_album(
-        self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str = ""
-    ) -> tuple[Photograph, Taken]:
-        """Decode a photograph of an album, with its overview, and return when and by which camera it was taken."""
-        result = await self._run_job(AlbumJob(content, stated), deadline, client)
-        assert isinstance(result, tuple)
         return result
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str) -> Film:

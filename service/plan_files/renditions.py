@@ -106,6 +106,6 @@ def plan_localisability(plan: FloorPlan, job: RenditionJob, *, coarse: bool = Fa
 def localisability_map(plan: FloorPlan, report: bytes, condition: Condition) -> bytes:
     """Return the drawing of a `LocalisabilityAnswer` of the plan as SVG."""
     # Imported late for the same reason.
-    from lalaloc_core.draw.localisability import localisability_svg
+    from lalaloc_core.draw.heat import localisability_svg
 
     return localisability_svg(plan, json.loads(report), condition).encode()

@@ -19,8 +19,6 @@ from lalaloc_core.localise.encode.features import encodes_spheres
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from lalaloc_core.photograph import Photograph
-from lalaloc_core.photograph.taken import Taken
 from service.capacity.admission_control import Slots
 from service.capacity.bounded_cache import BoundedCache
 from service.capacity.fair_share import FairSemaphore
@@ -58,18 +56,15 @@ class AlbumSearch:
         """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
         content, document, context = query.content, query.document, query.context
         with context.clock.stage("decode"):
-            if isinstance(content, Photograph):
-                view, taken = content, Taken()
-            else:
-                view, taken = await self._parts.decoder.decode_for_album(
-                    content, document.stated_camera, context.deadline, context.client
-                )
-
+            view = await self._parts.decoder.decode(
+                content, document.stated_camera, context.deadline, context.client, purpose="album"
+            )
         if view.sphere is not None and not encodes_spheres(self._parts.bundle.manifest):
             raise InvalidPhotographError("the photograph is a full sphere, of which the model gives no features")
 
         def encode() -> AlbumEntry:
-            made = photograph_entry(query.sha256, self._parts.encoder.with_features(view), taken)
+            made = photograph_entry(query.sha256, self._parts.encoder.with_features(view))
+            taken = made.taken
             facts = PhotographFacts(
                 taken_at=None if taken.at is None else taken.at.isoformat(),
                 make=taken.make or None,

@@ -14,7 +14,7 @@ from lalaloc_core.localise.query import CameraHeight, KnownHeading, Query
 from lalaloc_core.localise.query.query import known_heading
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
-from lalaloc_core.photograph.overlap import TURN_SIDE
+from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from service.capacity.query_context import QueryContext
 from service.decoding.decoder import Decoder
@@ -50,14 +50,14 @@ class PhotographReader:
             return await self._decode_all(contents, stated, context)
 
     async def _decode_all(
-        self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext, *, overview: int = 0
+        self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext, *, purpose: Purpose = "single"
     ) -> list[Photograph]:
         """Decode photographs, a few at a time, so that a query leaves the other decoders to others."""
 
         async def decode(index: int) -> Photograph:
             with _named(index, contents):
                 return await self._decoder.decode(
-                    contents[index], stated, context.deadline, context.client, overview=overview
+                    contents[index], stated, context.deadline, context.client, purpose=purpose
                 )
 
         photographs: list[Photograph] = []
@@ -78,7 +78,7 @@ class PhotographReader:
             the photographs, and their angles; None if they are features or a sphere is among them.
         """
         with context.clock.stage("decode"):
-            photographs = await self._decode_all(contents, stated, context, overview=TURN_SIDE)
+            photographs = await self._decode_all(contents, stated, context, purpose="turn")
             if any(photograph.overview is None for photograph in photographs):
                 # Patches of the others are not cut yet.
                 decode = partial(self._decoder.decode, deadline=context.deadline, client=context.client)

@@ -68,7 +68,7 @@ class SessionSearch:
             levels = [row.level for row in site.ready] if isinstance(site, VenueSite) else []
             steps = track_steps(
                 await self._parts.executor.compute(context, partial(self._track_ground, ground, levels)),
-                self._parts.encoder,
+                self._parts.encoder.layouts,
                 state or TrackState.first(len(encoded.roll)),
                 encoded,
                 form.odometry,

@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS as _PLAN
 from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.importers import DEFAULT_IMPORT_LIMITS as _IMPORT
 from lalaloc_core.importers import ImportLimits
-from lalaloc_core.photograph.film_limits import FilmLimits
+from lalaloc_core.photograph.film import FilmLimits
 from lalaloc_core.photograph.spheres import PhotographLimits
 from service.settings.setting_types import Count, HostNames, IssuerUrl, Origins, PortMapping, Seconds
 

@@ -80,7 +80,7 @@ _SMALL = '{"fx":232.4,"fy":232.4,"cx":319.5,"cy":239.5}'
 _SIDEWAYS = '{"fx":581,"fy":581,"cx":799.5,"cy":599.5}'
 FAULTS = (
     Fault(name="crop_over_seam.jpg", room=None, said="(800, 100) is not within the full sphere of 1024 x 512"),
-    Fault(name="cube_3x2.jpg", said="a cube map, 3 x 2 faces: it was converted"),
+    Fault(name="cube_3x2.jpg", room=None, said="a cube map, 3 x 2 faces: convert it to equirectangular"),
     Fault(name="cylinder_full_is_crop.jpg", room=None, said="the borders do not continue each other; send hfov_deg"),
     Fault(name="dual_fisheye.jpg", room=None, said="dual fisheye picture of a 360° camera"),
     Fault(name="gopro_wide.jpg", said="GoPro HERO5 Black has a fisheye lens of about 123°"),
@@ -92,7 +92,7 @@ FAULTS = (
     Fault(name="png_big_metadata.png", said="texts of 1611 bytes were ignored"),
     Fault(name="sphere_letterbox.jpg", said="a sphere with bars at its borders"),
     Fault(name="sphere_orientation6.jpg", said="the Exif orientation 6, which is ignored"),
-    Fault(name="stereo_top_bottom.jpg", said="a stereo sphere, one eye above the other"),
+    Fault(name="stereo_top_bottom.jpg", room=None, said="a stereo sphere, one eye above the other: cut out one"),
     Fault(name="two_xmp.jpg"),
 )
 # Intrinsics of another size without an optical centre cannot be scaled, but contradict EXIF.

@@ -31,8 +31,7 @@ from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
-from lalaloc_core.photograph.overlap import ALBUM_SIDE
-from lalaloc_core.photograph.taken import Taken
+from lalaloc_core.photograph.exif import Taken
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("kitchen.jpg", "study.jpg", "bedroom.jpg", "living_room.jpg", "phone.jpg")
@@ -62,7 +61,7 @@ def photographs(encoder: PhotographEncoder) -> list[AlbumPhotograph]:
     for number, name in enumerate(NAMES):
         content = (EXAMPLES / name).read_bytes()
         view = open_photograph(
-            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), overview=ALBUM_SIDE
+            content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), purpose="album"
         )
         taken = Taken(at=datetime(2026, 5, 1, 12, number), make="M", model="P", width=1280, height=960)
         found.append(photograph_entry(name, encoder.with_features(view), taken))
@@ -206,7 +205,7 @@ def test_photographs_of_a_facade_are_set_aside(
     outside = [
         photograph_entry(
             f"outside {number}",
-            encoder.with_features(open_photograph(_facade(number), overview=ALBUM_SIDE, **size)),
+            encoder.with_features(open_photograph(_facade(number), purpose="album", **size)),
             replace(photographs[-1].taken, at=datetime(2026, 5, 1, 12, 10 + number)),
         )
         for number in range(2)

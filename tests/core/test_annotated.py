@@ -37,8 +37,7 @@ from lalaloc_core.learn.dataset_names import GALLERIES
 from lalaloc_core.learn.metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.encode.view_encoder import ViewEncoder
-from lalaloc_core.render.layout import render_layout
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import render_layout, wall_profile
 from tests.core.questions import prediction_of
 from tests.strategies import present
 

@@ -15,8 +15,7 @@ from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.draw import canvas, rasterise
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
-from lalaloc_core.draw.outline import layout_outline
-from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.draw.outline import Stroke, draw_strokes, layout_outline, wall_line
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import ProbabilityMap

@@ -17,8 +17,7 @@ import pytest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.photograph import StatedCamera
-from lalaloc_core.photograph.film import Film, read_film
-from lalaloc_core.photograph.film_limits import FilmLimits
+from lalaloc_core.photograph.film import Film, FilmLimits, read_film
 from lalaloc_core.photograph.film_motion import FlowTracker
 from tests.core.filmed import HEVC, RATE, STEP_DEG, VP9, encode, needs_ffmpeg, run, turn
 

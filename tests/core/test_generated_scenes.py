@@ -23,7 +23,7 @@ from lalaloc_core.learn.data.synthetic.altered_photographs import (
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
 from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.render.layout import render_layout
+from lalaloc_core.render.profile import render_layout
 
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)
 FURNISHED = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)

@@ -119,7 +119,7 @@ class TestPerfectEncoder:
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
-        layout, profile_m = perfect.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
+        layout, profile_m = perfect.layouts.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
         np.testing.assert_allclose(query.latents[nearest], layout[0], atol=2e-3)
         np.testing.assert_allclose(np.exp(present(query.profile).log_m[nearest]), profile_m[0], atol=2e-4)
 

@@ -18,9 +18,14 @@ from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION, generate_home
 from lalaloc_core.localise.match import Layouts, layouts_at
 from lalaloc_core.localise.match.pose_grid import layouts_of_plans
-from lalaloc_core.render.gradient import free_travel_m, log_distance_gradient, log_profile_gradient
-from lalaloc_core.render.layout import RenderedLayout, render_layout
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.profile import (
+    RenderedLayout,
+    free_travel_m,
+    log_distance_gradient,
+    log_profile_gradient,
+    render_layout,
+    wall_profile,
+)
 from lalaloc_core.render.reference import reference_view
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from lalaloc_core.render.sweep import SweptLayouts, profiles_at, sweep_layouts

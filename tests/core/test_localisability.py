@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lalaloc_core.bundle import Bundle, Manifest, default_bundle
-from lalaloc_core.bundle.prediction_errors import correlated
+from lalaloc_core.bundle.fitted_parameters import correlated
 from lalaloc_core.conditions import CONDITIONS, HARDEST, condition_of, parts_of
-from lalaloc_core.draw.localisability import localisability_svg
+from lalaloc_core.draw.heat import localisability_svg
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.calibrate.measured_errors import measured
 from lalaloc_core.floorplan import FloorPlan

@@ -20,8 +20,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
-from lalaloc_core.localise.encode.object_encoder import outside_odds
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.localise.encode.view_encoder import outside_odds
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost
 from lalaloc_core.localise.match.matching_cost import MatchingCost
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, PredictedRoomType, Query, SeenObject, SeenObjects

@@ -18,8 +18,8 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig
 from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.bent_lines import measure_bend
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
+from lalaloc_core.photograph.levelling import measure_bend
 from lalaloc_core.photograph.patches import UNSEEN, Patch, joined_patches, patch_azimuths
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere

@@ -39,7 +39,7 @@ def flat() -> FloorPlan:
 
 @pytest.fixture(scope="module")
 def search(flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Search:
-    return partial(localise, flat, grid, encoders, refiner=optimiser.refine)
+    return partial(localise, flat, grid, encoders.layouts, refiner=optimiser.refine)
 
 
 @pytest.fixture(scope="module")

@@ -253,7 +253,7 @@ def motions_along(walk: Walk, *, directed: bool = False) -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def search(plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder) -> Search:
-    return partial(localise_sequence, plan, grid, encoders)
+    return partial(localise_sequence, plan, grid, encoders.layouts)
 
 
 @pytest.fixture(scope="module")

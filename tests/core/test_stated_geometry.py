@@ -12,7 +12,7 @@ from PIL import ExifTags
 from lalaloc_core.photograph import Intrinsics, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
 from lalaloc_core.photograph.exif import read_exif_lens
-from lalaloc_core.photograph.intrinsics_fit import fit_intrinsics
+from lalaloc_core.photograph.stated_camera import fit_intrinsics
 from tests.core.taken import exif_of, jpeg, sphere, take
 
 Tag = ExifTags.Base

@@ -16,10 +16,9 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.overlap import TURN_SIDE, Features, Link
+from lalaloc_core.photograph.overlap import Features, Link, Step, agreeing_links, headings_in_order, usual_steps
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn, level_axes
-from lalaloc_core.photograph.turn_order import Step, agreeing_links, headings_in_order, usual_steps
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from tests.core.taken import jpeg, sphere, take
 
@@ -36,9 +35,7 @@ def photographs(headings_deg: Sequence[float], room: str = "living_room", **stat
         for heading, pitch in zip(headings_deg, pitches_deg, strict=False)
     ]
     statement = StatedCamera(projection="perspective", **stated)
-    return [
-        open_photograph(picture, sphere_size=(128, 256), stated=statement, overview=TURN_SIDE) for picture in pictures
-    ]
+    return [open_photograph(picture, sphere_size=(128, 256), stated=statement, purpose="turn") for picture in pictures]
 
 
 def misses_deg(angles: Sequence[TurnAngles], headings: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

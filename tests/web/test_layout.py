@@ -10,8 +10,7 @@ import pytest
 
 from lalaloc_core.conventions import OPENING_CLASSES, row_elevations
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.layout import RenderedLayout, render_layout
-from lalaloc_core.render.profile import cast_rays, layout_depth
+from lalaloc_core.render.profile import RenderedLayout, cast_rays, layout_depth, render_layout
 from tests.service.conftest import upload
 from tests.web.conftest import EXAMPLES, Visit
 

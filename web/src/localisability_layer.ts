@@ -189,7 +189,7 @@ export class LocalisabilityLayer {
   }
 }
 
-/** Return the probability of every cell, as in lalaloc_core/draw/localisability.py: the mean of its room's places by distance. */
+/** Return the probability of every cell, as in lalaloc_core/draw/heat.py: the mean of its room's places by distance. */
 function shadesOf(
   { box, columns, rows }: Cells,
   found: Localisability,

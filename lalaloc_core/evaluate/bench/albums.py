@@ -30,7 +30,7 @@ from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import stated_height
 from lalaloc_core.photograph import StatedCamera
-from lalaloc_core.photograph.taken import Taken
+from lalaloc_core.photograph.exif import Taken
 
 _PHOTOGRAPHS = 20
 # Annotated rooms of an album, their distance (m), and the field of view (degrees) of their two photographs.

@@ -17,7 +17,7 @@ from lalaloc_core.learn.data.dataset import Camera, Dataset
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.render.layout import render_layout
+from lalaloc_core.render.profile import render_layout
 
 _MAX_HOMES = 100
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Integer
 from scipy.special import ndtri
 
 from lalaloc_core.bundle import Bundle, Manifest, PredictionErrors, write_manifest
-from lalaloc_core.bundle.prediction_errors import LEVELS
+from lalaloc_core.bundle.fitted_parameters import LEVELS
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
 from lalaloc_core.errors import InvalidInputError

@@ -20,7 +20,7 @@ from PIL import Image
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.draw.outline import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.report_tables import percent

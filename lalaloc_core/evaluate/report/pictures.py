@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lalaloc_core.draw.canvas import FOUND, TRUE, document, draw_cross, rasterise, words
 from lalaloc_core.draw.heat import Cells, colour_bar, distance_map, heat_image
-from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.draw.outline import Stroke, draw_strokes, wall_line
 from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.floorplan import FloorPlan

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths
-from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.draw.outline import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, encode, read_image
 from lalaloc_core.evaluate.methods.method import Pose

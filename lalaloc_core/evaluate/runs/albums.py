@@ -21,8 +21,7 @@ from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
 from lalaloc_core.photograph import StatedCamera, open_photograph
-from lalaloc_core.photograph.overlap import ALBUM_SIDE
-from lalaloc_core.photograph.taken import Taken, read_taken
+from lalaloc_core.photograph.exif import Taken
 
 _PLAN = "plan"
 # Size of generated spheres, pixels.
@@ -80,11 +79,13 @@ class AlbumCase:
         return len(rooms)
 
 
-def album_entry(model: LocalModel, id: str, content: bytes, stated: StatedCamera, taken: Taken) -> AlbumPhotograph:
-    """Return the entry of a photograph's file."""
+def album_entry(
+    model: LocalModel, id: str, content: bytes, stated: StatedCamera, taken: Taken | None = None
+) -> AlbumPhotograph:
+    """Return the entry of a photograph's file, with the given time and camera or those of its metadata."""
     manifest = model.bundle.manifest
     view = open_photograph(
-        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), overview=ALBUM_SIDE
+        content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), purpose="album"
     )
     return photograph_entry(id, model.encoder.with_features(view), taken)
 
@@ -139,11 +140,9 @@ def _prediction(case: AlbumCase, scene: Scene, camera: Camera, pin: Pin, clicks:
 def _entry(model: LocalModel, name: str, photograph: DatasetPhotograph) -> AlbumPhotograph:
     """Return the entry of a photograph: a file of any projection, a view, or a generated sphere."""
     if isinstance(photograph, FilePhotograph):
-        content = photograph.content()
-        return album_entry(model, name, content, StatedCamera(), read_taken(content))
-    if isinstance(photograph, ViewPhotograph):
+        content, stated = photograph.content(), StatedCamera()
+    elif isinstance(photograph, ViewPhotograph):
         content, stated = photograph.content(), photograph.stated_camera
     else:
         content, stated = encode_jpeg(photograph.image(*_SPHERE_SIZE)), StatedCamera(projection="equirectangular")
-    size = read_taken(content)
-    return album_entry(model, name, content, stated, Taken(width=size.width, height=size.height))
+    return album_entry(model, name, content, stated)

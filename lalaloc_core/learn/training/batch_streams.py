@@ -20,7 +20,7 @@ from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
 from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
-from lalaloc_core.render.layout import render_layout
+from lalaloc_core.render.profile import render_layout
 from lalaloc_core.render.sweep import profiles_at
 
 T = TypeVar("T")

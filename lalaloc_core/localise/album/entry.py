@@ -26,8 +26,8 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, InvalidCorrectionError, InvalidEntryError
 from lalaloc_core.localise.encode.features import MAX_BYTES, read_features, write_features
 from lalaloc_core.photograph import Photograph
+from lalaloc_core.photograph.exif import MAX_NAME, Taken
 from lalaloc_core.photograph.overlap import Features
-from lalaloc_core.photograph.taken import MAX_NAME, Taken
 
 MAX_ENTRY_BYTES = 20_000
 _MAX_DESCRIPTORS, _DESCRIPTOR_BYTES = 256, 16
@@ -214,7 +214,7 @@ def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None
         id: its name within the album.
         photograph: the photograph with its features (`PhotographEncoder.with_features`, or features that a client
             sent); its `overview` gives the descriptors.
-        taken: time and camera, from `photograph.taken.read_taken`; None for features.
+        taken: time and camera, if they are not those of the photograph.
     """
     assert photograph.features is not None
     outputs = dict(photograph.features.outputs)
@@ -231,7 +231,8 @@ def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None
     descriptors = _NO_DESCRIPTORS if photograph.overview is None else Descriptors.of(photograph.overview.features)
     pixels = photograph.thumbnail if photograph.sphere is None else photograph.sphere
     colours = _NO_COLOURS if pixels is None else _colours(pixels)
-    return AlbumPhotograph(id=id, photograph=light, taken=taken or Taken(), descriptors=descriptors, colours=colours)
+    taken = taken or photograph.taken or Taken()
+    return AlbumPhotograph(id=id, photograph=light, taken=taken, descriptors=descriptors, colours=colours)
 
 
 def _colours(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "64"]:

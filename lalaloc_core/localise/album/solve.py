@@ -30,8 +30,8 @@ from lalaloc_core.localise.album.links import Found, find_links, pair_odds
 from lalaloc_core.localise.album.pins import Album, Pin, Suggestion
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms, expected_photographs, walk_of
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
-from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, outside_odds
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.encode.view_encoder import OBJECT_OUTPUTS, outside_odds
 
 MAX_PHOTOGRAPHS = 500
 # The comparison with poses takes memory by their number, the walk from room to room time by the cube of theirs.

@@ -29,9 +29,8 @@ from lalaloc_core.errors import (
     InvalidPhotographError,
 )
 from lalaloc_core.localise.encode.exported_network import PROFILE_OUTPUTS, SHARE_OUTPUT
-from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEncoder
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
-from lalaloc_core.localise.encode.view_encoder import ViewEncoder
+from lalaloc_core.localise.encode.view_encoder import OBJECT_OUTPUTS, ObjectEncoder, ViewEncoder
 from lalaloc_core.photograph import Assumed, Intrinsics, Photograph, PhotographFeatures, StatedCamera
 from lalaloc_core.photograph.cameras import Camera, Fisheye, Perspective
 from lalaloc_core.photograph.projection import Source

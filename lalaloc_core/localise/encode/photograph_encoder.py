@@ -14,9 +14,14 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.localise.encode.features import RING_HEIGHTS_M, at_height
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.encode.object_encoder import OBJECT_OUTPUTS, ObjectEncoder, seen_objects
 from lalaloc_core.localise.encode.sphere_encoder import SphereEncoder
-from lalaloc_core.localise.encode.view_encoder import VIEW_OUTPUTS, ViewEncoder
+from lalaloc_core.localise.encode.view_encoder import (
+    OBJECT_OUTPUTS,
+    VIEW_OUTPUTS,
+    ObjectEncoder,
+    ViewEncoder,
+    seen_objects,
+)
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
 from lalaloc_core.photograph.patches import joined_patches

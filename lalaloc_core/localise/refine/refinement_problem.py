@@ -27,7 +27,7 @@ from array_api_compat import array_namespace, device, to_device
 from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import Array
-from lalaloc_core.render.gradient import ProfileJacobian, free_travel_m, log_profile_gradient
+from lalaloc_core.render.profile import ProfileJacobian, free_travel_m, log_profile_gradient
 
 # Distance that is minimised: Euclidean, mean absolute difference, or the mean of log(1 + r²).
 Norm = Literal["l2", "l1", "cauchy"]

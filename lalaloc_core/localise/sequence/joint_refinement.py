@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.sequence.measured_motion import Motion
-from lalaloc_core.render.gradient import free_travel_m, log_profile_gradient
+from lalaloc_core.render.profile import free_travel_m, log_profile_gradient
 
 _MARGIN_M, _MAX_STEP_M, _MAX_TURN = 0.03, 0.5, 0.2
 _ITERATIONS, _OWN_ITERATIONS, _FIRST_DAMPING = 25, 8, 1e-2

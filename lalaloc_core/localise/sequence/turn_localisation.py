@@ -13,8 +13,8 @@ from lalaloc_core.localise.belief import RIGHT_WITHIN_M, Posterior, photograph_h
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.sequence.measured_motion import Motion
 from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
+from lalaloc_core.photograph.overlap import LIKELY_SD
 from lalaloc_core.photograph.turn_angles import TurnAngles
-from lalaloc_core.photograph.turn_order import LIKELY_SD
 
 # Phones move about the person who turns.
 ON_THE_SPOT = Motion(distance_m=0.0, distance_std_m=0.15)

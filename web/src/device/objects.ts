@@ -1,4 +1,4 @@
-/** Objects in photographs that are no spheres, as in lalaloc_core/localise/encode/object_encoder.py. */
+/** Objects in photographs that are no spheres, as in lalaloc_core/localise/encode/view_encoder.py. */
 
 import { type CameraView, type Ray, tiltOf } from "../camera";
 import { radians } from "../layout";

@@ -15,7 +15,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes
-from lalaloc_core.render.layout import render_layout
+from lalaloc_core.render.profile import render_layout
 
 # Gap between two copies (m), not a multiple of the grid step, so that the grid has another offset in each copy.
 _APART_M = 3.17

@@ -1,4 +1,4 @@
-"""Pictures that hold a sphere in another layout: converted, or named; ordinary photographs are left alone."""
+"""Pictures that hold a sphere in another format: converted, or named; ordinary photographs are left alone."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Iterator
 from functools import cache
+from time import process_time
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from PIL import Image
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
-from lalaloc_core.photograph.cube_maps import arrange_faces, find_cube
+from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
 
@@ -57,28 +58,8 @@ def barred(panorama: np.ndarray, above: int, beside: int, grey: int = 0) -> np.n
 
 
 def usable(panorama: np.ndarray) -> dict[str, np.ndarray]:
-    """Return pictures from which the sphere can be taken, by a word of their warning."""
-    front, right, back, left, up, down = faces(panorama)
-    empty = np.zeros_like(front)
-    white = empty + 255
-    other_eye = np.roll(panorama, 6, axis=1)
-    square, other_square = (cv2.resize(eye, (512, 512)) for eye in (panorama, other_eye))
-    rows = [[empty, up, empty, empty], [left, front, right, back], [empty, down, empty, empty]]
-    column = [[white, up, white], [left, front, right], [white, down, white], [white, np.rot90(back, 2), white]]
-    of_video = [equiangular(face) for face in (front, right, back, left, up, down)]
-    turned = [np.rot90(of_video[5]), np.rot90(of_video[2], -1), np.rot90(of_video[4])]
+    """Return pictures from which the sphere is taken, by a word of their warning."""
     return {
-        "cube map, 3 x 2 faces": np.vstack([np.hstack([right, left, up]), np.hstack([down, front, back])]),
-        "cube map, equi-angular, 3 x 2": np.vstack([np.hstack([of_video[i] for i in (3, 0, 1)]), np.hstack(turned)]),
-        "cube map, 2 x 3": np.vstack([np.hstack([right, left]), np.hstack([up, down]), np.hstack([front, back])]),
-        "cube map, 6 x 1": np.hstack([right, left, up, down, front, back]),
-        "cube map, 6 x 1 faces": np.hstack([up, front, right, back, left, down]),
-        "cube map, 1 x 6": np.vstack([front, right, back, left, up, down]),
-        "cross of 4 x 3": np.vstack([np.hstack(row) for row in rows]),
-        "cross of 3 x 4": np.vstack([np.hstack(row) for row in column]),
-        "one eye above the other": np.vstack([panorama, other_eye]),
-        "one eye beside the other": np.hstack([panorama, other_eye]),
-        "stereo sphere, one eye beside": np.hstack([square, other_square]),
         "bars at its borders, 11%": barred(panorama, 32, 0),
         "bars at its borders, 33%": barred(panorama, 128, 0, 255),
         "bars at its borders, 16%": barred(panorama, 0, 100),
@@ -94,12 +75,33 @@ def circle(panorama: np.ndarray, heading_deg: float) -> np.ndarray:
 def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
     """Return pictures that are refused, by a word of the refusal."""
     front, right, back, left, up, down = faces(panorama)
+    empty = np.zeros_like(front)
+    white = empty + 255
+    other_eye = np.roll(panorama, 6, axis=1)
+    square, other_square = (cv2.resize(eye, (512, 512)) for eye in (panorama, other_eye))
+    rows = [[empty, up, empty, empty], [left, front, right, back], [empty, down, empty, empty]]
+    column = [[white, up, white], [left, front, right], [white, down, white], [white, np.rot90(back, 2), white]]
+    of_video = [equiangular(face) for face in (front, right, back, left, up, down)]
+    turned = [np.rot90(of_video[5]), np.rot90(of_video[2], -1), np.rot90(of_video[4])]
     two = [circle(panorama, heading_deg) for heading_deg in (0.0, 180.0)]
+    half, other_half = (eye[:, 256:768] for eye in (panorama, other_eye))
     return {
+        "cube map, 3 x 2 faces": np.vstack([np.hstack([right, left, up]), np.hstack([down, front, back])]),
+        "cube map, 3 x 2 faces: convert": np.vstack([np.hstack([of_video[i] for i in (3, 0, 1)]), np.hstack(turned)]),
         "cube map, 3 x 2": np.vstack(
             [np.hstack([left, np.rot90(front), right]), np.hstack([down, back[::-1, ::-1], up])]
         ),
-        "cube map, 6 x 1": np.hstack([np.rot90(right), left, up, down, np.rot90(front, -1), back]),
+        "cube map, 2 x 3": np.vstack([np.hstack([right, left]), np.hstack([up, down]), np.hstack([front, back])]),
+        "cube map, 6 x 1": np.hstack([right, left, up, down, front, back]),
+        "cube map, 6 x 1 faces": np.hstack([up, front, right, back, left, down]),
+        "cube map, 6 x 1 faces: convert": np.hstack([np.rot90(right), left, up, down, np.rot90(front, -1), back]),
+        "cube map, 1 x 6": np.vstack([front, right, back, left, up, down]),
+        "cross of 4 x 3": np.vstack([np.hstack(row) for row in rows]),
+        "cross of 3 x 4": np.vstack([np.hstack(row) for row in column]),
+        "one eye above the other: cut out": np.vstack([panorama, other_eye]),
+        "one eye beside the other: cut out": np.hstack([panorama, other_eye]),
+        "stereo sphere, one eye beside": np.hstack([square, other_square]),
+        "VR180, two eyes": np.hstack([half, other_half]),
         "dual fisheye": np.hstack(two),
         "dual fisheye picture": np.vstack(two),
         "circle of a fisheye": two[0],
@@ -108,7 +110,7 @@ def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_sphere_is_taken_out_of_its_layout(name: str) -> None:
+def test_sphere_is_taken_out_of_its_bars(name: str) -> None:
     panorama = small(name)
     whole = opened(jpeg(panorama)).sphere
     assert whole is not None
@@ -122,16 +124,29 @@ def test_sphere_is_taken_out_of_its_layout(name: str) -> None:
 
 def test_pictures_of_six_unrelated_faces_are_no_cube_maps() -> None:
     rooms = [faces(small(name))[:2] for name in NAMES[:3]]
-    assert find_cube(np.vstack([np.hstack([room[row] for room in rooms]) for row in (0, 1)])) is None
+    pixels = np.vstack([np.hstack([room[row] for room in rooms]) for row in (0, 1)])
+    assert find_sphere_format(thumbnail(pixels)) is None
 
 
-def test_doubtful_faces_are_not_arranged() -> None:
-    same = np.repeat(faces(small("kitchen"))[0][None], 6, axis=0).reshape(2, 3, 256, 256, 3)
-    assert arrange_faces(same) is None
+def thumbnail(pixels: np.ndarray) -> Thumbnail:
+    share = THUMBNAIL_SIDE / max(pixels.shape)
+    return Thumbnail(cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+
+
+@pytest.mark.parametrize("ratio", [(2, 1), (4, 3), (3, 4), (3, 2), (1, 1), (16, 9)])
+def test_all_detectors_together_take_two_milliseconds(ratio: tuple[int, int]) -> None:
+    width, height = ratio
+    pixels = cv2.resize(small("kitchen"), (THUMBNAIL_SIDE * width // max(ratio), THUMBNAIL_SIDE * height // max(ratio)))
+    times_s = []
+    for _ in range(30):
+        begin = process_time()
+        assert find_sphere_format(Thumbnail(pixels)) is None
+        times_s.append(process_time() - begin)
+    assert min(times_s) < 2e-3
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_layout_that_cannot_be_converted_is_refused_by_name(name: str) -> None:
+def test_format_that_is_not_converted_is_refused_by_name(name: str) -> None:
     for words, pixels in unusable(small(name)).items():
         with pytest.raises(InvalidPhotographError, match=words):
             opened(jpeg(np.ascontiguousarray(pixels)))
@@ -152,18 +167,6 @@ def test_orientation_of_a_sphere_is_ignored(orientation: int) -> None:
     assert view.sphere is not None
     assert np.abs(view.sphere.astype(int) - whole).mean() < 3.0
     assert f"Exif orientation {orientation}, which is ignored" in view.warnings[0]
-
-
-def test_left_eye_of_vr180_shows_half_of_the_sphere() -> None:
-    panorama = small("living_room")
-    half, other = panorama[:, 256:768], np.roll(panorama, 6, axis=1)[:, 256:768]
-    view = opened(jpeg(np.hstack([half, other])))
-    whole = opened(jpeg(panorama)).sphere
-    assert "VR180" in view.warnings[0]
-    assert view.azimuths == pytest.approx((-0.5 * math.pi, 0.5 * math.pi))
-    assert view.sphere is not None
-    assert whole is not None
-    assert np.abs(view.sphere[:, 66:190].astype(int) - whole[:, 66:190]).mean() < 6.0
 
 
 def ordinary(panorama: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, bool]]:

@@ -1,0 +1,285 @@
+"""Pictures that hold a sphere otherwise than as one equirectangular picture, told by their pixels.
+
+Such a picture passes for an ordinary photograph by its size, and would be localised with a wrong geometry. A sphere on
+its side or within bars is taken out of the picture; other formats are refused by name. All detectors judge one small
+picture, and take 2 ms together at most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from lalaloc_core.photograph.projection import COARSEST, is_sphere
+
+# Longest side (pixels) of judged pictures.
+THUMBNAIL_SIDE = 504
+# Relative deviation of a ratio of sides; editors round.
+_TOLERANCE = 0.01
+# Eyes of a stereo picture: height and width (pixels) of compared pictures, the smallest correlation of two eyes (other
+# pictures reach 0.45), and the largest shift between them (pixels).
+_EYE, _MIN_CORRELATION, _MAX_SHIFT = (32, 64), 0.65, 3
+# Bars: largest spread of grey levels along a row, and least share of the height.
+_MAX_BAR_SPREAD, _MIN_BARS = 4.0, 0.02
+# Circles: side (pixels) of judged squares, radii of the ring inside and of the corners, and grey levels of the corners.
+_CIRCLE = 64
+_RING, _CORNERS = (0.8, 0.93), 1.12
+_DARK, _MIN_STEP, _MIN_DARK_SHARE = 40.0, 25.0, 0.97
+_SECTORS = 8
+# Cube maps: rows and columns of their faces, and side (pixels) of judged faces.
+_CROSSES, _GRIDS = ((3, 4), (4, 3)), ((2, 3), (3, 2), (1, 6), (6, 1))
+_FACE = 64
+# Empty cells of a cross: largest spread of grey levels, and difference between cells.
+_MAX_SPREAD, _MAX_DIFFERENCE = 5.0, 10.0
+# Edges of faces: ratio of the difference across a border to that between lines next to it, up to which they continue
+# each other and from which they do not; least shares of continued edges and of broken borders.
+_CONTINUED, _BROKEN = 2.5, 4.0
+_MIN_CONTINUED, _MIN_BROKEN = 0.8, 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereFormat:
+    """Format of a picture that holds a sphere.
+
+    Attributes:
+        text: its name, the reason for it, and what is done or to be done about it.
+        box: part of the picture with the sphere, as shares (left, top, right, bottom); None if it is refused.
+        is_stored: `box` is one of the stored picture, before its Exif orientation is applied.
+    """
+
+    text: str
+    box: tuple[float, float, float, float] | None = None
+    is_stored: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """Small upright picture, at most `THUMBNAIL_SIDE` wide and high, and the Exif orientation of the stored one."""
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    orientation: int = 1
+
+    @cached_property
+    def grey(self) -> UInt8[np.ndarray, "h w"]:
+        """Grey levels."""
+        return cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)
+
+
+def find_sphere_format(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a picture; None for a photograph, or a sphere as it should be."""
+    return next((found for find in _DETECTORS if (found := find(thumbnail)) is not None), None)
+
+
+def looks_spherical(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
+    """Return whether a picture of any size looks like a full sphere; see `is_sphere`."""
+    height, width = COARSEST
+    return is_sphere(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _has_ratio(pixels: np.ndarray, ratio: float) -> bool:
+    height, width = pixels.shape[:2]
+    # The judged size is rounded to whole pixels.
+    return abs(width - ratio * height) <= max(_TOLERANCE * width, 1.0 + ratio)
+
+
+def _find_sideways(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a sphere that the Exif orientation would turn on its side."""
+    if thumbnail.orientation not in (5, 6, 7, 8) or not _has_ratio(thumbnail.pixels, 0.5):
+        return None
+    turns = 1 if thumbnail.orientation in (5, 6) else -1
+    if not looks_spherical(np.ascontiguousarray(np.rot90(thumbnail.pixels, turns))):
+        return None
+    return SphereFormat(
+        text=f"the photograph is a sphere with the Exif orientation {thumbnail.orientation}, which is ignored: its "
+        "stored picture is twice as wide as high, and its borders continue each other",
+        box=(0.0, 0.0, 1.0, 1.0),
+        is_stored=True,
+    )
+
+
+def _find_circles(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a picture with one or two circles of fisheye lenses on black."""
+    grey = thumbnail.grey
+    height, width = grey.shape
+    for ratio, halves in (
+        (2.0, (grey[:, : width // 2], grey[:, width - width // 2 :])),
+        (0.5, (grey[: height // 2], grey[height - height // 2 :])),
+    ):
+        if _has_ratio(grey, ratio) and all(map(_is_circle, halves)):
+            return SphereFormat(
+                text="the photograph is the dual fisheye picture of a 360° camera, two circles that are not stitched: "
+                "export it from the camera's app as an equirectangular 360° photograph"
+            )
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    beside = (part for part in (grey[:top], grey[:, :left]) if part.size)
+    if all(np.percentile(part, 90) < _DARK for part in beside) and _is_circle(grey[top : top + side, left:][:, :side]):
+        return SphereFormat(
+            text="the photograph is the circle of a fisheye lens: send projection=fisheye and hfov_deg, its horizontal "
+            "field of view (often 180), of the square around the circle"
+        )
+    return None
+
+
+def _is_circle(square: UInt8[np.ndarray, "h w"]) -> bool:
+    """Return whether a square picture is dark in its corners, and bright within its largest circle all around."""
+    grey = cv2.resize(square, (_CIRCLE, _CIRCLE), interpolation=cv2.INTER_AREA)
+    is_corner, ring = _circle_parts()
+    corners = grey[is_corner].astype(float)
+    if np.mean(corners < _DARK) < _MIN_DARK_SHARE or corners.std() > 0.3 * _DARK:
+        return False
+    bright = [np.median(grey[ring == sector]) > corners.mean() + _MIN_STEP for sector in range(_SECTORS)]
+    return sum(bright) >= _SECTORS - 1
+
+
+@cache
+def _circle_parts() -> tuple[Bool[np.ndarray, "s s"], Int[np.ndarray, "s s"]]:
+    """Return the corners of a square, and the sector of each pixel of the ring within it, -1 beside the ring."""
+    place = (np.arange(_CIRCLE) + 0.5) / _CIRCLE * 2.0 - 1.0
+    x, y = np.meshgrid(place, place)
+    radius, sector = np.hypot(x, y), ((np.arctan2(y, x) / math.tau + 0.5) * _SECTORS).astype(int) % _SECTORS
+    return radius > _CORNERS, np.where((radius > _RING[0]) & (radius < _RING[1]), sector, -1)
+
+
+def _find_stereo(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a picture with two eyes, each with a sphere or with 180° of it."""
+    pixels, grey = thumbnail.pixels, thumbnail.grey
+    height, width = grey.shape
+    above = (slice(height // 2), slice(None)), (slice(height - height // 2, height), slice(None))
+    beside = (slice(None), slice(width // 2)), (slice(None), slice(width - width // 2, width))
+    for name, (first, second) in (("above", above), ("beside", beside)):
+        if not _look_alike(grey[first], grey[second]):
+            continue
+        if looks_spherical(pixels[first]) and looks_spherical(pixels[second]):
+            return SphereFormat(
+                text=f"the photograph is a stereo sphere, one eye {name} the other: cut out one of them, and send it "
+                "as a picture twice as wide as high"
+            )
+        if name == "beside" and _has_ratio(pixels, 2.0):
+            return SphereFormat(
+                text="the photograph is VR180, two eyes with 180° beside each other: cut out one of them, and send it "
+                "with projection=equirectangular and hfov_deg=180"
+            )
+    return None
+
+
+def _look_alike(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> bool:
+    """Return whether two grey pictures show the same, up to the shift between two eyes."""
+    height, width = _EYE
+    # Slow changes and rows, as of light from above, are alike in all pictures.
+    margin = width // 16
+    details = []
+    for half in (first, second):
+        small = cv2.resize(half, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        inner = (small - cv2.GaussianBlur(small, (0, 0), margin / 2))[:, margin:-margin]
+        details.append(inner - inner.mean(axis=1, keepdims=True))
+    if min(inner.std() for inner in details) < 1.0:
+        return False
+    core = np.ascontiguousarray(details[0][:, _MAX_SHIFT:-_MAX_SHIFT])
+    return float(cv2.matchTemplate(details[1], core, cv2.TM_CCOEFF_NORMED).max()) > _MIN_CORRELATION
+
+
+def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a sphere within bars of one colour."""
+    pixels = thumbnail.pixels
+    height, width = pixels.shape[:2]
+    top, bottom = _bars(pixels)
+    left, right = _bars(pixels.transpose(1, 0, 2))
+    if (bottom - top) * (right - left) > (1.0 - _MIN_BARS) * height * width or min(bottom - top, right - left) < 16:
+        return None
+    # The bars are equal and the sphere twice as wide as high, which is more exact than the judged pixels.
+    across, down = (right - left) / width, (bottom - top) / height
+    exact = (1.0, width / 2.0 / height) if across > 0.98 else (2.0 * height / width, 1.0)
+    slack = 2.5 / min(height, width)
+    if max(abs(exact[0] - across), abs(exact[1] - down), abs(left + right - width) / width) > slack:
+        return None
+    if abs(top + bottom - height) / height > slack or max(exact) > 1.0 + slack:
+        return None
+    if not looks_spherical(pixels[top:bottom, left:right]):
+        return None
+    beside, above = 0.5 * (1.0 - min(exact[0], 1.0)), 0.5 * (1.0 - min(exact[1], 1.0))
+    share = 1.0 - (1.0 - 2.0 * beside) * (1.0 - 2.0 * above)
+    return SphereFormat(
+        text=f"the photograph is a sphere with bars at its borders, {share:.0%} of the picture: they were cut off",
+        box=(beside, above, 1.0 - beside, 1.0 - above),
+    )
+
+
+def _bars(pixels: UInt8[np.ndarray, "n m 3"]) -> tuple[int, int]:
+    """Return the first row and the end of the rows between bars of one colour at the top and bottom."""
+    ends = pixels[[0, -1]].astype(np.float32)
+    colour = ends.mean(axis=(0, 1))
+    if ends.std(axis=1).max() >= _MAX_BAR_SPREAD or np.abs(ends.mean(axis=1) - colour).max() >= 2.0 * _MAX_BAR_SPREAD:
+        return 0, len(pixels)
+    values = pixels.astype(np.float32)
+    is_bar = values.std(axis=1).max(axis=1) < _MAX_BAR_SPREAD
+    is_bar &= np.abs(values.mean(axis=1) - colour).max(axis=1) < 2.0 * _MAX_BAR_SPREAD
+    if is_bar.all():
+        return 0, len(pixels)
+    return int(np.argmin(is_bar)), len(pixels) - int(np.argmin(is_bar[::-1]))
+
+
+def _find_cube(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a cube map."""
+    height, width = thumbnail.pixels.shape[:2]
+    for rows, columns in (*_CROSSES, *_GRIDS):
+        if abs(width * rows - height * columns) > max(_TOLERANCE * width * rows, float(rows + columns)):
+            continue
+        size = columns * _FACE, rows * _FACE
+        even = cv2.resize(thumbnail.pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        cells = even.reshape(rows, _FACE, columns, _FACE, 3).transpose(0, 2, 1, 3, 4)
+        if (_is_cross if (rows, columns) in _CROSSES else _is_cube)(cells):
+            kind = "a cross of " if (rows, columns) in _CROSSES else ""
+            return SphereFormat(
+                text=f"the photograph is a cube map, {kind}{columns} x {rows} faces: convert it to equirectangular, "
+                "twice as wide as high"
+            )
+    return None
+
+
+def _is_cross(cells: Float[np.ndarray, "r c s s 3"]) -> bool:
+    """Return whether cells are a cross: a band of four faces, one above and one below it, and empty cells."""
+    rows, columns = cells.shape[:2]
+    values = cells.reshape(rows, columns, -1, 3)
+    is_empty = values.std(axis=2).max(axis=-1) < _MAX_SPREAD
+    empty = values.mean(axis=2)[is_empty]
+    if len(empty) != 6 or np.ptp(empty, axis=0).max() > _MAX_DIFFERENCE:
+        return False
+    if rows == 3:
+        return not is_empty[1].any() and bool((is_empty[0] == is_empty[2]).all())
+    return not (is_empty[:, 1].any() or is_empty[1].any())
+
+
+def _is_cube(cells: Float[np.ndarray, "r c s s 3"]) -> bool:
+    """Return whether the edges of six faces continue each other, and not only those of neighbours in the picture."""
+    rows, columns = cells.shape[:2]
+    faces = cells.reshape(6, _FACE, _FACE, 3)
+    # Left, right, top and bottom edge of each face, and the line beside it.
+    edges, beside = (
+        np.stack([faces[:, :, a], faces[:, :, b], faces[:, a], faces[:, b]], axis=1).reshape(24, _FACE, 3)
+        for a, b in ((0, -1), (1, -2))
+    )
+    steps = np.abs(edges - beside).mean(axis=(1, 2))
+    differences = (np.abs(edges[:, None] - other).mean(axis=(2, 3)) for other in (edges, edges[:, ::-1]))
+    ratio = np.minimum(*differences) / (np.minimum(steps[:, None], steps) + 1.0)
+    ratio[np.kron(np.eye(6, dtype=bool), np.ones((4, 4), bool))] = np.inf
+    index = np.arange(6).reshape(rows, columns)
+    across = zip(index[:, :-1].ravel() * 4 + 1, index[:, 1:].ravel() * 4, strict=True)
+    down = zip(index[:-1].ravel() * 4 + 3, index[1:].ravel() * 4 + 2, strict=True)
+    broken = np.mean([ratio[pair] > _BROKEN for pair in (*across, *down)])
+    return bool(broken >= _MIN_BROKEN and np.mean(ratio.min(axis=1) < _CONTINUED) >= _MIN_CONTINUED)
+
+
+_DETECTORS: tuple[Callable[[Thumbnail], SphereFormat | None], ...] = (
+    _find_sideways,
+    _find_circles,
+    _find_stereo,
+    _find_bars,
+    _find_cube,
+)
