@@ -41,7 +41,15 @@ from lalaloc_core.photograph.picture_files import (
     opened_picture,
     scaled,
 )
-from lalaloc_core.photograph.projection import COARSEST, Lens, Projection, Source, find_lens, is_closed
+from lalaloc_core.photograph.projection import (
+    COARSEST,
+    Lens,
+    Projection,
+    Source,
+    find_lens,
+    is_closed,
+    is_twice_as_wide,
+)
 from lalaloc_core.photograph.sphere_formats import (
     THUMBNAIL_SIDE,
     SphereFormat,
@@ -217,7 +225,7 @@ def open_photograph(
         if found is not None and found.box is not None:
             opened = opened.taken_out(found)
             lens = Lens(projection="equirectangular", projection_source="estimated")
-        elif found is not None and stated.projection == AUTO:
+        elif found is not None and (stated.projection == AUTO or not is_twice_as_wide(opened.width, opened.height)):
             raise InvalidPhotographError(found.text)
         else:
             lens = opened.lens()

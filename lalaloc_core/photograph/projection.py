@@ -120,7 +120,7 @@ def find_lens(
     if stated.intrinsics is not None and projection in ("perspective", "fisheye"):
         intrinsics, warnings = fit_intrinsics(stated.intrinsics, width, height, orientation)
         return known(camera_of_intrinsics(projection, width, height, intrinsics), "given", warnings)
-    is_full = projection == "equirectangular" and _is_twice_as_wide(width, height) and stated.hfov_deg == 360.0
+    is_full = projection == "equirectangular" and is_twice_as_wide(width, height) and stated.hfov_deg == 360.0
     if stated.hfov_deg is not None and not is_full:
         return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
     if projection == "equirectangular":
@@ -170,7 +170,8 @@ def is_closed(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
     return float(np.abs(values[:, 0] - values[:, -1]).mean()) / (step + 0.5) < _MAX_CLOSED_SEAM
 
 
-def _is_twice_as_wide(width: int, height: int) -> bool:
+def is_twice_as_wide(width: int, height: int) -> bool:
+    """Return whether a picture has the sides of a full sphere."""
     return abs(width / height - 2.0) <= 2.0 * _SPHERE_TOLERANCE
 
 
@@ -185,7 +186,7 @@ def _projection(
     if stated.projection != AUTO:
         return stated.projection, "given"  # pyright: ignore[reportReturnType]
     if sphere.declared:
-        if sphere.fault is not None and _is_twice_as_wide(width, height) and not looks_spherical():
+        if sphere.fault is not None and is_twice_as_wide(width, height) and not looks_spherical():
             raise InvalidPhotographError(
                 f"the photograph of {width} x {height} has invalid photo sphere metadata, {sphere.fault}, and is not a "
                 f"full 360° sphere; {_HELP}"
@@ -196,7 +197,7 @@ def _projection(
     if stated.intrinsics is not None:
         return "perspective", "assumed"
     hfov = TWO_PI if stated.hfov_deg is None else math.radians(stated.hfov_deg)
-    twice_as_wide = _is_twice_as_wide(width, height)
+    twice_as_wide = is_twice_as_wide(width, height)
     if twice_as_wide and hfov == TWO_PI and looks_spherical():
         return "equirectangular", "estimated"
     if exif.fisheye is not None and not exif.strip and not twice_as_wide:

@@ -32,9 +32,9 @@ _CIRCLE = 64
 _RING, _CORNERS = (0.8, 0.93), 1.12
 _DARK, _MIN_STEP, _MIN_DARK_SHARE = 40.0, 25.0, 0.97
 _SECTORS = 8
-# Cube maps: rows and columns of their faces, and side (pixels) of judged faces.
+# Cube maps: rows and columns of their faces, and side (pixels) of judged cells of crosses and faces of others.
 _CROSSES, _GRIDS = ((3, 4), (4, 3)), ((2, 3), (3, 2), (1, 6), (6, 1))
-_FACE = 64
+_CELL, _FACE = 18, 42
 # Empty cells of a cross: largest spread of grey levels, and difference between cells.
 _MAX_SPREAD, _MAX_DIFFERENCE = 5.0, 10.0
 # Edges of faces: ratio of the difference across a border to that between lines next to it, up to which they continue
@@ -135,7 +135,7 @@ def _is_circle(square: UInt8[np.ndarray, "h w"]) -> bool:
     if np.mean(corners < _DARK) < _MIN_DARK_SHARE or corners.std() > 0.3 * _DARK:
         return False
     bright = [np.median(grey[ring == sector]) > corners.mean() + _MIN_STEP for sector in range(_SECTORS)]
-    return sum(bright) >= _SECTORS - 1
+    return bool(sum(bright) >= _SECTORS - 1)
 
 
 @cache
@@ -189,8 +189,7 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a sphere within bars of one colour."""
     pixels = thumbnail.pixels
     height, width = pixels.shape[:2]
-    top, bottom = _bars(pixels)
-    left, right = _bars(pixels.transpose(1, 0, 2))
+    (top, bottom), (left, right) = _bars(pixels), _bars(pixels.transpose(1, 0, 2))
     if (bottom - top) * (right - left) > (1.0 - _MIN_BARS) * height * width or min(bottom - top, right - left) < 16:
         return None
     # The bars are equal and the sphere twice as wide as high, which is more exact than the judged pixels.
@@ -213,13 +212,13 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
 
 def _bars(pixels: UInt8[np.ndarray, "n m 3"]) -> tuple[int, int]:
     """Return the first row and the end of the rows between bars of one colour at the top and bottom."""
-    ends = pixels[[0, -1]].astype(np.float32)
-    colour = ends.mean(axis=(0, 1))
-    if ends.std(axis=1).max() >= _MAX_BAR_SPREAD or np.abs(ends.mean(axis=1) - colour).max() >= 2.0 * _MAX_BAR_SPREAD:
+    mean, spread = cv2.meanStdDev(np.ascontiguousarray(pixels[[0, -1]]))
+    if spread.max() > 2.0 * _MAX_BAR_SPREAD:
         return 0, len(pixels)
-    values = pixels.astype(np.float32)
-    is_bar = values.std(axis=1).max(axis=1) < _MAX_BAR_SPREAD
-    is_bar &= np.abs(values.mean(axis=1) - colour).max(axis=1) < 2.0 * _MAX_BAR_SPREAD
+    totals = (cv2.reduce(pixels, 1, kind, dtype=cv2.CV_64F)[:, 0] for kind in (cv2.REDUCE_SUM, cv2.REDUCE_SUM2))
+    means, squares = (total / pixels.shape[1] for total in totals)
+    is_bar = (squares - means**2).max(axis=1) < _MAX_BAR_SPREAD**2
+    is_bar &= np.abs(means - mean[:, 0]).max(axis=1) < 2.0 * _MAX_BAR_SPREAD
     if is_bar.all():
         return 0, len(pixels)
     return int(np.argmin(is_bar)), len(pixels) - int(np.argmin(is_bar[::-1]))
@@ -231,11 +230,12 @@ def _find_cube(thumbnail: Thumbnail) -> SphereFormat | None:
     for rows, columns in (*_CROSSES, *_GRIDS):
         if abs(width * rows - height * columns) > max(_TOLERANCE * width * rows, float(rows + columns)):
             continue
-        size = columns * _FACE, rows * _FACE
-        even = cv2.resize(thumbnail.pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        cells = even.reshape(rows, _FACE, columns, _FACE, 3).transpose(0, 2, 1, 3, 4)
-        if (_is_cross if (rows, columns) in _CROSSES else _is_cube)(cells):
-            kind = "a cross of " if (rows, columns) in _CROSSES else ""
+        is_cross = (rows, columns) in _CROSSES
+        side = _CELL if is_cross else _FACE
+        even = cv2.resize(thumbnail.pixels, (columns * side, rows * side), interpolation=cv2.INTER_AREA)
+        cells = even.astype(np.float32).reshape(rows, side, columns, side, 3).transpose(0, 2, 1, 3, 4)
+        if (_is_cross if is_cross else _is_cube)(cells):
+            kind = "a cross of " if is_cross else ""
             return SphereFormat(
                 text=f"the photograph is a cube map, {kind}{columns} x {rows} faces: convert it to equirectangular, "
                 "twice as wide as high"
@@ -266,14 +266,21 @@ def _is_cube(cells: Float[np.ndarray, "r c s s 3"]) -> bool:
         for a, b in ((0, -1), (1, -2))
     )
     steps = np.abs(edges - beside).mean(axis=(1, 2))
-    differences = (np.abs(edges[:, None] - other).mean(axis=(2, 3)) for other in (edges, edges[:, ::-1]))
-    ratio = np.minimum(*differences) / (np.minimum(steps[:, None], steps) + 1.0)
-    ratio[np.kron(np.eye(6, dtype=bool), np.ones((4, 4), bool))] = np.inf
-    index = np.arange(6).reshape(rows, columns)
-    across = zip(index[:, :-1].ravel() * 4 + 1, index[:, 1:].ravel() * 4, strict=True)
-    down = zip(index[:-1].ravel() * 4 + 3, index[1:].ravel() * 4 + 2, strict=True)
-    broken = np.mean([ratio[pair] > _BROKEN for pair in (*across, *down)])
-    return bool(broken >= _MIN_BROKEN and np.mean(ratio.min(axis=1) < _CONTINUED) >= _MIN_CONTINUED)
+
+    def ratio(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return the difference of edges, in the direction that fits better, relative to that of lines next to them."""
+        ways = (np.abs(edges[first] - other[second]).mean(axis=(-2, -1)) for other in (edges, edges[:, ::-1]))
+        return np.minimum(*ways) / (np.minimum(steps[first], steps[second]) + 1.0)
+
+    index = 4 * np.arange(6).reshape(rows, columns)
+    before = np.concatenate([index[:, :-1].ravel() + 1, index[:-1].ravel() + 3])
+    after = np.concatenate([index[:, 1:].ravel(), index[1:].ravel() + 2])
+    if np.mean(ratio(before, after) > _BROKEN) < _MIN_BROKEN:
+        return False
+    every = np.arange(24)
+    ratios = ratio(every[:, None], every[None])
+    ratios[every[:, None] // 4 == every // 4] = np.inf
+    return bool(np.mean(ratios.min(axis=1) < _CONTINUED) >= _MIN_CONTINUED)
 
 
 _DETECTORS: tuple[Callable[[Thumbnail], SphereFormat | None], ...] = (
