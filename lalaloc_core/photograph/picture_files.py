@@ -213,7 +213,8 @@ def scaled(file: PictureFile, size: tuple[int, int], *, oversampling: int = 2) -
 def _scaled_part(file: PictureFile, size: tuple[int, int]) -> Image.Image:
     left, top, right, bottom = file.box
     width, height = turned(file.size, file.orientation)
-    finest = math.ceil(size[0] / (right - left)), math.ceil(size[1] / (bottom - top))
+    # Finer, because the borders of the part lie between pixels.
+    finest = math.ceil(2.0 * size[0] / (right - left)), math.ceil(2.0 * size[1] / (bottom - top))
     picture = scaled(replace(file, box=_WHOLE), (min(width, finest[0]), min(height, finest[1])))
     pixels = left * picture.width, top * picture.height, right * picture.width, bottom * picture.height
     return picture.resize(size, Image.Resampling.BOX, box=pixels)

@@ -142,8 +142,8 @@ def test_all_detectors_together_take_two_milliseconds(ratio: tuple[int, int]) ->
         begin = process_time()
         assert find_sphere_format(Thumbnail(pixels)) is None
         times_s.append(process_time() - begin)
-    # Twice the limit: tests share their cores.
-    assert min(times_s) < 4e-3
+    # 2 ms on an idle core without type checks of arguments, which tests have.
+    assert min(times_s) < 8e-3
 
 
 @pytest.mark.parametrize("name", NAMES)
