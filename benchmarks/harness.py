@@ -113,9 +113,9 @@ def upload_example_plan(url: str) -> str:
 
 
 def query_of(pose: TruePose, **target: str) -> dict[str, Any]:
-    """Return the form of a query with an example panorama and its heading, as arguments of `httpx.post`."""
+    """Return the form of a query with an example photograph and its heading, as arguments of `httpx.post`."""
     fields = {**target, "heading_deg": f"{pose.heading_deg}", "camera_height_m": f"{pose.camera_height_m}"}
-    return {"data": fields, "files": {"panorama": (pose.file, pose.picture.read_bytes())}}
+    return {"data": fields, "files": {"photo": (pose.file, pose.picture.read_bytes())}}
 
 
 @dataclass(frozen=True)
@@ -214,10 +214,10 @@ def form(fields: tuple[tuple[str, str], ...], files: tuple[tuple[str, bytes], ..
 
 
 def example_query(number: int, plan_id: str) -> tuple[bytes, str]:
-    """Return the query with an example panorama, its heading and its camera height, as body and media type."""
+    """Return the query with an example photograph, its heading and its camera height, as body and media type."""
     poses = read_poses()
     query = query_of(poses[number % len(poses)], floorplan_id=plan_id)
-    return form(tuple(query["data"].items()), (("panorama", query["files"]["panorama"][1]),))
+    return form(tuple(query["data"].items()), (("photo", query["files"]["photo"][1]),))
 
 
 @dataclass(frozen=True)

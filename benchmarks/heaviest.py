@@ -26,8 +26,8 @@ from lalaloc_core.importers import EXPORT_FORMATS, ImportLimits, export_plan
 
 # Plans with the most vertices, and with the most rooms and openings, that are accepted by default.
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
-# Panoramas of a sequence and of a batch.
-_PANORAMAS = 10
+# Photographs of a sequence and of a batch.
+_PHOTOGRAPHS = 10
 _ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "north_deg": 25.0}
 
 
@@ -132,7 +132,7 @@ def _venue(plan_ids: Sequence[str], name: str = "venue") -> bytes:
 
 
 @cache
-def _panorama() -> bytes:
+def _sphere() -> bytes:
     return read_poses()[0].picture.read_bytes()
 
 
@@ -175,9 +175,9 @@ def _scans(count: int) -> bytes:
 
 @cache
 def _padded_picture(size: int) -> bytes:
-    """Return the example panorama with comments of some bytes in total."""
+    """Return the example photograph with comments of some bytes in total."""
     comment = b"\xff\xfe\xff\xff" + bytes(2**16 - 3)
-    picture = _panorama()
+    picture = _sphere()
     return picture[:2] + comment * max(size // len(comment), 0) + picture[2:]
 
 
@@ -227,12 +227,12 @@ def _follow_events(caller: Caller, _stored: Stored, size: int) -> None:
         caller.send("GET", f"/floorplans/{answer.json()['id']}/events")
 
 
-def _localise(picture: Callable[[int], bytes] = lambda _size: _panorama(), **fields: str) -> Work:
+def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **fields: str) -> Work:
     """Return the work of a query; without a heading, so that all are searched."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
         values = {name: value.format(plan=stored.plan_id, venue=stored.venue_id) for name, value in fields.items()}
-        caller.send("POST", "/localise", *form(tuple(values.items()), (("panorama", picture(size)),)))
+        caller.send("POST", "/localise", *form(tuple(values.items()), (("photo", picture(size)),)))
 
     return work
 
@@ -241,7 +241,7 @@ def _sequence(*, padded: bool, venue: bool = False) -> Work:
     """Return the work of a sequence in a plan or venue, `padded` to `size` tenths of a megabyte in total."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
-        files = _PANORAMAS * (("panorama", _padded_picture(size * 10**5 // _PANORAMAS if padded else 0)),)
+        files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS if padded else 0)),)
         place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
         caller.send("POST", "/localise/sequence", *form((place, ("motion", "turn")), files))
 
@@ -250,7 +250,7 @@ def _sequence(*, padded: bool, venue: bool = False) -> Work:
 
 def _batch(caller: Caller, stored: Stored, _size: int) -> None:
     # More photographs take longer, but no more at a time.
-    files = _PANORAMAS * (("photo", _panorama()),)
+    files = _PHOTOGRAPHS * (("photo", _sphere()),)
     caller.send("POST", "/localise/batch", *form((("floorplan_id", stored.plan_id),), files))
 
 
@@ -314,7 +314,7 @@ def _change_and_search_venue(caller: Caller, stored: Stored, size: int) -> None:
 
 def _read_and_delete_answer(caller: Caller, stored: Stored, _size: int) -> None:
     fields = (("floorplan_id", stored.plan_id), ("include", "posterior"))
-    answer = caller.send("POST", "/localise", *form(fields, (("panorama", _panorama()),)))
+    answer = caller.send("POST", "/localise", *form(fields, (("photo", _sphere()),)))
     if answer.status == 200:
         path = f"/answers/{answer.json()['answer_id']}"
         caller.send("GET", path)
@@ -328,7 +328,7 @@ def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool =
         path = f"/sessions/{answer.json()['id']}"
         sphere = (("projection", "equirectangular"),)
         for fields in (sphere, (*sphere, ("forward_m", "1"), ("turn_deg", "0"))):
-            caller.send("POST", f"{path}/photographs", *form(fields, (("panorama", _panorama()),)))
+            caller.send("POST", f"{path}/photographs", *form(fields, (("photo", _sphere()),)))
         caller.send("GET", path)
         caller.send("DELETE", path)
 
@@ -338,9 +338,9 @@ def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
     if answer.status != 201:
         return
     album = f"/albums/{answer.json()['id']}"
-    for first in range(0, size, _PANORAMAS):
+    for first in range(0, size, _PHOTOGRAPHS):
         # Bytes after the picture make it another one.
-        files = (("photo", _panorama() + str(first + number).encode()) for number in range(_PANORAMAS))
+        files = (("photo", _sphere() + str(first + number).encode()) for number in range(_PHOTOGRAPHS))
         caller.send("POST", f"{album}/photographs", *form((), tuple(files)))
     caller.send("GET", f"{album}/events")
     caller.send("GET", album)
@@ -458,12 +458,12 @@ LOADS = (
         98_000,
     ),
     Load(("POST /localise",), "JPEG of 400 scans", _localise(_scans, floorplan_id="{plan}"), 400, refusals=_TOO_LONG),
-    Load(("POST /localise/batch",), f"10 panoramas, {VERTICES_PLAN}", _batch),
-    Load(("POST /localise/sequence",), f"10 panoramas, {VERTICES_PLAN}", _sequence(padded=False)),
-    Load(("POST /localise/sequence",), "10 panoramas, {homes} homes", _sequence(padded=False, venue=True)),
+    Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
+    Load(("POST /localise/sequence",), f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
+    Load(("POST /localise/sequence",), "10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
     Load(
         ("POST /localise/sequence",),
-        "10 panoramas of {sequence_mb} MB in total",
+        "10 photographs of {sequence_mb} MB in total",
         _sequence(padded=True),
         1_000,
         connections=44,
