@@ -102,7 +102,7 @@ SERVICE_LAYERS = (
     "telemetry",
     "capacity",
     # Programs of worker processes, which do not import their supervisors.
-    "workers plan_files.plan_description plan_files.plan_mesh",
+    "workers plan_files.plan_mesh",
     "decoding.decode_worker plan_files.renditions",
     "plan_files.convert_worker",
     "pools storage",

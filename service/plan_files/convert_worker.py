@@ -189,7 +189,7 @@ def _imported(imported: ImportedPlan, job: ImportJob, limits: ImportLimits) -> I
     description = None
     if len(document.document) > LARGE:
         # Imported late for the same reason.
-        from service.plan_files.plan_description import describe_content
+        from service.plan_files.renditions import describe_content
 
         description = describe_content(plan, report, job.step_m)
     media_type = detect_media_type(job.content, imported.report.format)

@@ -4,8 +4,8 @@ Begin with `single_query.py`, whose `_search` shows the flow: photograph, ground
 does the same for several photographs and `session_query.py` for the next photograph of a session, `album_search.py` for
 albums; `localiser.py` calls them. `photograph_reader.py` decodes and encodes photographs. `grounds.py` waits for the
 plan or venue of a query and returns its `ground.py`. `executor.py` runs the steps, `lpo_pool.py` the refinement in
-worker processes; the core composes the answer, and `answers.py` names its stored plans. `stated_pose.py` reads the
-fields about the camera, `geopose.py` translates answers. `queries.py` has the queries.
+worker processes; the core composes the answer, and `answers.py` names its stored plans, and `geopose.py` translates
+answers. `queries.py` has the queries.
 """
 
 from service.capacity.query_context import QueryContext
@@ -30,5 +30,5 @@ from service.query.queries import (
     TrackQuery,
     Where,
 )
-from service.query.query_parts import QueryParts
 from service.query.session_query import MAX_POSES
+from service.query.single_query import QueryParts

@@ -26,7 +26,7 @@ from service.capacity.threads import Threads
 from service.query.album_answers import compose_outcome
 from service.query.ground import Ground
 from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery, Where
-from service.query.query_parts import QueryParts
+from service.query.single_query import QueryParts
 from service.schemas.albums import AlbumDocument, PhotographFacts
 from service.storage.album_jobs import AlbumPart
 from service.storage.records import PlanRecord, VenueRecord

@@ -1,4 +1,4 @@
-"""Grounds of queries: the plan or the venue that a query is about, waited for and loaded."""
+"""Grounds of queries: the plan or the venue that a query is about, what is stated of it, waited for and loaded."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ from time import monotonic
 import numpy as np
 
 from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.errors import InvalidHintError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise import query
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Query
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Hints, Near, Query, rooms_named
 from service.capacity.admission_control import Slots
 from service.capacity.query_context import QueryContext
 from service.capacity.threads import BoundedReads
 from service.errors import PlanFailedError, PlanNotReadyError, VenueUnsearchableError
-from service.grids import GridProvider, grid_height_m
+from service.grids import GridProvider, check_height_m, grid_height_m
 from service.query.executor import Executor
 from service.query.ground import Ground
-from service.query.stated_pose import stated_height, stated_hints
 from service.schemas import SessionDocument
-from service.schemas.query_fields import HeightFields, HintFields
+from service.schemas.query_fields import EarthPoint, HeightFields, HintFields, PlanPoint
 from service.storage.records import PlanRecord, VenueRecord
 from service.venues.plan_list import PlanList
 from service.venues.venue_hints import VenueHints
@@ -230,3 +232,30 @@ def _spread(encoded: Sequence[Query]) -> list[Query]:
     """Return photographs at even intervals, few enough to choose plans by each."""
     index = np.unique(np.linspace(0, len(encoded) - 1, _CHOOSING).round().astype(int))
     return [encoded[int(number)] for number in index]
+
+
+def stated_height(form: HeightFields, record: PlanRecord) -> CameraHeight:
+    """Return the camera height in the request, else the plan's, else an unknown one."""
+    if form.camera_height_m is not None:
+        check_height_m(record, form.camera_height_m)
+    return query.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
+
+
+def stated_hints(form: HintFields | SessionDocument, plan: FloorPlan) -> Hints:
+    """Return the hints of a request, before `Hints.check`."""
+    near = None
+    if form.near is not None and form.radius_m is not None:
+        near = _near_in_plan(form.near, form.radius_m, plan)
+    rooms = None if form.rooms is None else rooms_named(plan, form.rooms)
+    return Hints(near=near, rooms=rooms, strict=isinstance(form, HintFields) and form.strict)
+
+
+def _near_in_plan(point: PlanPoint | EarthPoint, radius_m: float, plan: FloorPlan) -> Near:
+    if isinstance(point, PlanPoint):
+        return Near(point.x_m, point.y_m, radius_m)
+    if plan.anchor is None:
+        raise InvalidHintError(
+            "near", f"{point} cannot be placed, because the plan has no anchor: give x_m and y_m, or add an anchor"
+        )
+    ((x_m, y_m),) = plan.anchor.to_plan(np.array([[point.longitude, point.latitude]]))
+    return Near(float(x_m), float(y_m), radius_m, str(point))

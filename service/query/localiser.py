@@ -19,10 +19,9 @@ from service.query.queries import (
     TrackQuery,
     Where,
 )
-from service.query.query_parts import QueryParts
 from service.query.sequence_query import SequenceSearch
 from service.query.session_query import SessionSearch
-from service.query.single_query import SingleSearch
+from service.query.single_query import QueryParts, SingleSearch
 from service.schemas import ModelAnswer
 from service.schemas.query_fields import HeightFields
 

@@ -11,8 +11,7 @@ from lalaloc_core.photograph.film import Film
 from service.query.answers import sequence_answer
 from service.query.grounds import Site
 from service.query.queries import SequenceQuery
-from service.query.query_parts import QueryParts
-from service.query.single_query import VENUE_CONFIG
+from service.query.single_query import VENUE_CONFIG, QueryParts
 from service.schemas import SequenceAnswer
 from service.storage.records import PlanRecord, VenueRecord
 

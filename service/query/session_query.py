@@ -25,7 +25,7 @@ from service.query.geopose import geopose_at
 from service.query.ground import Ground
 from service.query.grounds import VenueSite
 from service.query.queries import TrackOutcome, TrackQuery
-from service.query.query_parts import QueryParts
+from service.query.single_query import QueryParts
 from service.schemas import PathPoint, PhotographForm, StoredPose, TimingsAnswer, TrackedPoseAnswer
 from service.storage.records import PlanRecord, VenueRecord
 

@@ -4,18 +4,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
 from lalaloc_core.localise.answers.compose import compose_answer
 from lalaloc_core.localise.answers.documents import Answer, Spot
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.photograph import Photograph
+from service.decoding.decoder import Decoder
 from service.query.answers import localise_answer, posterior_answer
-from service.query.executor import finish_with
+from service.query.executor import Executor, finish_with
 from service.query.ground import Ground
+from service.query.grounds import Grounds
+from service.query.photograph_reader import PhotographReader
 from service.query.queries import PhotographQuery, PictureQuery, Where
-from service.query.query_parts import QueryParts
 from service.schemas import LocaliseAnswer
 from service.storage.records import PlanRecord
+
+
+@dataclass(frozen=True, kw_only=True)
+class QueryParts:
+    """Parts that single photographs, sequences and sessions share."""
+
+    bundle: Bundle
+    encoder: PhotographEncoder
+    decoder: Decoder
+    reader: PhotographReader
+    grounds: Grounds
+    executor: Executor
+
 
 # Among many plans the right one often ranks low before refinement, so refine more candidates than in a single plan.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)

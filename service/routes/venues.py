@@ -36,8 +36,7 @@ from service.routes.descriptions import (
     import_lines,
     json_body,
 )
-from service.routes.import_lines import answer_import
-from service.routes.plan_uploads import LEVELS_FORM, PlanUpload, prepare_levels, read_upload
+from service.routes.plan_uploads import LEVELS_FORM, PlanUpload, answer_import, prepare_levels, read_upload
 from service.schemas.plan_import import LevelsForm
 from service.schemas.venues import (
     VenueAnchorAnswer,
