@@ -47,9 +47,7 @@ _DESCRIPTION = (
 def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACKENDS) -> FastAPI:
     """Create an application.
 
-    Args:
-        settings: settings of the service. Default: read from the environment at start-up.
-        backends: builders of the components that can run in other processes.
+    Without settings, those in the environment are read at start-up.
     """
     telemetry = Telemetry()
     # Exported as 0 from the start, so that the first one shows as an increase.

@@ -101,13 +101,8 @@ def start_runtime(
 ) -> Runtime:
     """Open the store, load the model, start the worker processes, and queue unfinished pose grids.
 
-    Blocks while the model loads; workers start in the background.
-
-    Args:
-        settings: settings of the service.
-        telemetry: metrics and tracing.
-        cleanup: closes the components, also if the start fails.
-        backends: builders of the components that can run in other processes.
+    Blocks while the model loads; workers start in the background. `cleanup` closes the components, also if the start
+    fails.
     """
     cleanup.callback(sys.setswitchinterval, sys.getswitchinterval())
     sys.setswitchinterval(_SWITCH_INTERVAL_S)

@@ -84,14 +84,7 @@ class GridState:
 
     @classmethod
     def of_stored(cls, failure: str | None, poses: int | None, remote: float | None, job: GridJob | None) -> Self:
-        """Return the state of a stored plan.
-
-        Args:
-            failure: error of the last computation.
-            poses: number of poses of the stored grid.
-            remote: progress of another replica.
-            job: job of this replica.
-        """
+        """Return the state of a stored plan."""
         if poses is not None:
             return cls("ready", 1.0, poses)
         if failure is not None and job is None:

@@ -69,14 +69,8 @@ class EventStream(StreamingResponse):
 class ProgressEvents(Generic[EventT]):
     """Event streams about the progress of stored resources of one kind; for one event loop.
 
-    Args:
-        look: reads the state of resources, by id; deleted ones are left out.
-        deleted: event of a deleted one.
-        final: states after which a stream ends.
-        admission: slots of the app; streams end when the service stops.
-        reads: threads for reading the store.
-        max_s: timeout of a stream.
-        heartbeat_s: interval of comments on an idle stream, and of checks that its caller is still authorised.
+    `look` reads the state of resources by id, and leaves deleted ones out. A stream ends after a `final` state, `max_s`
+    (s), or when the service stops; at every heartbeat its caller is checked.
     """
 
     def __init__(

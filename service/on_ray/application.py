@@ -47,11 +47,7 @@ class RayOptions(BaseModel):
 
 
 def app(arguments: dict[str, str]) -> serve.Application:
-    """Build the application from the settings in the environment.
-
-    Args:
-        arguments: arguments of `serve run`, see `RayOptions`.
-    """
+    """Build the application from the settings in the environment."""
     try:
         options = RayOptions.model_validate(arguments)
     except ValidationError as error:

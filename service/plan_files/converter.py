@@ -85,13 +85,8 @@ class Converter:
     ) -> tuple[Imported, ...]:
         """Import a plan file. Blocks for up to twice `max_import_s`.
 
-        Args:
-            content: the file.
-            options: options of the import.
-            client: client of the upload.
-            every_level: return the plans of all levels, lowest first.
-            building: name for plans that have none, and for those of several levels, see `import_plans`.
-            on_step: called with steps of the import as they begin, on another thread; returns at once.
+        `building` names plans that have no name, and those of several levels. `on_step` is called with steps of the
+        import as they begin, on another thread, and returns at once.
 
         Raises:
             InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.

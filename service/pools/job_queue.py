@@ -91,11 +91,8 @@ class JobQueue:
     ) -> None:
         """Create an empty queue.
 
-        Args:
-            limit: maximum number of waiting jobs, besides the running ones.
-            served_by: tells whether a worker is expected to be warm at a time (`monotonic`).
-            accounts: CPU time of the clients; jobs are charged to theirs.
-            workers: shares of the clients in the workers; None lets a client use all of them.
+        `served_by` tells whether a worker is expected to be warm at a time (`monotonic`); without shares in the
+        `workers`, a client can use all of them.
         """
         self.accounts = accounts
         self._served_by = served_by

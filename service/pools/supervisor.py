@@ -66,11 +66,7 @@ class Supervisor:
     def __init__(self, spec: WorkerSpec, index: int, queue: JobQueue, on_restart: Callable[[str], None]) -> None:
         """Create a supervisor, which `start` starts.
 
-        Args:
-            spec: program of the worker.
-            index: number of the worker in its pool.
-            queue: source of jobs; closing it ends the thread after its current job.
-            on_restart: called with the reason whenever the worker is replaced.
+        Closing the queue ends the thread after its current job.
         """
         self.ready = False
         self.warmed_up = False

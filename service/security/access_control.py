@@ -258,8 +258,7 @@ _CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 def is_local(server: tuple[str, int | None] | None) -> bool:
     """Return True if only this machine can reach the server's local address.
 
-    Args:
-        server: local address: host and port, or path and None; None for a Unix socket.
+    The address is host and port, or path and None; it is None for a Unix socket.
     """
     if server is None or server[1] is None:
         return True
@@ -290,12 +289,8 @@ def check_origin(
 ) -> None:
     """Refuse requests that a page of another site makes a browser send.
 
-    Args:
-        method: HTTP method.
-        hosts: values of `Host`, which browsers always send.
-        origins: values of `Origin`, which browsers send with changes.
-        allowed: allowed host names besides this machine's, `*` for any.
-        pages: allowed origins.
+    Hosts are `allowed` besides those of this machine (`*`: any), and origins if they are of the `pages`. Browsers send
+    `Host` always, and `Origin` with changes.
     """
     for host in hosts:
         if not is_allowed_host(host, allowed):
@@ -309,9 +304,7 @@ def check_origin(
 def check_address(host: str, settings: Settings) -> None:
     """Refuse to listen on a public address without keys.
 
-    Args:
-        host: numeric address to listen on; `published_on` in the settings takes precedence.
-        settings: settings of the service.
+    `published_on` in the settings takes precedence over the numeric address to listen on.
     """
     reached = settings.access.published_host or host
     if not settings.access.api_keys and not settings.access.allow_anonymous and not is_local((reached, 0)):

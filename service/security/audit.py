@@ -69,11 +69,7 @@ def entry_of(
 ) -> AuditEntry:
     """Return the entry of a request that was answered.
 
-    Args:
-        scope: the request.
-        status: status of the answer.
-        caller: the caller; None for a request that was refused.
-        location: path of the created resource.
+    Requests that were refused have no caller; the location is that of a created resource.
     """
     fields = log_fields_of(scope)
     path = routed_path(scope)
@@ -101,11 +97,7 @@ def _result(status: int, rejection: str | None) -> str:
 
 
 class AuditTrail:
-    """Writer of the entries of one replica.
-
-    Args:
-        log: the stored log.
-    """
+    """Writer of the entries of one replica."""
 
     def __init__(self, log: AuditLog) -> None:
         self._log = log

@@ -93,10 +93,7 @@ class _CachedKey:
 class KeyCache:
     """Look-up of keys.
 
-    Args:
-        keys: stored keys.
-        fresh_s: lifetime of a cached key; a revoked key is rejected after this delay.
-        clock: current time, seconds.
+    A revoked key is rejected after `fresh_s` (s).
     """
 
     def __init__(self, keys: ApiKeys, *, fresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:

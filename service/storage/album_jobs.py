@@ -61,13 +61,7 @@ class AlbumJobs:
         self._database = database
 
     def due(self, model_sha256: str, tenants: Collection[str], limit: int) -> list[tuple[str, str]]:
-        """Return tenant and id of albums that no replica solves, at most one per tenant.
-
-        Args:
-            model_sha256: digest of the running model.
-            tenants: tenants to leave out.
-            limit: maximum number of albums.
-        """
+        """Return tenant and id of albums that no replica solves, at most one per tenant."""
         columns = ALBUMS.c
         live = self._database.is_live(columns.lease_until_s, columns.lease_s)
         first = func.row_number().over(partition_by=columns.tenant, order_by=(columns.updated_at, columns.id))

@@ -144,10 +144,7 @@ class Albums:
     def photographs(self, album_id: str, *, limit: int, after: int = 0) -> list[PhotographRecord]:
         """Return photographs by number, regardless of tenant. Callers check access first.
 
-        Args:
-            album_id: id of the album.
-            limit: maximum number of photographs.
-            after: number of the last photograph of the previous page.
+        `after` is the number of the last photograph of the previous page.
         """
         own = ALBUM_PHOTOGRAPHS.c.album_id == album_id, ALBUM_PHOTOGRAPHS.c.number > after
         with self._database.reading() as connection:
@@ -175,12 +172,7 @@ class Albums:
     ) -> tuple[PhotographRecord, bool]:
         """Add a photograph to an album, unless it has the same picture already.
 
-        Args:
-            tenant: owner of the album.
-            album_id: id of the album.
-            new: the photograph.
-            ttl_s: lifetime (s) of the album after this change.
-            limit: maximum number of photographs.
+        The album then lives for `ttl_s` (s).
 
         Returns:
             the photograph, and True if it was added.

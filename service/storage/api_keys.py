@@ -50,10 +50,7 @@ class ApiKeys:
     def rotate(self, key_id: str, key_hash: str, *, overlap: timedelta) -> ApiKey | None:
         """Store a successor with the same tenant, name, scopes, rate and lifetime.
 
-        Args:
-            key_id: id of the key that is replaced; it expires after the overlap, unless it does so before.
-            key_hash: hash of the successor's secret.
-            overlap: time for which both keys are valid.
+        Both keys are valid for the overlap, unless the replaced one expires before.
 
         Returns:
             the successor; None if the key does not exist, was revoked or has expired.
@@ -157,9 +154,7 @@ class Tenants:
     def change_limits(self, tenant: str, **limits: float | None) -> OperatorLimits:
         """Change limits of a tenant, and return all of them.
 
-        Args:
-            tenant: the tenant; it need not have stored anything yet.
-            limits: new values by the names of `OperatorLimits`; None for the limit in the settings. Others stay.
+        The tenant need not have stored anything yet; None sets the limit in the settings, and others stay.
         """
         values = {_LIMITS[name].name: value for name, value in limits.items()}
         statement = self._database.insert(TENANTS).values(tenant=tenant, **values)

@@ -24,10 +24,7 @@ _ANONYMOUS_SHARE = 0.1
 class AuditLog:
     """Entries of all tenants.
 
-    Args:
-        database: the database.
-        keep_s: time (s) after which entries are deleted.
-        max_entries: number of entries beyond which the oldest are deleted.
+    They are deleted after `keep_s` (s), and the oldest beyond `max_entries`.
     """
 
     def __init__(self, database: Database, *, keep_s: float, max_entries: int) -> None:

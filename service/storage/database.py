@@ -119,8 +119,7 @@ class Database:
     def writing(self, *, grows_by: int = 0) -> Iterator[Connection]:
         """Run a writing transaction; on SQLite it waits for other writers when it begins, not half-way through.
 
-        Args:
-            grows_by: approximate size of the stored data; 0 for changes that store little.
+        `grows_by` is about the size of the stored data; 0 for changes that store little.
 
         Raises:
             StoreFullError: the disk has no room for the data.
@@ -133,8 +132,7 @@ class Database:
     def freeing(self, work: Callable[[Connection], Result]) -> Result:
         """Run a transaction that deletes data; on a full disk it uses the reserve.
 
-        Args:
-            work: deletes the data; called again after a failure for lack of space.
+        `work` is called again after a failure for lack of space.
         """
         try:
             with self.writing() as connection:
@@ -148,8 +146,7 @@ class Database:
     def give_back(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
         """Return free space of an SQLite file to the disk, in short transactions, and restore the reserve.
 
-        Args:
-            is_stopped: asked before each transaction; when it is true, the rest stays for the next call.
+        `is_stopped` is asked before each; the rest stays for the next call.
 
         Raises:
             StoreUnavailableError, StoreBusyError: see `reading`.

@@ -112,17 +112,8 @@ class VenueSearch:
     ) -> LoadedPlans:
         """Choose and load the plans to search in full: all of them if they are few, else the most probable ones.
 
-        Args:
-            tenant: tenant of the plans.
-            venue_id: id of the venue.
-            ready: rows of its plans that are ready.
-            queries: the encoded photographs, each of which chooses plans.
-            form: the stated camera height.
-            hints: the hints.
-            warnings: warnings so far.
-            context: context of the query.
-            compute: runs CPU work.
-            favour: log factors by which plans are preferred in the choice alone.
+        Each of the queries chooses plans; `favour` returns log factors by which plans are preferred in the choice
+        alone.
 
         Raises:
             InvalidHintError: strict hints exclude every plan.
