@@ -14,16 +14,10 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from examples.truth import FOLDER, PLAN_PATH
-from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core import LaLaLoc, StatedCamera, read_plan
 from lalaloc_core.draw.answer import draw_answer, drawn_answer
 from lalaloc_core.draw.canvas import MUTED, document, image, jpeg, pixels, words
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
-from lalaloc_core.localise.local_model import LocalModel
-from lalaloc_core.localise.query import stated_height
-from lalaloc_core.localise.search.pipeline import Localisation
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
-from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.cameras import Perspective
 
 _COUNT, _FIELD_DEG, _SIZE = 12, 53.0, (360, 480)
@@ -35,23 +29,12 @@ _PICTURE, _QUALITY = FOLDER.parent / "docs" / "images" / "turn.jpg", 85
 
 def main() -> None:
     """Draw and write the picture."""
-    plan, model = FloorPlan.from_json(PLAN_PATH.read_bytes()), LocalModel(Bundle.open(default_bundle()))
-    frames = _frames()
-    photographs, angles = model.open_turn(
-        [encode_jpeg(frame) for frame in frames], StatedCamera(projection="perspective", hfov_deg=_FIELD_DEG)
-    )
-    height, linked = stated_height(plan, None), LinkedTurn.of(angles)
-    grid = model.grid(plan, height.height_m)
-    manifest = model.bundle.manifest
-
-    def drawn(found: Localisation, photograph: Photograph) -> tuple[bytes, float]:
-        confidence_model = manifest.confidence_for(view=True, turn=found.query.is_turn)
-        answer = drawn_answer(plan, grid, found, confidence_model, "estimated", photograph=photograph)
-        return _jpeg(pixels(draw_answer(answer, None, "plan"))), answer.confidence or 0.0
-
-    alone = model.localise(plan, grid, model.encoder.query(photographs[0], None, height))
-    turn = model.localise_turn(plan, grid, photographs, linked, height).pictures[0]
-    _write(frames, [drawn(alone, photographs[0]), drawn(turn, photographs[0])])
+    plan, model, frames = read_plan(PLAN_PATH), LaLaLoc(), _frames()
+    files = [encode_jpeg(frame) for frame in frames]
+    camera = StatedCamera(projection="perspective", hfov_deg=_FIELD_DEG)
+    answers = [model.localise(plan, files[0], camera=camera), model.localise_turn(plan, files, camera=camera)]
+    drawn = [_jpeg(pixels(draw_answer(drawn_answer(answer), None, "plan"))) for answer in answers]
+    _write(frames, list(zip(drawn, (answer.confidence or 0.0 for answer in answers), strict=True)))
 
 
 def _frames() -> list[UInt8[np.ndarray, "h w 3"]]:
