@@ -12,6 +12,7 @@ from lalaloc_core.cli import (
     assistants,
     encoding,
     evaluation,
+    lab,
     localising,
     measuring,
     pinning,
@@ -20,10 +21,12 @@ from lalaloc_core.cli import (
     tracking,
     training,
 )
-from lalaloc_core.errors import InvalidInputError, LaLaLocError
+from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError
 
 # The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130
+
+_LAB = training.COMMANDS | synthesis.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -31,7 +34,11 @@ def main(argv: list[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     # It lists every repaired detail of a DXF; the import's report has what matters.
     logging.getLogger("ezdxf").setLevel(logging.ERROR)
-    arguments = build_parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    if words and words[0] in _LAB.keys() - {"bench"}:
+        print(f"error: `lalaloc {words[0]}` is now `lalaloc lab {words[0]}`", file=sys.stderr)
+        return 2
+    arguments = build_parser().parse_args(words)
     try:
         arguments.run(arguments)
         sys.stdout.flush()
@@ -43,7 +50,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return _INTERRUPTED
-    except InvalidInputError as error:
+    except (InvalidInputError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except LaLaLocError as error:
@@ -64,9 +71,14 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise photographs in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    groups = (localising, pinning, encoding, tracking, plans, evaluation, measuring, synthesis, training, assistants)
-    for group in groups:
+    for group in (localising, pinning, encoding, tracking, plans, assistants):
         group.add_commands(commands)
+    lab.add_command(commands, "bench", _LAB["bench"])
+    actions = commands.add_parser(
+        "lab", help="train, measure and export models, by configuration files and options (docs/how-to/train.md)"
+    ).add_subparsers(required=True, metavar="COMMAND")
+    for name, command in _LAB.items():
+        lab.add_command(actions, name, command)
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'
     )

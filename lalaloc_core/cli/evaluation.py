@@ -1,20 +1,20 @@
-"""`lalaloc evaluate`, `score`, `report`, `worst` and `calibrate`."""
+"""`lalaloc lab evaluate`, `score`, `report`, `worst` and `calibrate`."""
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import shlex
 import sys
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from lalaloc_core.cli.options import add_options, count, positive
+from lalaloc_core.cli.lab import Command, check_range
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.dataset_names import DATASET_FORMATS, SPLITS
+from lalaloc_core.learn.dataset_names import Split
+from lalaloc_core.files import default_bundle
 
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4
@@ -22,151 +22,138 @@ _DECIMALS = 4
 _SHARES = ("within_10cm", "within_50cm", "within_1m", "within_1m_30deg", "correct_room", "heading_within_2deg")
 
 
-def add_commands(commands: Any) -> None:
-    """Add these commands to the parser."""
-    _add_evaluate(commands)
-    _add_score(commands)
-    _add_report(commands)
-    _add_worst(commands)
-    _add_calibrate(commands)
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Localise the queries of a data set or of generated homes, and score the answers.
+
+    Attributes:
+        bundle: model bundle (default: the shipped one).
+        method: localisation method.
+        kind: kind of query.
+        data: data set (default: generated homes).
+        dataset: format of the data set (default: detected from its files).
+        generator: generator of homes: the one used in training, or out-of-distribution homes.
+        homes: number of generated homes, 4 queries each.
+        seed: random seed of generated homes.
+        textures: folder of material pictures for generated homes (default: procedural materials).
+        split: split.
+        furniture: furniture level (default: by data set).
+        lighting: lighting (default: by data set).
+        heading: heading of queries (default: known; that of albums is unknown).
+        grid_step: step of the pose grid, metres.
+        view: cut views of this field of view, degrees (default: whole spheres).
+        heading_error: largest error of the known heading of views, degrees (default: 0).
+        albums: solve all photographs of a scene together, as `lalaloc pin`; files can be of any projection.
+        refine: last stage of refinement (default: lpo).
+        limit: maximum number of queries (default: all).
+        skip_bad: skip unusable files and samples, and list them.
+        workers: worker processes (default: one per core).
+        out: folder of the run; an existing run is continued.
+        json: print all figures as JSON.
+    """
+
+    bundle: Path = field(default_factory=default_bundle)
+    method: Literal["lalaloc", "oracle", "icp", "explicit", "decode"] = "lalaloc"
+    kind: Literal["layout", "panorama"] = "panorama"
+    data: Path | None = None
+    dataset: Literal["structured3d", "zind", "own", "annotated"] | None = None
+    generator: Literal["synth", "heldout"] = "synth"
+    homes: int = 100
+    seed: int = 0
+    textures: Path | None = None
+    split: Split = "test"
+    furniture: Literal["empty", "simple", "full"] | None = None
+    lighting: Literal["cold", "raw", "warm"] | None = None
+    heading: Literal["known", "unknown"] | None = None
+    grid_step: float = 0.5
+    view: float | None = None
+    heading_error: float | None = None
+    albums: bool = False
+    refine: Literal["none", "vdr", "lpo"] | None = None
+    limit: int | None = None
+    skip_bad: bool = False
+    workers: int | None = None
+    out: Path | None = None
+    json: bool = False
 
 
-def _add_evaluate(commands: Any) -> None:
-    evaluate = commands.add_parser(
-        "evaluate", help="localise the queries of a data set or of generated homes, and score the answers"
-    )
-    add_options(evaluate, "--bundle")
-    evaluate.add_argument(
-        "--method",
-        default="lalaloc",
-        choices=("lalaloc", "oracle", "icp", "explicit", "decode"),
-        help="localisation method (default: %(default)s)",
-    )
-    evaluate.add_argument(
-        "--kind", choices=("layout", "panorama"), default="panorama", help="kind of query (default: %(default)s)"
-    )
-    _data_arguments(evaluate)
-    evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: %(default)s)")
-    evaluate.add_argument(
-        "--furniture", choices=("empty", "simple", "full"), help="furniture level (default: by data set)"
-    )
-    evaluate.add_argument("--lighting", choices=("cold", "raw", "warm"), help="lighting (default: by data set)")
-    evaluate.add_argument(
-        "--heading", choices=("known", "unknown"), help="heading of queries (default: known; that of albums is unknown)"
-    )
-    evaluate.add_argument(
-        "--grid-step",
-        type=positive,
-        default=0.5,
-        metavar="M",
-        help="step of the pose grid, metres (default: %(default)s)",
-    )
-    evaluate.add_argument(
-        "--view", type=positive, metavar="DEG", help="cut views of this field of view (default: whole spheres)"
-    )
-    evaluate.add_argument(
-        "--heading-error", type=positive, metavar="DEG", help="largest error of the known heading of views (default: 0)"
-    )
-    evaluate.add_argument(
-        "--albums",
-        action="store_true",
-        help="solve all photographs of a scene together, as `lalaloc pin`; files can be of any projection",
-    )
-    evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
-    evaluate.add_argument("--limit", type=count, metavar="N", help="maximum number of queries (default: all)")
-    add_options(evaluate, "--skip-bad", "--workers")
-    evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; an existing run is continued")
-    evaluate.add_argument("--json", action="store_true", help="print all figures as JSON")
-    evaluate.set_defaults(run=_evaluate)
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """Score the stored predictions of runs again, without model or data.
+
+    Attributes:
+        runs: folders of runs.
+        json: print all figures as JSON.
+    """
+
+    runs: tuple[Path, ...]
+    json: bool = False
 
 
-def _add_score(commands: Any) -> None:
-    score = commands.add_parser("score", help="score the stored predictions of runs again, without model or data")
-    score.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
-    score.add_argument("--json", action="store_true", help="print all figures as JSON")
-    score.set_defaults(run=_score)
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Write a self-contained HTML report about runs.
+
+    Attributes:
+        runs: folders of runs.
+        out: page to write.
+        pictures: folder to write the page's pictures to as well.
+    """
+
+    runs: tuple[Path, ...]
+    out: Path = Path("report.html")
+    pictures: Path | None = None
 
 
-def _add_report(commands: Any) -> None:
-    report = commands.add_parser("report", help="write a self-contained HTML report about runs")
-    report.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
-    report.add_argument(
-        "--out", type=Path, default=Path("report.html"), metavar="FILE", help="page to write (default: %(default)s)"
-    )
-    report.add_argument("--pictures", type=Path, metavar="DIR", help="folder to write the page's pictures to as well")
-    report.set_defaults(run=_report)
+@dataclass(frozen=True, kw_only=True)
+class Worst:
+    """List the worst queries of a run and count their properties.
+
+    Attributes:
+        folder: folder of the run.
+        count: number of queries.
+        out: folder of results.
+    """
+
+    folder: Path
+    count: int = 100
+    out: Path = Path("worst")
 
 
-def _add_worst(commands: Any) -> None:
-    worst = commands.add_parser("worst", help="draw the worst queries of a run and count their properties")
-    worst.add_argument("folder", type=Path, metavar="RUN", help="folder of the run")
-    worst.add_argument("--count", type=count, default=100, metavar="N", help="number of queries (default: %(default)s)")
-    worst.add_argument(
-        "--out", type=Path, default=Path("worst"), metavar="DIR", help="folder of results (default: %(default)s)"
-    )
-    worst.set_defaults(run=_worst)
+@dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Fit a bundle's matching weights and confidence on generated validation homes.
+
+    Attributes:
+        bundle: model bundle (default: the shipped one).
+        homes: number of generated homes, 4 queries each.
+        seed: random seed of generated homes.
+        textures: folder of material pictures for generated homes (default: procedural materials).
+        openings_weight: weight of openings relative to walls, such as one tuned on photographs (default: fitted).
+        tail: scale of the errors of walls over the predicted one (default: the bundle's).
+        keep_evidence: keep the bundle's matching weights and fit only confidence.
+        views: calibrate the encoder of views, on views of 55° to 110°, not on spheres.
+        turns: only fit the confidence of turns on the spot, on 2 turns of views and parts of them in each home.
+        errors: only measure the predictions' errors, for `plan check --localisability`.
+        out: folder to store predictions in and to continue from.
+    """
+
+    bundle: Path = field(default_factory=default_bundle)
+    homes: int = 100
+    seed: int = 0
+    textures: Path | None = None
+    openings_weight: float | None = None
+    tail: float | None = None
+    keep_evidence: bool = False
+    views: bool = False
+    turns: bool = False
+    errors: bool = False
+    out: Path | None = None
 
 
-def _add_calibrate(commands: Any) -> None:
-    calibrate = commands.add_parser(
-        "calibrate", help="fit a bundle's matching weights and confidence on generated validation homes"
-    )
-    add_options(calibrate, "--bundle")
-    _generator_arguments(calibrate)
-    calibrate.add_argument(
-        "--openings-weight",
-        type=positive,
-        metavar="WEIGHT",
-        help="weight of openings relative to walls, such as one tuned on photographs (default: fitted)",
-    )
-    calibrate.add_argument(
-        "--tail",
-        type=positive,
-        metavar="FACTOR",
-        help="scale of the errors of walls over the predicted one (default: the bundle's)",
-    )
-    calibrate.add_argument(
-        "--keep-evidence", action="store_true", help="keep the bundle's matching weights and fit only confidence"
-    )
-    calibrate.add_argument(
-        "--views", action="store_true", help="calibrate the encoder of views, on views of 55° to 110°, not on spheres"
-    )
-    calibrate.add_argument(
-        "--turns",
-        action="store_true",
-        help="only fit the confidence of turns on the spot, on 2 turns of views and parts of them in each home",
-    )
-    calibrate.add_argument(
-        "--errors", action="store_true", help="only measure the predictions' errors, for `plan check --localisability`"
-    )
-    calibrate.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to store predictions in and to continue from"
-    )
-    calibrate.set_defaults(run=_calibrate)
-
-
-def _data_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", type=Path, metavar="DIR", help="data set (default: generated homes)")
-    parser.add_argument(
-        "--dataset", choices=tuple(DATASET_FORMATS), help="format of the data set (default: detected from its files)"
-    )
-    parser.add_argument(
-        "--generator",
-        choices=("synth", "heldout"),
-        default="synth",
-        help="generator of homes: the one used in training, or out-of-distribution homes (default: %(default)s)",
-    )
-    _generator_arguments(parser)
-
-
-def _generator_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--homes", type=count, default=100, help="number of generated homes, 4 queries each (default: %(default)s)"
-    )
-    add_options(parser, "--seed", "--textures")
-
-
-def _evaluate(arguments: argparse.Namespace) -> None:
+def _evaluate(arguments: Evaluate) -> None:
+    check_range(arguments, 1, "homes", "limit")
+    check_range(arguments, 0, "grid_step", "view", "heading_error", "workers")
     from lalaloc_core.evaluate.runs.evaluation import run_evaluation
     from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance, describe_model
     from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
@@ -211,7 +198,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         _print_scores(report)
 
 
-def _check_options(arguments: argparse.Namespace) -> None:
+def _check_options(arguments: Evaluate) -> None:
     """Check that the options of `evaluate` belong together."""
     method, kind = arguments.method, arguments.kind
     photographs = kind == "panorama" and method == "lalaloc"
@@ -233,7 +220,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--heading-error is for --view with a known heading")
 
 
-def _score(arguments: argparse.Namespace) -> None:
+def _score(arguments: Score) -> None:
     from lalaloc_core.evaluate.runs.predictions import RunFolder
     from lalaloc_core.evaluate.runs.score import score_run
 
@@ -277,19 +264,22 @@ def _print_scores(report: dict[str, Any]) -> None:
         print(f"corrections of an album until all rooms are right: {report['clicks_per_album']:.1f}")
 
 
-def _report(arguments: argparse.Namespace) -> None:
+def _report(arguments: Report) -> None:
     from lalaloc_core.evaluate.report import write_report
 
     write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
 
 
-def _worst(arguments: argparse.Namespace) -> None:
+def _worst(arguments: Worst) -> None:
+    check_range(arguments, 1, "count")
     from lalaloc_core.evaluate.report.worst import write_worst
 
     print_json(write_worst(arguments.folder, arguments.out, arguments.count))
 
 
-def _calibrate(arguments: argparse.Namespace) -> None:
+def _calibrate(arguments: Calibrate) -> None:
+    check_range(arguments, 1, "homes")
+    check_range(arguments, 0, "openings_weight", "tail")
     if arguments.errors:
         from lalaloc_core.evaluate.calibrate.measured_errors import calibrate_errors
 
@@ -312,7 +302,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     print_json(manifest.metrics)
 
 
-def _generated_homes(arguments: argparse.Namespace) -> dict[str, Any]:
+def _generated_homes(arguments: Evaluate) -> dict[str, Any]:
     """Return the arguments of the chosen generator as plain data."""
     generated = _generated(arguments, arguments.furniture or "full")
     if arguments.generator == "synth":
@@ -324,7 +314,7 @@ def _generated_homes(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"generator": arguments.generator} | {name: generated[name] for name in ("homes", "seed", "furniture")}
 
 
-def _generated(arguments: argparse.Namespace, furniture: str | None) -> dict[str, Any]:
+def _generated(arguments: Evaluate, furniture: str | None) -> dict[str, Any]:
     """Return arguments of `GeneratedScenes` as plain data."""
     return {
         "homes": arguments.homes,
@@ -332,3 +322,12 @@ def _generated(arguments: argparse.Namespace, furniture: str | None) -> dict[str
         "furniture": furniture,
         "textures": None if arguments.textures is None else str(arguments.textures),
     }
+
+
+COMMANDS = {
+    "evaluate": Command(Evaluate, _evaluate, "data"),
+    "score": Command(Score, _score, "runs"),
+    "report": Command(Report, _report, "runs"),
+    "worst": Command(Worst, _worst, "folder"),
+    "calibrate": Command(Calibrate, _calibrate, "bundle"),
+}

@@ -1,21 +1,21 @@
-"""`lalaloc bench`, `lalaloc photographs` and `lalaloc reproduce`: published figures of a model."""
+"""`lalaloc bench`, `lalaloc lab photographs` and `lalaloc lab reproduce`: published figures of a model."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import shlex
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Literal, get_args
 
-from lalaloc_core.cli.options import add_options, count, positive
+from lalaloc_core.cli.lab import Command, check_range
 from lalaloc_core.cli.printing import print_json
-from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.errors import ConfigError, InvalidInputError
 from lalaloc_core.files import default_bundle
 from lalaloc_core.learn.dataset_names import GALLERIES
 
-_GROUPS = (
+Group = Literal[
     "rendering",
     "service",
     "accuracy",
@@ -34,87 +34,87 @@ _GROUPS = (
     "copies",
     "methods",
     "datasets",
-)
+]
+_GROUPS: tuple[Group, ...] = get_args(Group)
 
 
-def add_commands(commands: Any) -> None:
-    """Add these commands to the parser."""
-    _add_bench(commands)
-    _add_photographs(commands)
-    _add_reproduce(commands)
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """Measure the figures of the results page and print them as JSON.
+
+    Attributes:
+        only: groups of figures (default: all).
+        bundle: model bundle (default: the shipped one).
+        textures: folder of material pictures for generated homes (default: procedural materials).
+        homes: test homes per accuracy figure, 4 queries each.
+        out: also write the JSON to this file; with `only`, update it.
+        annotated: folder of annotated photographs, for albums, bounds and films of real rooms.
+        profile: print the time of each stage of a query instead of measuring figures.
+        queries: queries for `profile`.
+    """
+
+    only: tuple[Group, ...] = ()
+    bundle: Path = field(default_factory=default_bundle)
+    textures: Path | None = None
+    homes: int = 250
+    out: Path | None = None
+    annotated: Path | None = None
+    profile: bool = False
+    queries: int = 10
 
 
-def _add_bench(commands: Any) -> None:
-    bench = commands.add_parser("bench", help="measure the figures of the results page and print them as JSON")
-    add_options(bench, "--bundle", "--textures")
-    bench.add_argument(
-        "--homes", type=int, default=250, help="test homes per accuracy figure, 4 queries each (default: %(default)s)"
-    )
-    bench.add_argument("--out", type=Path, metavar="FILE", help="also write the JSON to FILE; --only updates FILE")
-    bench.add_argument(
-        "--annotated",
-        type=Path,
-        metavar="DIR",
-        help="folder of annotated photographs, for albums, bounds and films of real rooms",
-    )
-    bench.add_argument("--only", choices=_GROUPS, action="append", help="one group of figures; repeat for more")
-    bench.add_argument(
-        "--profile", action="store_true", help="print the time of each stage of a query instead of measuring figures"
-    )
-    bench.add_argument("--queries", type=count, default=10, help="queries for --profile (default: %(default)s)")
-    bench.set_defaults(run=_bench)
+@dataclass(frozen=True, kw_only=True)
+class Photographs:
+    """Measure a model on annotated photographs of real rooms.
+
+    Attributes:
+        data: folder of annotated photographs.
+        galleries: number of plans to locate every photograph in; 0 measures walls and openings only.
+        view: also views of these fields, degrees.
+        bundle: model bundle (default: the shipped one).
+        workers: worker processes (default: one per core).
+        out: folder of results.
+    """
+
+    data: Path
+    galleries: int = GALLERIES
+    view: tuple[float, ...] = ()
+    bundle: Path = field(default_factory=default_bundle)
+    workers: int | None = None
+    out: Path = Path("photographs")
 
 
-def _add_photographs(commands: Any) -> None:
-    photographs = commands.add_parser(
-        "photographs", help="measure a model on annotated photographs of real rooms and draw its predictions"
-    )
-    photographs.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder of annotated photographs")
-    photographs.add_argument(
-        "--galleries",
-        type=int,
-        choices=range(GALLERIES + 1),
-        default=GALLERIES,
-        help="number of plans to locate every photograph in; 0 measures walls and openings only (default: %(default)s)",
-    )
-    photographs.add_argument(
-        "--view", type=positive, action="append", default=[], metavar="DEG", help="also views of this field; repeatable"
-    )
-    add_options(photographs, "--bundle", "--workers")
-    photographs.add_argument(
-        "--out", type=Path, default=Path("photographs"), metavar="DIR", help="folder of results (default: %(default)s)"
-    )
-    photographs.set_defaults(run=_photographs)
+@dataclass(frozen=True, kw_only=True)
+class Reproduce:
+    """Measure a table of the paper and print it beside the paper's.
+
+    Attributes:
+        table: tables.
+        list_: list the tables and exit.
+        all_: all tables.
+        data: data set: Structured3D or the output of synth.
+        budget: amount of training and of queries per row.
+        out: folder of models, runs and tables.
+        limit: queries per row (default: by `budget`).
+        skip_bad: skip unusable files and samples, and list them.
+        workers: worker processes (default: one per core).
+        bundle: model bundle of the shipped model's rows (default: the shipped one).
+    """
+
+    table: tuple[str, ...] = ()
+    list_: bool = False
+    all_: bool = False
+    data: Path | None = None
+    budget: Literal["small", "full"] = "small"
+    out: Path = Path("runs/reproduce")
+    limit: int | None = None
+    skip_bad: bool = False
+    workers: int | None = None
+    bundle: Path = field(default_factory=default_bundle)
 
 
-def _add_reproduce(commands: Any) -> None:
-    reproduce = commands.add_parser("reproduce", help="measure a table of the paper and print it beside the paper's")
-    reproduce.add_argument("--list", action="store_true", dest="only_list", help="list the tables and exit")
-    reproduce.add_argument("--table", action="append", default=[], metavar="NAME", help="table; repeat for more")
-    reproduce.add_argument("--all", action="store_true", dest="every", help="all tables")
-    reproduce.add_argument("--data", type=Path, metavar="DIR", help="data set: Structured3D or the output of synth")
-    reproduce.add_argument(
-        "--budget",
-        choices=("small", "full"),
-        default="small",
-        help="amount of training and of queries per row (default: %(default)s)",
-    )
-    reproduce.add_argument(
-        "--out",
-        type=Path,
-        default=Path("runs/reproduce"),
-        metavar="DIR",
-        help="folder of models, runs and tables (default: %(default)s)",
-    )
-    reproduce.add_argument("--limit", type=count, metavar="N", help="queries per row (default: by --budget)")
-    add_options(reproduce, "--skip-bad", "--workers")
-    reproduce.add_argument(
-        "--bundle", type=Path, default=default_bundle(), help="model bundle of the shipped model's rows"
-    )
-    reproduce.set_defaults(run=_reproduce)
-
-
-def _bench(arguments: argparse.Namespace) -> None:
+def _bench(arguments: Bench) -> None:
+    check_range(arguments, 1, "homes", "queries")
     if arguments.profile:
         from lalaloc_core.bundle import Bundle
         from lalaloc_core.evaluate.bench.query_profile import profile_table
@@ -134,7 +134,10 @@ def _bench(arguments: argparse.Namespace) -> None:
     print_json(report)
 
 
-def _photographs(arguments: argparse.Namespace) -> None:
+def _photographs(arguments: Photographs) -> None:
+    check_range(arguments, 0, "workers", "galleries")
+    if arguments.galleries > GALLERIES:
+        raise ConfigError(f"galleries is {arguments.galleries}; the limit is {GALLERIES}")
     from lalaloc_core.evaluate.report.photograph_report import SHEET_FILE, evaluate_photographs
 
     results = evaluate_photographs(
@@ -150,10 +153,12 @@ def _photographs(arguments: argparse.Namespace) -> None:
     print(f"pictures: {arguments.out / SHEET_FILE}")
 
 
-def _reproduce(arguments: argparse.Namespace) -> None:
+def _reproduce(arguments: Reproduce) -> None:
+    check_range(arguments, 1, "limit")
+    check_range(arguments, 0, "workers")
     from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
 
-    if arguments.only_list:
+    if arguments.list_:
         for table in TABLES:
             print(f"{table.name:20} {table.title} (paper: {table.source}, {table.split} split)")
         return
@@ -161,11 +166,13 @@ def _reproduce(arguments: argparse.Namespace) -> None:
     unknown = [name for name in arguments.table if name not in known]
     if unknown:
         raise InvalidInputError(f"unknown table '{unknown[0]}'; --table is one of {', '.join(known)}")
-    chosen = list(TABLES) if arguments.every else [known[name] for name in arguments.table]
+    chosen = list(TABLES) if arguments.all_ else [known[name] for name in arguments.table]
     if not chosen:
         raise InvalidInputError("no table is chosen; use --table NAME, --all or --list")
     if arguments.data is None:
-        raise InvalidInputError("--data is missing; give the folder of Structured3D or the output of `lalaloc synth`")
+        raise InvalidInputError(
+            "--data is missing; give the folder of Structured3D or the output of `lalaloc lab synth`"
+        )
 
     from lalaloc_core.evaluate.reproduce.result import markdown
     from lalaloc_core.evaluate.reproduce.table_maker import TableMaker
@@ -182,3 +189,10 @@ def _reproduce(arguments: argparse.Namespace) -> None:
     )
     for table in chosen:
         print(markdown(table_maker.make(table)))
+
+
+COMMANDS = {
+    "bench": Command(Bench, _bench, "only"),
+    "photographs": Command(Photographs, _photographs, "data"),
+    "reproduce": Command(Reproduce, _reproduce, "table"),
+}

@@ -28,10 +28,7 @@ def _within(
     return parse
 
 
-count = _within("count", int, "at least 1", lambda value: value >= 1)
 positive = _within("positive", float, "positive", lambda value: 0.0 < value < math.inf)
-# Number of worker processes; 0 runs everything in this process.
-processes = _within("processes", int, "at least 0", lambda value: value >= 0)
 heading = _within("heading", float, "between -360 and 360 degrees", lambda value: -360.0 <= value <= 360.0)
 tolerance = _within("tolerance", float, "between 0 and 45 degrees", lambda value: 0.0 <= value <= 45.0)
 
@@ -42,14 +39,6 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "M",
         "help": "metres above the floor (default: the plan's, otherwise estimated)",
     },
-    "--seed": {"type": int, "default": 0, "help": "random seed of generated homes (default: %(default)s)"},
-    "--skip-bad": {"action": "store_true", "help": "skip unusable files and samples, and list them"},
-    "--textures": {
-        "type": Path,
-        "metavar": "DIR",
-        "help": "material pictures for generated homes (default: procedural materials)",
-    },
-    "--workers": {"type": processes, "metavar": "N", "help": "worker processes (default: one per core)"},
 }
 
 

@@ -1,42 +1,55 @@
-"""`lalaloc synth` and `lalaloc contact-sheet`."""
+"""`lalaloc lab synth` and `lalaloc lab contact-sheet`."""
 
 from __future__ import annotations
 
-import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-from lalaloc_core.cli.options import add_options
-from lalaloc_core.learn.dataset_names import SPLITS
-
-
-def add_commands(commands: Any) -> None:
-    """Add these commands to the parser."""
-    synth = commands.add_parser("synth", help="write synthetic scenes in Structured3D's layout")
-    synth.add_argument("--scenes", type=int, required=True, help="number of scenes in total; existing ones are kept")
-    synth.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
-    synth.add_argument("--split", choices=("all", *SPLITS), default="all", help="split (default: %(default)s)")
-    synth.add_argument(
-        "--height", type=int, default=256, help="height of a panorama in pixels, half its width (default: %(default)s)"
-    )
-    add_options(synth, "--seed", "--textures")
-    synth.add_argument("--workers", type=int, default=1, help="rendering processes (default: %(default)s)")
-    synth.set_defaults(run=_synth)
-
-    sheet = commands.add_parser("contact-sheet", help="write a picture with examples of synthetic panoramas")
-    sheet.add_argument(
-        "--out",
-        type=Path,
-        default=Path("contact_sheet.jpg"),
-        metavar="FILE",
-        help="picture to write (default: %(default)s)",
-    )
-    add_options(sheet, "--seed", "--textures")
-    sheet.set_defaults(run=_contact_sheet)
+from lalaloc_core.cli.lab import Command
+from lalaloc_core.learn.dataset_names import Split
 
 
-def _synth(arguments: argparse.Namespace) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Synth:
+    """Write synthetic scenes in Structured3D's layout.
+
+    Attributes:
+        scenes: number of scenes in total; existing ones are kept.
+        out: folder of the data set.
+        split: split.
+        height: height of a panorama in pixels, half its width.
+        seed: random seed of generated homes.
+        textures: folder of material pictures for generated homes (default: procedural materials).
+        workers: rendering processes.
+    """
+
+    scenes: int
+    out: Path
+    split: Literal["all"] | Split = "all"
+    height: int = 256
+    seed: int = 0
+    textures: Path | None = None
+    workers: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactSheet:
+    """Write a picture with examples of synthetic panoramas.
+
+    Attributes:
+        out: picture to write.
+        seed: random seed of generated homes.
+        textures: folder of material pictures for generated homes (default: procedural materials).
+    """
+
+    out: Path = Path("contact_sheet.jpg")
+    seed: int = 0
+    textures: Path | None = None
+
+
+def _synth(arguments: Synth) -> None:
     from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
 
     settings = Synthesis(root=arguments.out, seed=arguments.seed, height=arguments.height, textures=arguments.textures)
@@ -50,9 +63,12 @@ def _synth(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {counts}; {written} of them new")
 
 
-def _contact_sheet(arguments: argparse.Namespace) -> None:
+def _contact_sheet(arguments: ContactSheet) -> None:
     import numpy as np
 
     from lalaloc_core.learn.synth.rendering.panorama import contact_sheet
 
     contact_sheet(arguments.out, np.random.default_rng(arguments.seed), arguments.textures)
+
+
+COMMANDS = {"synth": Command(Synth, _synth, "out"), "contact-sheet": Command(ContactSheet, _contact_sheet, "out")}

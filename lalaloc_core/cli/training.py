@@ -1,17 +1,16 @@
-"""`lalaloc train` and `lalaloc export`."""
+"""`lalaloc lab train` and `lalaloc lab export`."""
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import dataclasses
-import json
 import os
 import platform
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from lalaloc_core.cli.options import add_options, count, processes
+from lalaloc_core.cli.lab import Command, check_range
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
@@ -26,126 +25,103 @@ _PER_HELDOUT_HOME = 3
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 
-def add_commands(commands: Any) -> None:
-    """Add these commands to the parser."""
-    _add_train(commands)
-    _add_export(commands)
-    _add_export_again(commands)
-    _add_add_objects(commands)
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a stage: the layout encoder, then the image encoder.
+
+    Attributes:
+        stage: the encoder of layouts, of spheres (image), of views (preset trunk), or the first two at once.
+        preset: networks and schedule.
+        out: folder of the run, shared by both stages.
+        data: data set (default: homes generated during training).
+        skip_bad: skip unusable files and samples, and list them.
+        textures: folder of material pictures for generated homes (default: procedural materials).
+        minutes: training time, instead of `steps`.
+        steps: number of updates (default: the preset's).
+        seed: random seed (default: the preset's).
+        set_: setting of the preset as KEY=VALUE, such as image.uses_per_panorama=4 or image.supersample=[2,1].
+        from_: start from the weights of a bundle or of another run (default: random weights).
+        layout_from: image stage: bundle or run with the layout encoder to use if `out` has none.
+        photographs: image stages: folders of panoramas; `teacher` predicts walls and openings of those without an
+            annotation (preset trunk).
+        teacher: TensorFlow Lite segmenter with ADE20K's classes, or bundle whose encoder of spheres reads them.
+        resume: continue from the checkpoint in `out`.
+        device: cpu or cuda (default: cuda if available).
+        workers: processes that make batches; 0 uses none.
+        render: renderer of generated homes: the worker processes, or `device`, which then receives scenes instead of
+            pixels (default: device if it is a GPU).
+        validation_homes: maximum number of homes or scenes for validation.
+    """
+
+    stage: Literal["layout", "image", "view", "end-to-end"]
+    preset: Literal["ring", "trunk", "paper", "tiny", "tiny-trunk"] = "ring"
+    out: Path
+    data: Path | None = None
+    skip_bad: bool = False
+    textures: Path | None = None
+    minutes: float | None = None
+    steps: int | None = None
+    seed: int | None = None
+    set_: dict[str, Any] = field(default_factory=dict)
+    from_: Path | None = None
+    layout_from: Path | None = None
+    photographs: tuple[Path, ...] = ()
+    teacher: tuple[Path, ...] = ()
+    resume: bool = False
+    device: str | None = None
+    workers: int = 1
+    render: Literal["workers", "device"] | None = None
+    validation_homes: int = _VALIDATION_HOMES
 
 
-def _add_train(commands: Any) -> None:
-    train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
-    train.add_argument(
-        "stage",
-        choices=("layout", "image", "view", "end-to-end"),
-        help="stage to train: the encoder of layouts, of spheres, of views (preset trunk), or the first two at once",
-    )
-    train.add_argument(
-        "--preset",
-        default="ring",
-        choices=("ring", "trunk", "paper", "tiny", "tiny-trunk"),
-        help="networks and schedule (default: %(default)s)",
-    )
-    train.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the run, shared by both stages"
-    )
-    train.add_argument("--data", type=Path, metavar="DIR", help="data set (default: homes generated during training)")
-    add_options(train, "--skip-bad", "--textures")
-    train.add_argument("--minutes", type=float, help="training time, instead of --steps")
-    train.add_argument("--steps", type=int, help="number of updates (default: the preset's)")
-    train.add_argument("--seed", type=int, help="random seed (default: the preset's)")
-    train.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="settings",
-        help="change a setting of the preset, such as image.uses_per_panorama=4 or image.supersample=[2,1]",
-    )
-    train.add_argument(
-        "--from",
-        type=Path,
-        metavar="DIR",
-        dest="init_from",
-        help="start from the weights of a bundle or of another run (default: random weights)",
-    )
-    train.add_argument(
-        "--layout-from",
-        type=Path,
-        metavar="DIR",
-        help="image stage: bundle or run with the layout encoder to use if --out has none",
-    )
-    train.add_argument(
-        "--photographs",
-        type=Path,
-        action="append",
-        metavar="DIR",
-        help="image stages: folder of panoramas; --teacher predicts walls and openings of those without an annotation; "
-        "may be repeated (preset trunk)",
-    )
-    train.add_argument(
-        "--teacher",
-        type=Path,
-        action="append",
-        metavar="PATH",
-        help="TensorFlow Lite segmenter with ADE20K's classes, or bundle whose encoder of spheres reads them; "
-        "may be repeated for one of each",
-    )
-    train.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
-    train.add_argument("--device", help="cpu or cuda (default: cuda if available)")
-    train.add_argument(
-        "--workers", type=processes, default=1, help="processes that make batches; 0 uses none (default: %(default)s)"
-    )
-    train.add_argument(
-        "--render",
-        choices=("workers", "device"),
-        help="renderer of generated homes: the worker processes, or --device, which then receives scenes instead of "
-        "pixels (default: device if it is a GPU)",
-    )
-    train.add_argument(
-        "--validation-homes",
-        type=count,
-        default=_VALIDATION_HOMES,
-        metavar="N",
-        help="maximum number of homes or scenes for validation (default: %(default)s)",
-    )
-    train.set_defaults(run=_train)
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Export a trained run to a model bundle.
+
+    Attributes:
+        run_: folder of the run.
+        out: folder of the bundle.
+        name: name of the model (default: name of the folder `out`).
+        version: version of the model.
+        note: note for the manifest as KEY=VALUE.
+        into: copy this bundle with the run's encoder of spheres or of views in place of its own; calibrate the copy.
+        last: export the last weights instead of the best by validation.
+    """
+
+    run_: Path
+    out: Path
+    name: str | None = None
+    version: str
+    note: dict[str, str] = field(default_factory=dict)
+    into: Path | None = None
+    last: bool = False
 
 
-def _add_export(commands: Any) -> None:
-    export = commands.add_parser("export", help="export a trained run to a model bundle")
-    export.add_argument("--run", type=Path, required=True, dest="folder", metavar="DIR", help="folder of the run")
-    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the bundle")
-    export.add_argument("--name", help="name of the model (default: name of the folder --out)")
-    export.add_argument("--version", required=True, dest="model_version", help="version of the model")
-    export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="note for the manifest")
-    export.add_argument(
-        "--into",
-        "--views-of",
-        type=Path,
-        metavar="BUNDLE",
-        help="copy this bundle with the run's encoder of spheres or of views in place of its own; calibrate the copy",
-    )
-    export.add_argument("--last", action="store_true", help="export the last weights instead of the best by validation")
-    export.set_defaults(run=_export)
+@dataclass(frozen=True, kw_only=True)
+class ExportAgain:
+    """Export the networks of a model bundle again from its own weights.
+
+    Attributes:
+        bundle: folder of the bundle.
+    """
+
+    bundle: Path
 
 
-def _add_export_again(commands: Any) -> None:
-    again = commands.add_parser("export-again", help="export the networks of a model bundle again from its own weights")
-    again.add_argument("bundle", type=Path, help="folder of the bundle")
-    again.set_defaults(run=_export_again)
+@dataclass(frozen=True, kw_only=True)
+class AddObjects:
+    """Add the pretrained classifier of objects, which tells types of rooms, to a model bundle.
+
+    Attributes:
+        bundle: folder of the bundle.
+    """
+
+    bundle: Path
 
 
-def _add_add_objects(commands: Any) -> None:
-    objects = commands.add_parser(
-        "add-objects", help="add the pretrained classifier of objects, which tells types of rooms, to a model bundle"
-    )
-    objects.add_argument("bundle", type=Path, help="folder of the bundle")
-    objects.set_defaults(run=_add_objects)
-
-
-def _train(arguments: argparse.Namespace) -> None:
+def _train(arguments: Train) -> None:
+    check_range(arguments, 0, "workers")
+    check_range(arguments, 1, "validation_homes")
     import torch
 
     from lalaloc_core.learn.data.dataset_detection import open_dataset
@@ -169,8 +145,8 @@ def _train(arguments: argparse.Namespace) -> None:
         deferred=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
         heldout=None if arguments.data is not None else HeldoutScenes(homes=heldout_homes),
-        photographs=tuple(arguments.photographs or ()),
-        teachers=tuple(arguments.teacher or ()),
+        photographs=arguments.photographs,
+        teachers=arguments.teacher,
     )
     train_stage(
         arguments.stage,
@@ -180,12 +156,12 @@ def _train(arguments: argparse.Namespace) -> None:
         data=data,
         workers=arguments.workers,
         resume=arguments.resume,
-        init_from=arguments.init_from,
+        init_from=arguments.from_,
         layout_from=arguments.layout_from,
     )
 
 
-def _check_train_options(arguments: argparse.Namespace) -> None:
+def _check_train_options(arguments: Train) -> None:
     """Check that the options of `train` belong together."""
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
@@ -193,22 +169,22 @@ def _check_train_options(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--skip-bad is for --data")
     if arguments.data is not None and arguments.render is not None:
         raise InvalidInputError("--render is for generated homes, not for --data")
-    if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
+    if arguments.from_ is not None and (arguments.resume or arguments.stage == "end-to-end"):
         raise InvalidInputError("--from starts a new run of one stage; it excludes --resume and end-to-end")
     for option, name, stages in (
         ("--layout-from", "layout_from", ("image",)),
         ("--photographs", "photographs", ("image", "view")),
         ("--teacher", "teacher", ("image", "view")),
     ):
-        if arguments.stage not in stages and getattr(arguments, name) is not None:
+        if arguments.stage not in stages and getattr(arguments, name):
             raise InvalidInputError(f"{option} is for the stage {' or '.join(stages)}, not for '{arguments.stage}'")
 
 
-def _train_config(arguments: argparse.Namespace) -> TrainConfig:
+def _train_config(arguments: Train) -> TrainConfig:
     """Return the preset with the settings, schedule and seed of the options."""
     from lalaloc_core.learn.training.presets import PRESETS
 
-    config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
+    config = PRESETS[arguments.preset].with_settings(arguments.set_)
     # End-to-end training takes its schedule from the image stage.
     part = "layout" if arguments.stage == "layout" else "image"
     given = {name: getattr(arguments, name) for name in ("minutes", "steps")}
@@ -227,37 +203,22 @@ def _keep_freed_memory() -> None:
         libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
-def _settings(pairs: list[str]) -> dict[str, Any]:
-    """Parse settings by path; values are JSON, other words are text."""
-    settings = {}
-    for pair in pairs:
-        path, equals, value = pair.partition("=")
-        if not equals:
-            raise InvalidInputError(f"--set is '{pair}'; it must be KEY=VALUE")
-        try:
-            settings[path] = json.loads(value)
-        except ValueError:
-            settings[path] = value
-    return settings
-
-
-def _export(arguments: argparse.Namespace) -> None:
+def _export(arguments: Export) -> None:
     from lalaloc_core.learn.export.run_export import export_into, export_run
 
-    pairs = [note.partition("=") for note in arguments.note]
-    notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
-    given: dict[str, Any] = {"version": arguments.model_version, "notes": notes, "last": arguments.last}
+    notes = {"hardware": platform.machine(), **arguments.note}
+    given: dict[str, Any] = {"version": arguments.version, "notes": notes, "last": arguments.last}
     if arguments.into is not None:
         if arguments.name is not None:
             raise InvalidInputError(f"--name is '{arguments.name}'; a copy of --into keeps its name")
-        bundle = export_into(arguments.into, arguments.folder, arguments.out, **given)
+        bundle = export_into(arguments.into, arguments.run_, arguments.out, **given)
     else:
         name = arguments.name or arguments.out.resolve().name
-        bundle = export_run(arguments.folder, arguments.out, name=name, **given)
+        bundle = export_run(arguments.run_, arguments.out, name=name, **given)
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
 
 
-def _export_again(arguments: argparse.Namespace) -> None:
+def _export_again(arguments: ExportAgain) -> None:
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.learn.export.run_export import reexport_bundle
 
@@ -266,8 +227,16 @@ def _export_again(arguments: argparse.Namespace) -> None:
     print_json({"before": before.sha256, "after": after.sha256})
 
 
-def _add_objects(arguments: argparse.Namespace) -> None:
+def _add_objects(arguments: AddObjects) -> None:
     from lalaloc_core.learn.export.run_export import add_objects
 
     bundle = add_objects(arguments.bundle)
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
+
+
+COMMANDS = {
+    "train": Command(Train, _train, "stage"),
+    "export": Command(Export, _export, "run_"),
+    "export-again": Command(ExportAgain, _export_again, "bundle"),
+    "add-objects": Command(AddObjects, _add_objects, "bundle"),
+}

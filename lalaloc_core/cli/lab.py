@@ -1,0 +1,141 @@
+"""`lalaloc lab`: commands that train, measure and export models, each with a configuration.
+
+A configuration is a dataclass. Its values come from a TOML or JSON file, from words such as
+`preset=trunk`, and from options, which are made of its fields; later ones win.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.errors import ConfigError
+
+_FILES = (".toml", ".json")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command: the class of its configuration, the function that runs it, and the key of words without one."""
+
+    kind: type[Any]
+    run: Callable[[Any], None]
+    positional: str
+
+
+def add_command(commands: Any, name: str, command: Command) -> None:
+    """Add a command, with an option for each field of its configuration."""
+    text, _, attributes = (inspect.getdoc(command.kind) or "").partition("\n\nAttributes:\n")
+    meanings = {
+        key: " ".join(meaning.split())
+        for key, meaning in re.findall(r"^ {4}(\w+): (.*(?:\n {5,}.*)*)", attributes, re.MULTILINE)
+    }
+    positional = command.positional.rstrip("_")
+    parser = commands.add_parser(name, help=text[0].lower() + text[1:].rstrip("."))
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar=f"CONFIGURATION|{positional.upper()}|KEY=VALUE",
+        help="file of the configuration, .toml or .json; values by the names of the options; and the value of "
+        f"--{positional}",
+    )
+    for entry in fields(command.kind):
+        key, annotation = entry.name.rstrip("_"), str(entry.type)
+        usual = entry.default
+        # argparse reads % in help as a format.
+        meaning = meanings[entry.name].replace("%", "%%")
+        if annotation != "bool" and isinstance(usual, str | int | float | Path):
+            meaning += f" (default: {usual})"
+        given: dict[str, Any] = {"action": "append", "metavar": key.upper()}
+        if annotation == "bool":
+            given = {"action": "append_const", "const": "true"}
+        parser.add_argument(f"--{key.replace('_', '-')}", dest=entry.name, help=meaning, **given)
+    parser.set_defaults(run=partial(_run, command))
+
+
+def _run(command: Command, arguments: argparse.Namespace) -> None:
+    command.run(configured(command, arguments.words, vars(arguments)))
+
+
+def configured(command: Command, words: list[str], options: dict[str, list[str] | None]) -> Any:
+    """Return a configuration of files, words and options.
+
+    Raises:
+        ConfigError: a file cannot be read, or a key or value is wrong.
+    """
+    from lalaloc_core.configuration import build_config
+
+    known = {entry.name: entry for entry in fields(command.kind)}
+    raw: dict[str, Any] = {}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals and Path(word).suffix in _FILES:
+            raw |= {_field_name(name, known): value for name, value in _read(Path(word)).items()}
+        elif equals:
+            _set(raw, known[_field_name(key, known)], text)
+        else:
+            _set(raw, known[command.positional], word)
+    for name, texts in options.items():
+        for text in (texts or []) if name in known else []:
+            _set(raw, known[name], text)
+    return build_config(command.kind, raw, path="the configuration")
+
+
+def _field_name(key: str, known: dict[str, Field[Any]]) -> str:
+    name = key.replace("-", "_")
+    if name not in known and f"{name}_" not in known:
+        raise ConfigError(f"the configuration has no key '{key}'; it has {', '.join(known).replace('_,', ',')}")
+    return name if name in known else f"{name}_"
+
+
+def _set(raw: dict[str, Any], entry: Field[Any], text: str) -> None:
+    """Set a value by its text; tables and lists get one more."""
+    annotation = str(entry.type)
+    if annotation.startswith("dict"):
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--{entry.name.rstrip('_')} is '{text}'; it must be KEY=VALUE")
+        raw[entry.name] = raw.get(entry.name, {}) | {key: value if "dict[str, str]" in annotation else _json(value)}
+    elif annotation.startswith("tuple"):
+        value = _json(text) if text.startswith("[") or "float" in annotation else text
+        raw[entry.name] = [*raw.get(entry.name, []), *(value if isinstance(value, list) else [value])]
+    else:
+        raw[entry.name] = _json(text) if re.match("bool|int|float", annotation) else text
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        return tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except OSError as error:
+        raise ConfigError(f"'{path}' cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"'{path}' is no {path.suffix[1:].upper()}: {error}") from error
+
+
+def check_range(configuration: Any, least: float, *names: str) -> None:
+    """Check that values are at least `least`, or greater if it is 0 and they are no integers.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    for name in names:
+        value = getattr(configuration, name)
+        if value is not None and (value < least or (isinstance(value, float) and value <= least)):
+            limit = "positive" if isinstance(value, float) else f"at least {least:g}"
+            raise ConfigError(f"{name} is {value:g}; it must be {limit}")
