@@ -478,7 +478,7 @@ class TestEvaluating:
         self, root: Path, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         out = tmp_path / "out"
-        command = ["photographs", "--data", str(root), "--bundle", str(tiny_bundle), "--galleries", "1"]
+        command = ["lab", "photographs", "--data", str(root), "--bundle", str(tiny_bundle), "--galleries", "1"]
         assert main([*command, "--workers", "0", "--out", str(out)]) == 0
         printed = capsys.readouterr().out
         figures = json.loads((out / FIGURES_FILE).read_text())

@@ -206,8 +206,8 @@ def test_training_does_not_depend_on_the_rendering_place(tmp_path: Path) -> None
     weights = []
     for place in ("workers", "device"):
         out = tmp_path / place
-        assert main(["train", "layout", "--out", str(out), *common]) == 0
-        assert main(["train", "image", "--out", str(out), *common, "--render", place, "--device", "cpu"]) == 0
+        assert main(["lab", "train", "layout", "--out", str(out), *common]) == 0
+        assert main(["lab", "train", "image", "--out", str(out), *common, "--render", place, "--device", "cpu"]) == 0
         weights.append(Checkpoint.load(out / "image.pt").inference_weights["image_encoder"])
     for name, value in weights[0].items():
         assert torch.allclose(value.float(), weights[1][name].float(), atol=1e-3), name

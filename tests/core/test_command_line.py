@@ -194,27 +194,42 @@ def test_errors_are_one_line(
 @pytest.mark.parametrize(
     ("command", "code", "message"),
     [
-        ("evaluate --bundle {bundle} --out {out} --data nowhere", 2, "nowhere"),
-        ("evaluate --bundle {bundle} --out {out} --lighting warm", 2, "no photographs 'full/warm'"),
-        ("evaluate --bundle {bundle} --out {out} --data {own_data} --split train", 2, "split 'train'"),
-        ("evaluate --bundle {out} --homes 1", 1, "error: no model bundle at"),
-        ("export --run {out} --out {out} --version 1", 1, "error: no checkpoint at"),
-        ("score {out}", 1, "error: no evaluation run at"),
-        ("reproduce --table roof", 2, "unknown table 'roof'; --table is one of localisation"),
-        ("reproduce", 2, "no table is chosen"),
-        ("reproduce --table similarity", 2, "--data is missing"),
-        ("synth --out {out} --scenes 250 --split test", 2, "scenes is 250; the limits of split 'test' are 1 to 249"),
-        ("synth --out {out} --scenes 1 --height 33", 2, "height is 33; it must be an even number"),
-        ("synth --out {out} --scenes 1 --height 8", 2, "height is 8"),
-        ("synth --out {out} --scenes 1 --seed -1", 2, "seed is -1"),
-        ("synth --out {out} --scenes 1 --workers 0", 2, "workers is 0; the minimum is 1"),
-        ("synth --out {out} --scenes 1 --textures nowhere", 2, "no <category>/<material>/*.jpg below 'nowhere'"),
-        ("train layout --out {out} --skip-bad", 2, "--skip-bad"),
-        ("train layout --out {out} --data x --textures y", 2, "--textures"),
-        ("train layout --preset tiny-trunk --out {out} --photographs {out}", 2, "--photographs"),
-        ("train layout --preset tiny-trunk --out {out} --teacher {out}", 2, "--teacher"),
-        ("train layout --preset tiny-trunk --out {out} --layout-from {out}", 2, "--layout-from"),
-        ("train image --out {out} --data somewhere --render device", 2, "--render is for generated homes"),
+        ("lab evaluate --bundle {bundle} --out {out} --data nowhere", 2, "nowhere"),
+        ("lab evaluate --bundle {bundle} --out {out} --lighting warm", 2, "no photographs 'full/warm'"),
+        ("lab evaluate --bundle {bundle} --out {out} --data {own_data} --split train", 2, "split 'train'"),
+        ("lab evaluate --bundle {out} --homes 1", 1, "error: no model bundle at"),
+        ("lab export --run {out} --out {out} --version 1", 1, "error: no checkpoint at"),
+        ("lab score {out}", 1, "error: no evaluation run at"),
+        ("lab reproduce --table roof", 2, "unknown table 'roof'; --table is one of localisation"),
+        ("lab reproduce", 2, "no table is chosen"),
+        ("lab reproduce --table similarity", 2, "--data is missing"),
+        (
+            "lab synth --out {out} --scenes 250 --split test",
+            2,
+            "scenes is 250; the limits of split 'test' are 1 to 249",
+        ),
+        ("lab synth --out {out} --scenes 1 --height 33", 2, "height is 33; it must be an even number"),
+        ("lab synth --out {out} --scenes 1 --height 8", 2, "height is 8"),
+        ("lab synth --out {out} --scenes 1 --seed -1", 2, "seed is -1"),
+        ("lab synth --out {out} --scenes 1 --workers 0", 2, "workers is 0; the minimum is 1"),
+        ("lab synth --out {out} --scenes 1 --textures nowhere", 2, "no <category>/<material>/*.jpg below 'nowhere'"),
+        ("lab train layout --out {out} --skip-bad", 2, "--skip-bad"),
+        ("lab train layout --out {out} --data x --textures y", 2, "--textures"),
+        ("lab train layout --preset tiny-trunk --out {out} --photographs {out}", 2, "--photographs"),
+        ("lab train layout --preset tiny-trunk --out {out} --teacher {out}", 2, "--teacher"),
+        ("lab train layout --preset tiny-trunk --out {out} --layout-from {out}", 2, "--layout-from"),
+        ("lab train image --out {out} --data somewhere --render device", 2, "--render is for generated homes"),
+        ("lab train roof --out {out}", 2, "stage is 'roof'"),
+        ("lab train layout out={out} depth=3", 2, "no key 'depth'; it has stage, preset, out"),
+        ("lab train layout", 2, "lacks the key 'out'"),
+        ("lab train {out}/train.toml", 2, "train.toml' cannot be read"),
+        ("lab evaluate --kind song", 2, "kind is 'song'"),
+        ("lab evaluate --limit 0", 2, "limit is 0; it must be at least 1"),
+        ("lab evaluate --grid-step -1", 2, "grid_step is -1; it must be positive"),
+        ("lab evaluate --workers -1", 2, "workers is -1; it must be at least 0"),
+        ("lab reproduce --limit 0", 2, "limit is 0"),
+        ("bench --only roof", 2, "only[0] is 'roof'"),
+        ("train layout --out {out}", 2, "`lalaloc train` is now `lalaloc lab train`"),
     ],
 )
 def test_invalid_request_is_refused_before_writing(
@@ -232,12 +247,6 @@ def test_invalid_request_is_refused_before_writing(
     [
         "",
         "fly",
-        "train roof",
-        "evaluate --kind song",
-        "evaluate --limit 0",
-        "evaluate --grid-step -1",
-        "evaluate --workers -1",
-        "reproduce --limit 0",
         "localise plan.json photo.jpg --heading 400",
         "localise plan.json photo.jpg --camera-height -1",
         "localise plan.json photo.jpg --heading-tolerance 50",
@@ -249,6 +258,21 @@ def test_invalid_argument_is_refused(command: str, capsys: pytest.CaptureFixture
     assert ended.value.code == 2
     options = [f"argument {word}" for word in command.split() if word.startswith("--")]
     assert all(option in capsys.readouterr().err for option in options)
+
+
+def test_configuration_is_a_file_with_changes(tmp_path: Path) -> None:
+    from lalaloc_core.cli.lab import configured
+    from lalaloc_core.cli.training import COMMANDS
+
+    file = tmp_path / "train.toml"
+    file.write_text(
+        'stage = "image"\nout = "runs/x"\nskip-bad = true\nset = {"image.batch" = 4}\nphotographs = ["a"]\n'
+    )
+    words = [str(file), "preset=trunk", "set=image.supersample=[2,1]", "photographs=b"]
+    train = configured(COMMANDS["train"], words, {"minutes": ["2.5"], "from_": ["runs/y"]})
+    assert (train.stage, train.preset, train.out, train.skip_bad) == ("image", "trunk", Path("runs/x"), True)
+    assert train.set_ == {"image.batch": 4, "image.supersample": [2, 1]}
+    assert (train.photographs, train.minutes, train.from_) == ((Path("a"), Path("b")), 2.5, Path("runs/y"))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])

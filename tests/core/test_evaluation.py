@@ -160,7 +160,7 @@ class TestCommandLine:
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         arguments = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
-        assert main(["evaluate", *arguments, "--out", str(tmp_path / "run"), "--json"]) == 0
+        assert main(["lab", "evaluate", *arguments, "--out", str(tmp_path / "run"), "--json"]) == 0
         output = capsys.readouterr().out
         printed = json.loads(output)
         assert printed["n"] == 4
@@ -168,10 +168,10 @@ class TestCommandLine:
         assert 0.0 <= printed["final"]["within_1m"]["value"] <= 1.0
         info = RunFolder(tmp_path / "run").read_info()
         RunFolder(tmp_path / "run").write_info(dataclasses.replace(info, bundle="gone", data="gone"))
-        assert main(["score", str(tmp_path / "run"), "--json"]) == 0
+        assert main(["lab", "score", str(tmp_path / "run"), "--json"]) == 0
         (again,) = json.loads(capsys.readouterr().out).values()
         assert again == printed
-        assert main(["score", str(tmp_path / "run")]) == 0
+        assert main(["lab", "score", str(tmp_path / "run")]) == 0
         table = capsys.readouterr().out
         assert "4 queries" in table
         assert "too few queries for an interval: 4; give at least 20" in table
@@ -198,7 +198,7 @@ def test_scene_is_solved_as_one_album(tmp_path: Path, capsys: pytest.CaptureFixt
         "panorama,x_m,y_m,heading_deg\nbroken.jpg,2.9,1.5,335\n"
         "kitchen.jpg,7.1,2.2,250\nstudy.jpg,2.6,6.75,340\nphone.jpg,2.9,1.5,335\n"
     )
-    command = ["evaluate", "--albums", "--data", str(scene.parent), "--workers", "0", "--out", str(run)]
+    command = ["lab", "evaluate", "--albums", "--data", str(scene.parent), "--workers", "0", "--out", str(run)]
     assert main(command) != 0
     assert "scene 'flat', room 'broken.jpg'" in capsys.readouterr().err
     assert main([*command[:-1], str(tmp_path / "skipping"), "--skip-bad", "--json"]) == 0
@@ -210,7 +210,7 @@ def test_scene_is_solved_as_one_album(tmp_path: Path, capsys: pytest.CaptureFixt
     assert report["room_calibration_error"] == pytest.approx(1 / 3, abs=0.1)
     phone = RunFolder(tmp_path / "skipping").read_predictions()[2]
     assert (phone.room_rank, phone.clicks, list(phone.stages)) == (1, 1, ["album"])
-    assert main(["score", str(tmp_path / "skipping")]) == 0
+    assert main(["lab", "score", str(tmp_path / "skipping")]) == 0
     assert "corrections of an album until all rooms are right: 1.0" in capsys.readouterr().out
 
 
@@ -221,7 +221,7 @@ def test_scene_is_solved_as_one_album(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_options_of_single_photographs_are_refused_for_albums(
     options: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["evaluate", "--albums", *options]) != 0
+    assert main(["lab", "evaluate", "--albums", *options]) != 0
     assert ("--albums" if "--method" in options else options[-2]) in capsys.readouterr().err
 
 

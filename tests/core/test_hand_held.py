@@ -108,7 +108,7 @@ def test_calibration_of_turns_changes_their_confidence_alone(
     folder = tmp_path / "model"
     shutil.copytree(default_bundle(), folder)
     before = Bundle.open(folder)
-    assert main(["calibrate", "--bundle", str(folder), "--turns", "--homes", "2"]) == 0
+    assert main(["lab", "calibrate", "--bundle", str(folder), "--turns", "--homes", "2"]) == 0
     assert "turn_validation_heading_searched_confidence" in json.loads(capsys.readouterr().out)
     after = Bundle.open(folder)
     assert after.sha256 == before.sha256

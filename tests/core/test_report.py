@@ -124,7 +124,7 @@ def run_folder(path: Path, predictions: list[Prediction], **changes: Any) -> Pat
         "kind": "panorama",
         "dataset": "Somewhere3D",
         "data": str(path / "gone"),
-        "command": "lalaloc evaluate --data gone",
+        "command": "lalaloc lab evaluate --data gone",
     }
     folder = RunFolder(path)
     folder.write_info(run_info(**(values | changes)))
@@ -259,7 +259,7 @@ class TestFigures:
             "Somewhere3D, test split",
             "12 panorama queries",
             "1 without an answer",
-            "lalaloc evaluate --data",
+            "lalaloc lab evaluate --data",
         ):
             assert words in page.text
 

@@ -38,7 +38,7 @@ def result(dataset: str = "synthetic scenes (seed 0)", budget: str = "small") ->
         dataset=dataset,
         split="test",
         budget=budget,  # type: ignore[arg-type]
-        command="lalaloc reproduce",
+        command="lalaloc lab reproduce",
         columns=("pose_recall", "median_cm"),
         rows=(
             RowResult(
@@ -147,7 +147,7 @@ class TestRendering:
 
 class TestCommand:
     def test_list_names_every_table(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["reproduce", "--list"]) == 0
+        assert main(["lab", "reproduce", "--list"]) == 0
         printed = capsys.readouterr().out
         assert all(f"{table.name} " in printed for table in TABLES)
 
@@ -155,11 +155,11 @@ class TestCommand:
     def test_tables_share_runs(self, tmp_path: Path, tiny_bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
         data, out = str(tmp_path / "scenes"), tmp_path / "out"
         for split in ("validation", "test"):
-            assert main(["synth", "--scenes", "1", "--split", split, "--out", data, "--height", "64"]) == 0
+            assert main(["lab", "synth", "--scenes", "1", "--split", split, "--out", data, "--height", "64"]) == 0
         tables = ["similarity", "vogel-samples"]
         names = [word for name in tables for word in ("--table", name)]
         common = ["--data", data, "--out", str(out), "--bundle", str(tiny_bundle), "--limit", "3", "--workers", "0"]
-        assert main(["reproduce", *names, *common]) == 0
+        assert main(["lab", "reproduce", *names, *common]) == 0
         printed = capsys.readouterr().out
         assert "Layout-similarity metric" in printed
         similarity = TableResult.read(out / "tables" / "similarity.json")

@@ -353,7 +353,7 @@ class TestPages:
     def test_command_prints_common_features(
         self, layout_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        assert main(["worst", str(layout_run), "--count", "1", "--out", str(tmp_path)]) == 0
+        assert main(["lab", "worst", str(layout_run), "--count", "1", "--out", str(tmp_path)]) == 0
         assert json.loads(capsys.readouterr().out)["outcomes"]["no answer"] == 1
 
     def test_missing_query_is_named(self, layout_run: Path, tmp_path: Path) -> None:

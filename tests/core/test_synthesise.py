@@ -457,7 +457,7 @@ def test_full_disk_is_an_error_without_partial_scenes(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
 def test_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, ending: signal.Signals) -> None:
     program = "import sys; from lalaloc_core.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ["synth", "--scenes", "40", "--split", "test", "--out", str(tmp_path), "--height", "64"]
+    arguments = ["lab", "synth", "--scenes", "40", "--split", "test", "--out", str(tmp_path), "--height", "64"]
     process = subprocess.Popen(
         [sys.executable, "-c", program, *arguments, "--workers", "2"], start_new_session=True, stderr=subprocess.PIPE
     )
@@ -516,7 +516,7 @@ def test_too_many_scenes_for_a_split_are_refused(scenes: int, split: Any) -> Non
 @pytest.mark.slow
 def test_command_writes_and_extends_scenes(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "data"
-    common = ["synth", "--out", str(out), "--height", str(HEIGHT), "--seed", str(SEED)]
+    common = ["lab", "synth", "--out", str(out), "--height", str(HEIGHT), "--seed", str(SEED)]
     assert main([*common, "--scenes", "1", "--split", "test"]) == 0
     assert main([*common, "--scenes", "1", "--split", "validation"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"{out}: 1 validation; 1 of them new"
@@ -528,15 +528,15 @@ def test_command_writes_and_extends_scenes(root: Path, tmp_path: Path, capsys: p
 
 def test_folder_with_other_scenes_is_refused(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = content(root)
-    assert main(["synth", "--scenes", "3", "--out", str(root), "--height", "64", "--seed", str(SEED)]) == 2
+    assert main(["lab", "synth", "--scenes", "3", "--out", str(root), "--height", "64", "--seed", str(SEED)]) == 2
     message = capsys.readouterr().err
     assert f"its scenes were generated with height {HEIGHT}, not 64; width {2 * HEIGHT}, not 128" in message
     assert "seed" not in message
     assert content(root) == before
     (tmp_path / "scene_00000").mkdir()
-    assert main(["synth", "--scenes", "3", "--out", str(tmp_path)]) == 2
+    assert main(["lab", "synth", "--scenes", "3", "--out", str(tmp_path)]) == 2
     assert "holds 'scene_00000' but no synthetic.json" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert main(["synth", "--scenes", "3", "--out", str(tmp_path / "file")]) == 2
+    assert main(["lab", "synth", "--scenes", "3", "--out", str(tmp_path / "file")]) == 2
     assert "cannot be written: File exists" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"scene_00000", "file"}

@@ -199,7 +199,7 @@ class TestRuns:
             train_stage("layout", CONFIG, folder, device=CPU, workers=0, resume=True)
 
     def test_command_exits_with_2_at_a_bad_file(self, data: OwnData, capsys: pytest.CaptureFixture[str]) -> None:
-        words = ["train", "layout", "--preset", "tiny", "--steps", "3", "--workers", "0", "--device", "cpu"]
+        words = ["lab", "train", "layout", "--preset", "tiny", "--steps", "3", "--workers", "0", "--device", "cpu"]
         words += ["--data", str(data.root), "--out", str(data.root.parent / "run")]
         assert main(words) == 0
         (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")

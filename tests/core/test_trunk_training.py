@@ -396,15 +396,30 @@ class TestWarmStart:
 
     @pytest.mark.slow
     def test_command_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
-        words = ["train", "image", "--preset", "tiny", "--workers", "0", "--device", "cpu", "--out", str(tmp_path)]
+        words = [
+            "lab",
+            "train",
+            "image",
+            "--preset",
+            "tiny",
+            "--workers",
+            "0",
+            "--device",
+            "cpu",
+            "--out",
+            str(tmp_path),
+        ]
         words += ["--from", str(tiny_bundle), "--set", "image.uses_per_panorama=2", "--set", "image.batch=4"]
         words += ["--validation-homes", "1"]
         assert main([*words, "--steps", "1"]) == 0
         config = Checkpoint.load(tmp_path / "image.pt").config
         assert (config.image.uses_per_panorama, config.image.batch) == (2, 4)
         assert main([*words, "--resume"]) == 2
-        assert main(["train", "layout", "--out", str(tmp_path), "--set", "image.batch"]) == 2
-        assert main(["export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"]) == 0
+        assert main(["lab", "train", "layout", "--out", str(tmp_path), "--set", "image.batch"]) == 2
+        assert (
+            main(["lab", "export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"])
+            == 0
+        )
         assert Bundle.open(tmp_path / "b").manifest.training["image"]["checkpoint"] == "last"
 
 

@@ -1,4 +1,4 @@
-"""Calibration of a model bundle on generated validation homes: `lalaloc calibrate`.
+"""Calibration of a model bundle on generated validation homes: `lalaloc lab calibrate`.
 
 Begin with `calibration.py`, the procedure. It fits the weights of the matching cost and the confidence
 (`parameter_fits.py`), and what openings look like in photographs (`opening_appearance.py`). `measured_errors.py`

@@ -2,7 +2,7 @@
 
 FOLDER/photographs.json   all figures, and the figures of every photograph
 FOLDER/photographs.png    every photograph with the true and the predicted lines
-FOLDER/known, unknown     the runs in galleries, heading known and searched, for `lalaloc worst` and `lalaloc report`
+FOLDER/known, unknown     the runs in galleries, heading known and searched, for `lalaloc lab worst` and `report`
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
     folder = RunFolder(run)
     info, predictions = folder.read_info(), folder.read_predictions()
     if not predictions:
-        raise RunError(f"the run at '{run}' has no predictions; run `lalaloc evaluate` first")
+        raise RunError(f"the run at '{run}' has no predictions; run `lalaloc lab evaluate` first")
     chosen = choose_worst(predictions, count)
     analyser = _QueryAnalyser(info)
     queries: list[WorstQuery] = []

@@ -1,4 +1,4 @@
-"""Reproduction of every table of the paper: `lalaloc reproduce`.
+"""Reproduction of every table of the paper: `lalaloc lab reproduce`.
 
 Begin with `paper_tables.py`, the rows of each table and the paper's figures. `table_maker.py` trains, evaluates and
 scores a table, `ablations.py` has the trained variants, `result.py` writes tables as JSON and Markdown.

@@ -76,7 +76,7 @@ def markdown(table: TableResult) -> str:
     """Return a table as Markdown, with our figure and, in italics, the paper's in each cell."""
     same = table.dataset == _PAPER_DATA and table.budget == "full"
     lines = [
-        f"**{table.title}** (`{table.source}`, `lalaloc reproduce --table {table.name}`). Upright: ours, on "
+        f"**{table.title}** (`{table.source}`, `lalaloc lab reproduce --table {table.name}`). Upright: ours, on "
         f"{table.dataset}, {table.split} split, budget {table.budget}, with 95 % intervals. Italic: the paper's, on "
         f"{_PAPER_DATA}{'' if same else '; not the same experiment'}.",
         "",

@@ -91,7 +91,7 @@ class Table:
     """Table of the paper.
 
     Attributes:
-        name: name for `lalaloc reproduce --table`.
+        name: name for `lalaloc lab reproduce --table`.
         source: label of the paper's table or figure.
         form: a "figure" is also drawn; "times" runs one query at a time.
     """

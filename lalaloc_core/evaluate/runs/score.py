@@ -108,7 +108,7 @@ class Scores:
 def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
     """Score the predictions of one run; `seed` is that of the bootstrap."""
     if not predictions:
-        raise InvalidInputError("there are no predictions to score; run `lalaloc evaluate` first")
+        raise InvalidInputError("there are no predictions to score; run `lalaloc lab evaluate` first")
     bootstrap = _Bootstrap([prediction.scene for prediction in predictions], np.random.default_rng(seed))
     names = list(dict.fromkeys(name for prediction in predictions for name in prediction.stages))
     final = position_errors_m(predictions)

@@ -1,4 +1,4 @@
-"""Presets of `lalaloc train --preset`, including tiny ones for tests."""
+"""Presets of `lalaloc lab train --preset`, including tiny ones for tests."""
 
 from __future__ import annotations
 

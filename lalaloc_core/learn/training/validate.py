@@ -1,7 +1,7 @@
 """Validation during training: retrieval in scenes that are not trained on.
 
-Validation is fast: known heading, nearest grid latent, no refinement. `lalaloc evaluate` runs the full pipeline on the
-exported bundle.
+Validation is fast: known heading, nearest grid latent, no refinement. `lalaloc lab evaluate` runs the full pipeline
+on the exported bundle.
 """
 
 from __future__ import annotations

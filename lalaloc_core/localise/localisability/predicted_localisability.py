@@ -114,7 +114,7 @@ def errors_of(manifest: Manifest) -> Errors:
     view = manifest.view
     if manifest.errors is None or view is None or view.errors is None:
         raise InvalidInputError(
-            f"model '{manifest.name}' has no measured prediction errors; run `lalaloc calibrate --errors`"
+            f"model '{manifest.name}' has no measured prediction errors; run `lalaloc lab calibrate --errors`"
         )
     return Errors(manifest.errors, view.errors)
 

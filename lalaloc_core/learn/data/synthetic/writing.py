@@ -1,4 +1,4 @@
-"""Generated scenes on disk in Structured3D's layout: `lalaloc synth`.
+"""Generated scenes on disk in Structured3D's layout: `lalaloc lab synth`.
 
 A scene gets its final name when it is complete, so an interrupted run can continue. A scene depends on its number and
 the settings only, not on the run or the process that renders it.
