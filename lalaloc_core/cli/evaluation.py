@@ -13,8 +13,8 @@ from typing import Any, Literal
 from lalaloc_core.cli.lab import Command, check_range
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.dataset_names import Split
 from lalaloc_core.files import default_bundle
+from lalaloc_core.learn.dataset_names import Split
 
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4
