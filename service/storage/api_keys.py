@@ -176,7 +176,7 @@ class TenantLimits:
         return self._limits.get(tenant, _NO_LIMITS)
 
     def refresh(self) -> None:
-        """Read the limits; `Sweeper` calls this every `LALALOC_SWEEP_S`.
+        """Read the limits; `Sweeper` calls this every 5 s.
 
         Raises:
             StoreUnavailableError: the database is away; the limits of before stay.
