@@ -15,10 +15,10 @@ from service.http.problems import add_problems
 from service.schemas import EarthPoint, SessionDocument
 from service.schemas.admin import KeyDocument, RotationDocument, TenantLimitsDocument
 from service.schemas.albums import AlbumDocument, AlbumEvent, PhotographChangeDocument
+from service.schemas.fields import Problem
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.photographs import StatedIntrinsics
 from service.schemas.plan_import import ImportLine
-from service.schemas.problem_details import Problem
 from service.schemas.query_fields import PlanPoint
 from service.schemas.stored_plans import PlanEvent
 from service.schemas.venues import VenueChangeDocument, VenueDocument

@@ -21,7 +21,7 @@ from service.errors import (
 )
 from service.http.fields import describe_fault
 from service.problem_kinds import HTTP_PROBLEMS, INTERNAL, PROBLEMS, ProblemKind, problem_kind
-from service.schemas.problem_details import Fault, Problem
+from service.schemas.fields import Fault, Problem
 from service.security.access_control import routed_path
 from service.security.permissions import permissions_needed
 from service.telemetry import add_log_fields, request_id_of

@@ -2,10 +2,10 @@
 
 Begin with `single_query.py`, whose `_search` shows the flow: photograph, ground, steps, answer. `sequence_query.py`
 does the same for several photographs and `session_query.py` for the next photograph of a session, `album_search.py` for
-albums; `localiser.py` calls them. `photograph_reader.py` decodes and encodes photographs. `grounds.py` waits for the
-plan or venue of a query and returns its `ground.py`. `executor.py` runs the steps, `lpo_pool.py` the refinement in
-worker processes; the core composes the answer, and `answers.py` names its stored plans, and `geopose.py` translates
-answers. `queries.py` has the queries.
+albums; `localiser.py` calls them. `photograph_reader.py` decodes and encodes photographs. `grounds.py` reads what a
+request states about the camera, waits for its plan or venue, and returns its `ground.py`. `executor.py` runs the steps,
+`lpo_pool.py` the refinement in worker processes; the core composes the answer, and `answers.py` names its stored plans.
+`geopose.py` translates answers. `queries.py` has the queries.
 """
 
 from service.capacity.query_context import QueryContext

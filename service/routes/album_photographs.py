@@ -53,7 +53,7 @@ from service.schemas.albums import (
     PhotographFacts,
     PinAnswer,
 )
-from service.schemas.problem_details import Problem
+from service.schemas.fields import Problem
 from service.security import caller_of
 from service.storage.album_rows import AlbumRecord, NewPhotograph, PhotographRecord
 from service.storage.records import PlanRecord, VenuePlace

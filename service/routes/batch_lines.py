@@ -16,7 +16,7 @@ from service import errors
 from service.http.problems import problem_document
 from service.query import Content, QueryContext
 from service.routes.dependencies import ApiCall
-from service.schemas.problem_details import Problem
+from service.schemas.fields import Problem
 from service.telemetry import LOGGER_NAME
 from service.uploaded_file import UploadedFile
 

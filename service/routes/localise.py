@@ -1,22 +1,23 @@
-"""Queries: localise a photograph in a floor plan or a venue."""
+"""Queries about single photographs in a floor plan or a venue, batches of them, and kept answers."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Response, status
 
 from lalaloc_core.draw.answer import Picture
 from lalaloc_core.errors import InvalidHintError
-from service.capacity.admission_control import QUERY, admitted_as
-from service.errors import InvalidRequestError, UnanchoredPlanError
+from service import errors
+from service.capacity.admission_control import QUERY, QUERY_IN_PARTS, admitted_as
 from service.http.problems import problem_responses
-from service.http.representations import preferred
-from service.http.uploads import GEOJSON, GEOPOSE, JSON
-from service.query import PhotographQuery, PictureQuery
+from service.http.representations import NDJSON, LinesResponse, preferred
+from service.http.uploads import GEOJSON, GEOPOSE, JSON, Repeats
+from service.query import Content, PhotographQuery, PictureQuery, QueryContext
 from service.query.geopose import geojson_feature, geopose_document
-from service.routes.dependencies import Call
-from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
+from service.routes.batch_lines import BatchLines
+from service.routes.dependencies import Call, is_id
+from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS, READ_ERRORS
 from service.routes.query_request import (
     FEATURES,
     PHOTO,
@@ -29,7 +30,11 @@ from service.routes.query_request import (
     read_query,
 )
 from service.schemas import LocaliseAnswer, LocaliseForm
+from service.schemas.fields import Problem
+from service.schemas.localise_answer import BatchLine
+from service.security import caller_of
 from service.storage.records import PlanRecord
+from service.uploaded_file import UploadedFile
 
 router = APIRouter(tags=["localisation"])
 _PNG, _SVG = "image/png", "image/svg+xml"
@@ -66,7 +71,9 @@ _ON_EARTH = {GEOJSON: geojson_feature, GEOPOSE: geopose_document}
             },
         }
     }
-    | problem_responses(InvalidHintError, UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS),
+    | problem_responses(
+        InvalidHintError, errors.UnanchoredPlanError, *PLACE_ERRORS, *QUERY_ERRORS, *IDEMPOTENCY_ERRORS
+    ),
 )
 @admitted_as(QUERY)
 async def localise(
@@ -93,17 +100,19 @@ async def localise(
     media = preferred(call.request, (JSON, _PNG, _SVG, *_ON_EARTH))
     is_picture = media in (_PNG, _SVG)
     if picture is not None and not is_picture:
-        raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
+        raise errors.InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
     idempotent = call.idempotent(media)
     form, parts, context = await read_query(call, LocaliseForm, "max_photograph_bytes", files={PHOTO})
     if form.venue_id is not None and is_picture:
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [("venue_id", f"cannot be drawn as {media}: a picture shows one plan; set floorplan_id")]
         )
     (content,) = photographs_of(parts, form, call)
     if parts.named(FEATURES):
         if picture in ("both", "photograph"):
-            raise InvalidRequestError([("picture", f"is '{picture}', but {FEATURES} have no photograph; set plan")])
+            raise errors.InvalidRequestError(
+                [("picture", f"is '{picture}', but {FEATURES} have no photograph; set plan")]
+            )
         picture = "plan" if is_picture else None
 
     async def respond(_token: str) -> Response:
@@ -129,3 +138,80 @@ async def localise(
         return Response(drawing, headers=VARY | _POLICY, media_type=media)
 
     return await idempotent.run_async(parts, respond, call.runtime.reads)
+
+
+_PHOTOS_SCHEMA: dict[str, Any] = {
+    "type": "array",
+    "items": {"type": "string", "format": "binary"},
+    "minItems": 1,
+    "description": "Photographs, one part named `photo` each, as for `POST /localise`; limits: "
+    "`max_batch_photographs`, and `max_sequence_bytes` together.",
+}
+
+
+@router.post(
+    "/localise/batch",
+    summary="Localise many photographs, one by one",
+    status_code=200,
+    response_class=LinesResponse,
+    response_model=BatchLine,
+    openapi_extra=body_schema(LocaliseForm, _PHOTOS_SCHEMA, idempotent=False),
+    responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
+    | problem_responses(
+        InvalidHintError, errors.RateLimitedError, errors.UnknownVenueError, errors.UnknownFloorPlanError, *QUERY_ERRORS
+    ),
+)
+@admitted_as(QUERY_IN_PARTS)
+async def localise_batch(call: Call) -> Response:
+    """Localise many photographs, each by itself, in a stored floor plan or in the plans of a venue.
+
+    The fields hold for all photographs. The answer is a stream of lines of JSON, one per photograph in the order of the
+    request, each sent as soon as it is computed. A photograph that cannot be localised gets a line with the problem
+    that `POST /localise` would answer with; the others continue. Each photograph has the deadline of a query and counts
+    as a request for the rate limit. The batch ends if its client leaves, or does not take a line within
+    `request_deadline_s`.
+    """
+    call.idempotent(NDJSON)
+    settings = call.settings
+    most = settings.photographs.max_batch_photographs
+    repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
+    form, parts, _ = await read_query(call, LocaliseForm, "max_sequence_bytes", repeated=repeated)
+    files = parts.named(PHOTO) or parts.named(FEATURES)
+    photographs = list(zip(files, photographs_of(parts, form, call), strict=True))
+    await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(photographs))
+    place = await call.place(form.floorplan_id, form.venue_id)
+
+    async def answer(_index: int, _file: UploadedFile, content: Content, context: QueryContext) -> LocaliseAnswer:
+        found = await call.runtime.localiser.answer(place, PhotographQuery(form, content, context))
+        return await keep_answer(found, call)
+
+    return LinesResponse(BatchLines(call, answer, _line).lines(photographs), settings.requests.request_deadline_s)
+
+
+def _line(
+    index: int, name: str | None, answer: LocaliseAnswer | None, problem: Problem | None, retry_after_s: int | None
+) -> BatchLine:
+    status = 200 if problem is None else problem.status
+    return BatchLine(index=index, name=name, status=status, answer=answer, problem=problem, retry_after_s=retry_after_s)
+
+
+_KEPT = problem_responses(errors.UnknownAnswerError, *READ_ERRORS)
+
+
+@router.get("/answers/{answer_id}", summary="Get a kept answer", response_model=LocaliseAnswer, responses=_KEPT)
+def get_answer(answer_id: str, call: Call) -> Response:
+    """Return the answer to an earlier query, byte for byte, while it is kept. Photographs are never kept."""
+    kept_s = call.settings.storage.keep_answers_s
+    content = call.store.answers.get(call.tenant, answer_id, kept_s=kept_s) if is_id(answer_id) else None
+    if content is None:
+        raise errors.UnknownAnswerError(answer_id)
+    return Response(content, media_type=JSON)
+
+
+@router.delete(
+    "/answers/{answer_id}", status_code=status.HTTP_204_NO_CONTENT, summary="Delete a kept answer", responses=_KEPT
+)
+def delete_answer(answer_id: str, call: Call) -> None:
+    """Delete a kept answer before it expires."""
+    if not is_id(answer_id) or not call.store.answers.delete(call.tenant, answer_id):
+        raise errors.UnknownAnswerError(answer_id)

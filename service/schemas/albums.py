@@ -7,12 +7,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.schemas.fields import Degrees, HeadingDeg, Metres, ResponseModel, Score, Share, SignedDegrees
+from service.schemas.fields import Degrees, HeadingDeg, Metres, Problem, ResponseModel, Score, Share, SignedDegrees
 from service.schemas.localise_answer import GeoPose, Position
-from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import PhotographFields, ReadView
-from service.schemas.problem_details import Problem
-from service.schemas.query_fields import HeightFields, PlaceFields, PlanPoint
+from service.schemas.query_fields import HEADING_MEANING, HeightFields, PlaceFields, PlanPoint
 from service.schemas.venues import Document, Name
 
 PinStateName = Literal["sure", "uncertain", "set_aside", "corrected"]

@@ -13,14 +13,14 @@ from service.schemas.fields import (
     Mass,
     Metres,
     Milliseconds,
+    Problem,
     ResponseModel,
     Score,
     Share,
     Variance,
 )
-from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import ViewAnswer
-from service.schemas.problem_details import Problem
+from service.schemas.query_fields import HEADING_MEANING
 
 
 class GeoPosePosition(ResponseModel):

@@ -8,8 +8,16 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from lalaloc_core.photograph import Intrinsics, StatedCamera
 from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
-from service.schemas.fields import Degrees, Finite, ResponseModel, Score, Share, SignedDegrees
-from service.schemas.form_validators import parse_json, reject_underscores
+from service.schemas.fields import (
+    Degrees,
+    Finite,
+    ResponseModel,
+    Score,
+    Share,
+    SignedDegrees,
+    parse_json,
+    reject_underscores,
+)
 
 Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
 ValueSource = Literal["given", "gpano", "exif", "estimated", "assumed"]

@@ -6,9 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.schemas.fields import ResponseModel
+from service.schemas.fields import Problem, ResponseModel
 from service.schemas.native_plan import OpeningKind
-from service.schemas.problem_details import Problem
 
 
 class _FileOptions(BaseModel):

@@ -1,9 +1,9 @@
-"""Form fields that queries share: camera height, number of candidates, hints about the place."""
+"""Form fields that queries share: camera height, number of candidates, hints about the place; form of a query."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
@@ -11,8 +11,8 @@ from pydantic_core import PydanticCustomError
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.localise.query import DEFAULT_STD_M, RADIUS_RANGE_M, UNKNOWN_RANGE_M
-from service.schemas.fields import Finite
-from service.schemas.form_validators import parse_json, reject_underscores
+from service.schemas.fields import Finite, needs, parse_json, reject_underscores
+from service.schemas.photographs import PhotographFields
 
 
 class HeightFields(BaseModel):
@@ -170,4 +170,52 @@ class HintFields(BaseModel):
         # An invalid point is missing from the data and reported already.
         if "near" in given.data and (given.data["near"] is None) != (value is None):
             raise ValueError("needs near" if value is not None else "is missing; near needs a radius")
+        return value
+
+
+HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
+
+
+class LocaliseForm(PlaceFields, CameraFields, HintFields, PhotographFields):
+    """Form fields of a query, without the photograph; an empty field counts as left out."""
+
+    heading_deg: Annotated[float, Finite] | None = Field(
+        None,
+        ge=-360,
+        le=360,
+        description=f"The {HEADING_MEANING}. Default: the heading in the photograph's metadata "
+        "(`GPano:PoseHeadingDegrees`) if the plan has `north_deg`; else all headings are searched.",
+    )
+    heading_tolerance_deg: Annotated[float, Finite] = Field(
+        0.0,
+        ge=0,
+        le=45,
+        description="Tolerance of `heading_deg`: headings within it are searched and refined. 0: the heading is exact. "
+        "Needs `heading_deg`.",
+    )
+    refine: Literal["none", "vdr", "lpo"] = Field(
+        "lpo",
+        description="Last stage: nearest pose of the grid (`none`), denser poses around it (`vdr`), or pose refinement "
+        "(`lpo`).",
+    )
+
+    include: Literal["posterior"] | None = Field(
+        None, description="Extra part of the answer: the posterior over all places of the plan."
+    )
+
+    @field_validator("include")
+    @classmethod
+    def _check_include(cls, value: str | None, given: ValidationInfo) -> str | None:
+        if value is not None and given.data.get("venue_id") is not None:
+            raise ValueError("works for one plan, not for a venue")
+        return value
+
+    _check_numbers = field_validator("heading_deg", "heading_tolerance_deg", mode="before")(reject_underscores)
+    _check_tolerance = field_validator("heading_tolerance_deg")(needs("heading_deg"))
+
+    @field_validator("floorplan_id")
+    @classmethod
+    def _check_level(cls, value: str | None, given: ValidationInfo) -> str | None:
+        if value is not None and given.data.get("level") is not None:
+            raise ValueError("level needs venue_id instead of floorplan_id")
         return value

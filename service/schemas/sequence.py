@@ -9,8 +9,18 @@ from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_va
 from pydantic.json_schema import SkipJsonSchema
 
 from lalaloc_core.localise.sequence.measured_motion import MIN_ANGLE_STD
-from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
-from service.schemas.form_validators import needs, parse_json, reject_underscores
+from service.schemas.fields import (
+    Degrees,
+    Finite,
+    HeadingDeg,
+    Metres,
+    ResponseModel,
+    Score,
+    Share,
+    needs,
+    parse_json,
+    reject_underscores,
+)
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.photographs import PhotographFields, ViewAnswer
 from service.schemas.query_fields import CameraFields, PlaceFields

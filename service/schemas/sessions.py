@@ -11,12 +11,20 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN, usual_stds
-from service.schemas.fields import Finite, HeadingDeg, Metres, ResponseModel, Share, Variance
-from service.schemas.form_validators import needs, parse_json, reject_underscores
+from service.schemas.fields import (
+    Finite,
+    HeadingDeg,
+    Metres,
+    ResponseModel,
+    Share,
+    Variance,
+    needs,
+    parse_json,
+    reject_underscores,
+)
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
-from service.schemas.localise_query import HEADING_MEANING
 from service.schemas.photographs import PhotographFields, ReadView
-from service.schemas.query_fields import CameraFields, EarthPoint, PlaceFields, PlanPoint
+from service.schemas.query_fields import HEADING_MEANING, CameraFields, EarthPoint, PlaceFields, PlanPoint
 
 # `Odometry` checks the limits of motions, which this only describes.
 Step = Annotated[float, Finite, Field(json_schema_extra={"minimum": -MAX_STEP_M, "maximum": MAX_STEP_M})]
