@@ -120,10 +120,10 @@ class ReportBuilder:
     def build(self) -> ImportReport:
         """Return the finished report."""
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
-        facts = {name: value for name, value in vars(self).items() if name != "uses"}
-        texts = {name: _limit_lines(facts[name]) for name in ("notes", "warnings", "unsure", "rejected_texts")}
+        facts: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "uses"}
+        facts |= {name: _limit_lines(facts[name]) for name in ("notes", "warnings", "unsure", "rejected_texts")}
         outlines = tuple(_outline(area) for area in self.no_room[:_MAX_AREAS])
-        return ImportReport(**facts | texts | {"layers": tuple(layers[:_MAX_LINES]), "no_room": outlines})
+        return ImportReport(**facts | {"layers": tuple(layers[:_MAX_LINES]), "no_room": outlines})
 
 
 @dataclass

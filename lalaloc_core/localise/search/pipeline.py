@@ -365,7 +365,9 @@ class _Search:
     def localisation(self, stages: Sequence[_Stage]) -> Localisation:
         """Return the distinct candidates of the last stage, best first, and the evidence after every stage."""
         config, hints, last = self._config, self._hints, stages[-1]
-        by_stage = {stage.name: self._first(stage) for stage in stages[:-1]}
+        by_stage: dict[SearchStage, tuple[Candidate, Posterior]] = {
+            stage.name: self._first(stage) for stage in stages[:-1]
+        }
         wanted = max(self._top_k, self._refined) if config.by_probability else self._top_k
         answers = distinct(last.candidates, self.query, config.separation_m, wanted)
         found = self._posterior(last, answers)
