@@ -43,7 +43,7 @@ def add_command(commands: Any, name: str, command: Command) -> None:
     parser.add_argument(
         "words",
         nargs="*",
-        metavar=f"CONFIGURATION|{positional.upper()}|KEY=VALUE",
+        metavar="WORD",
         help="file of the configuration, .toml or .json; values by the names of the options; and the value of "
         f"--{positional}",
     )

@@ -233,9 +233,9 @@ class TestTurn:
         ("fields", "field", "message"),
         [
             ({"relative_heading_deg": "[0, 60]"}, "relative_heading_deg", "has 2 items, 3 photographs need 3"),
-            ({"motion": "walk", "relative_heading_deg": "[0, 1, 2]"}, "relative_heading_deg", "needs motion=turn"),
+            ({"motion": "walk", "relative_heading_deg": "[0, 1, 2]"}, "motion", "of a walk"),
             ({"motions": "[null, null]"}, "motions", "of a walk"),
-            ({"motion": "fly"}, "motion", "'walk' or 'turn'"),
+            ({"motion": "fly"}, "motion", "must be 'turn'"),
         ],
     )
     def test_contradictory_fields_are_refused(
