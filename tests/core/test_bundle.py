@@ -143,6 +143,7 @@ class TestExport:
         with pytest.raises(BundleError, match="layout queries only"):
             encoders.spheres.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
 
+    @pytest.mark.slow
     def test_network_that_differs_from_torch_is_not_exported(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -137,6 +137,10 @@ def start_app(
     request: pytest.FixtureRequest, tiny_bundle: Path, database_of: DatabaseOf, empty_database: Path
 ) -> StartApp:
     """Start the production app in this process, by default without LPO workers."""
+    # The imports of all workers are done before any request has a time limit.
+    first = multiprocessing.get_context("forkserver").Process(target=int)
+    first.start()
+    first.join()
 
     @contextmanager
     def start(data_dir: Path, **overrides: Any) -> Iterator[httpx.Client]:
