@@ -1,4 +1,4 @@
-"""Render the example panoramas and a phone photograph, write the panoramas' true poses, and draw pictures for docs/.
+"""Render the example spheres and a phone photograph, write the spheres' true poses, and draw pictures for docs/.
 
 Run `python -m examples.make_examples` after a change of the flat, the views or the renderer. The flat was drawn by
 hand, and no training data contains its plan, furniture or lighting. The pictures are those of
@@ -18,7 +18,7 @@ from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.homes import Home, Opening, OpeningKind
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Shot
+from lalaloc_core.learn.synth.rendering.sphere_renderer import Shot, SphereRenderer
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.spheres import level
@@ -45,7 +45,7 @@ class Hole:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Panorama: its file, its camera pose, and the seed of furniture, materials and lighting."""
+    """Sphere: its file, its camera pose, and the seed of furniture, materials and lighting."""
 
     file: str
     position_m: tuple[float, float]
@@ -100,7 +100,7 @@ def main() -> None:
     """Render every view of the flat and write the true poses."""
     home = example_home()
     materials = MaterialLibrary.create(np.random.default_rng(_MATERIALS_SEED))
-    renderer = PanoramaRenderer(materials, height=HEIGHT, width=WIDTH, supersample=_SUPERSAMPLE)
+    renderer = SphereRenderer(materials, height=HEIGHT, width=WIDTH, supersample=_SUPERSAMPLE)
     for view in VIEWS:
         (pixels,) = renderer.render([shot_of(home, view)]).numpy()
         Image.fromarray(pixels).save(FOLDER / view.file, quality=_JPEG_QUALITY, optimize=True)
@@ -112,7 +112,7 @@ def main() -> None:
 
 def _write_phone_photograph(home: Home, materials: MaterialLibrary) -> None:
     height, width = _PHONE_SPHERE
-    (sphere,) = PanoramaRenderer(materials, height=height, width=width).render([shot_of(home, PHONE)]).numpy()
+    (sphere,) = SphereRenderer(materials, height=height, width=width).render([shot_of(home, PHONE)]).numpy()
     camera = Perspective.of_hfov(*_PHONE_SIZE, _PHONE_HFOV)
     pixels = cut_view(sphere, camera, azimuth=0.0, pitch=_PHONE_PITCH, roll=_PHONE_ROLL)
     exif = Image.Exif()

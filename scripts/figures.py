@@ -19,9 +19,9 @@ PAPER_TABLES = ROOT / "docs" / "tables"
 MANIFEST = ROOT / "models" / "default" / "manifest.json"
 
 _ACCURACY_ROWS = {
-    "panorama_full": "furnished, known heading",
-    "panorama_full_unknown_heading": "furnished, unknown heading",
-    "panorama_empty": "unfurnished, known heading",
+    "sphere_full": "furnished, known heading",
+    "sphere_full_unknown_heading": "furnished, unknown heading",
+    "sphere_empty": "unfurnished, known heading",
     "heldout_full": "out-of-distribution, furnished, known heading",
     "heldout_full_unknown_heading": "out-of-distribution, furnished, unknown heading",
     "heldout_empty": "out-of-distribution, unfurnished, known heading",

@@ -1,4 +1,4 @@
-"""Synthetic panoramas of empty rectangular rooms: every pixel is floor, wall or ceiling."""
+"""Synthetic spheres of empty rectangular rooms: every pixel is floor, wall or ceiling."""
 
 from __future__ import annotations
 

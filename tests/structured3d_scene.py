@@ -143,20 +143,18 @@ def write_scene(
     appearances: Sequence[tuple[str, str]] = (("full", "warm"),),
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> None:
-    """Write a scene's annotation and the panoramas of its cameras."""
+    """Write a scene's annotation and the spheres of its cameras."""
     folder.mkdir(parents=True)
     write_annotation(folder, drawing_of(plan, rng, floor_m).to_document(rng))
     for stand in stands:
-        panorama = folder / "2D_rendering" / room_id(stand.room_index) / "panorama"
-        panorama.mkdir(parents=True)
-        write_camera(panorama, 1000.0 * stand.x_m, 1000.0 * stand.y_m, 1000.0 * (floor_m + stand.height_m))
+        sphere = folder / "2D_rendering" / room_id(stand.room_index) / "panorama"
+        sphere.mkdir(parents=True)
+        write_camera(sphere, 1000.0 * stand.x_m, 1000.0 * stand.y_m, 1000.0 * (floor_m + stand.height_m))
         for furniture, lighting in appearances:
-            (panorama / furniture).mkdir(exist_ok=True)
+            (sphere / furniture).mkdir(exist_ok=True)
             pixels = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
-            Image.fromarray(pixels).save(panorama / furniture / f"rgb_{lighting}light.png")
-            Image.fromarray(depth_mm(plan.rooms[stand.room_index], stand, size)).save(
-                panorama / furniture / "depth.png"
-            )
+            Image.fromarray(pixels).save(sphere / furniture / f"rgb_{lighting}light.png")
+            Image.fromarray(depth_mm(plan.rooms[stand.room_index], stand, size)).save(sphere / furniture / "depth.png")
 
 
 def write_annotation(folder: Path, document: dict[str, Any]) -> None:
@@ -164,13 +162,13 @@ def write_annotation(folder: Path, document: dict[str, Any]) -> None:
     (folder / "annotation_3d.json").write_text(json.dumps(document), encoding="utf-8")
 
 
-def write_camera(panorama: Path, x_mm: float, y_mm: float, z_mm: float) -> None:
+def write_camera(sphere: Path, x_mm: float, y_mm: float, z_mm: float) -> None:
     """Replace a camera's position."""
-    (panorama / "camera_xyz.txt").write_text(f"{x_mm} {y_mm} {z_mm}\n", encoding="ascii")
+    (sphere / "camera_xyz.txt").write_text(f"{x_mm} {y_mm} {z_mm}\n", encoding="ascii")
 
 
 def write_synthetic(root: Path, **changes: Any) -> None:
-    """Mark a folder as generated scenes with small panoramas."""
+    """Mark a folder as generated scenes with small spheres."""
     document = {"format": 1, "seed": 5, "height": HEIGHT, "width": WIDTH, "textures": None, **changes}
     (root / "synthetic.json").write_text(json.dumps(document), encoding="utf-8")
 

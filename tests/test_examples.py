@@ -1,4 +1,4 @@
-"""Example flat, its panoramas, and the demo."""
+"""Example flat, its spheres, and the demo."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def train(folder: Path) -> Path:
 
     torch.set_num_threads(1)
     device = torch.device("cpu")
-    # Rendering the usual number of validation panoramas would take longer than the training.
+    # Rendering the usual number of validation spheres would take longer than the training.
     data = TrainingData(validation_scenes=2)
     train_stage("layout", PRESETS["tiny"], folder, device=device, data=data, workers=0)
     train_stage("image", PRESETS["tiny"], folder, device=device, data=data, workers=0)

@@ -1,6 +1,6 @@
 """Small homes in ZInD's structure with known poses.
 
-A right-handed plan with true poses is mirrored into ZInD's frame, and every panorama gets a frame of its own with a
+A right-handed plan with true poses is mirrored into ZInD's frame, and every sphere gets a frame of its own with a
 random turn, scale and place. Its picture is painted from that frame alone, by ZInD's rule that a point (x, y) is seen
 at the image azimuth atan2(-x, y): each wall in a colour of its own, floor and ceiling in grey.
 """
@@ -28,8 +28,8 @@ FLOOR_GREY, CEILING_GREY = 60, 200
 
 
 @dataclass(frozen=True, kw_only=True)
-class TruePanorama:
-    """True pose of a panorama in the plan frame: metres, radians clockwise from +y."""
+class TrueSphere:
+    """True pose of a sphere in the plan frame: metres, radians clockwise from +y."""
 
     room_index: int
     x_m: float
@@ -39,16 +39,16 @@ class TruePanorama:
     primary: bool = True
 
     def name(self, number: int) -> str:
-        """Return the camera's name of panorama `number` of its floor."""
+        """Return the camera's name of sphere `number` of its floor."""
         return f"partial_room_{self.room_index + 1:02d}_pano_{number}"
 
 
-PANORAMAS = (
-    TruePanorama(room_index=0, x_m=1.2, y_m=1.4, heading=0.7),
-    TruePanorama(room_index=0, x_m=3.1, y_m=1.0, heading=4.0, primary=False),
-    TruePanorama(room_index=1, x_m=5.2, y_m=1.2, heading=2.9),
-    TruePanorama(room_index=2, x_m=2.0, y_m=4.8, heading=5.9),
-    TruePanorama(room_index=2, x_m=4.4, y_m=5.0, heading=1.6, primary=False),
+SPHERES = (
+    TrueSphere(room_index=0, x_m=1.2, y_m=1.4, heading=0.7),
+    TrueSphere(room_index=0, x_m=3.1, y_m=1.0, heading=4.0, primary=False),
+    TrueSphere(room_index=1, x_m=5.2, y_m=1.2, heading=2.9),
+    TrueSphere(room_index=2, x_m=2.0, y_m=4.8, heading=5.9),
+    TrueSphere(room_index=2, x_m=4.4, y_m=5.0, heading=1.6, primary=False),
 )
 
 
@@ -60,7 +60,7 @@ def wall_colour(wall: int) -> tuple[int, int, int]:
 def write_home(
     folder: Path,
     plan: FloorPlan,
-    panoramas: Sequence[TruePanorama],
+    spheres: Sequence[TrueSphere],
     rng: np.random.Generator,
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> None:
@@ -68,10 +68,10 @@ def write_home(
     (folder / "panos").mkdir(parents=True)
     scale_m = float(rng.uniform(0.5, 3.0))
     floor: dict[str, Any] = {}
-    for number, panorama in enumerate(panoramas):
-        room = f"room_{panorama.room_index + 1:02d}"
-        image_path = f"panos/{FLOOR}_{panorama.name(number)}.jpg"
-        data, vertices = _panorama_data(plan, panorama, scale_m, rng)
+    for number, sphere in enumerate(spheres):
+        room = f"room_{sphere.room_index + 1:02d}"
+        image_path = f"panos/{FLOOR}_{sphere.name(number)}.jpg"
+        data, vertices = _sphere_data(plan, sphere, scale_m, rng)
         data["image_path"] = image_path
         floor.setdefault(f"complete_{room}", {}).setdefault(f"partial_{room}", {})[f"pano_{number}"] = data
         Image.fromarray(_painted(vertices, data["ceiling_height"], size)).save(folder / image_path, quality=95)
@@ -84,22 +84,22 @@ def write_homes(root: Path, rng: np.random.Generator, size: tuple[int, int] = (H
     root.mkdir(parents=True, exist_ok=True)
     for homes in PARTITION.values():
         for home in homes:
-            write_home(root / home, crooked_flat(), PANORAMAS, rng, size)
+            write_home(root / home, crooked_flat(), SPHERES, rng, size)
     (root / "zind_partition.json").write_text(json.dumps(PARTITION), encoding="utf-8")
 
 
-def _panorama_data(
-    plan: FloorPlan, panorama: TruePanorama, scale_m: float, rng: np.random.Generator
+def _sphere_data(
+    plan: FloorPlan, sphere: TrueSphere, scale_m: float, rng: np.random.Generator
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """Return the file's entry of a panorama, and its room's vertices in the panorama's frame."""
-    room = plan.rooms[panorama.room_index]
+    """Return the file's entry of a sphere, and its room's vertices in the sphere's frame."""
+    room = plan.rooms[sphere.room_index]
     mirror = np.array([-1.0, 1.0])
-    # The panorama's frame has the camera height as its unit, and the centre column along +y.
-    scale = panorama.height_m / scale_m
-    translation = np.array([panorama.x_m, panorama.y_m]) * mirror / scale_m
+    # The sphere's frame has the camera height as its unit, and the centre column along +y.
+    scale = sphere.height_m / scale_m
+    translation = np.array([sphere.x_m, sphere.y_m]) * mirror / scale_m
     turns = 360.0 * int(rng.integers(-1, 2))
     # In the mirrored frame, clockwise becomes counter-clockwise.
-    angle = panorama.heading
+    angle = sphere.heading
     cosine, sine = math.cos(angle), math.sin(angle)
 
     def own(points: np.ndarray) -> np.ndarray:
@@ -111,12 +111,12 @@ def _panorama_data(
     internal = [own(hole[[*range(len(hole)), 0]]).tolist() for hole in room.holes_m]
     layout = {"vertices": vertices.tolist(), "doors": [], "windows": [], "openings": [], "internal": internal}
     data = {
-        "label": f"label {panorama.room_index + 1}",
-        "is_primary": panorama.primary,
+        "label": f"label {sphere.room_index + 1}",
+        "is_primary": sphere.primary,
         "is_inside": True,
         "is_ceiling_flat": True,
         "camera_height": 1.0,
-        "ceiling_height": room.ceiling_height_m / panorama.height_m,
+        "ceiling_height": room.ceiling_height_m / sphere.height_m,
         "floor_number": 1,
         "floor_plan_transformation": {
             "translation": translation.tolist(),
@@ -130,7 +130,7 @@ def _panorama_data(
 
 
 def _painted(vertices: np.ndarray, ceiling_height: float, size: tuple[int, int]) -> np.ndarray:
-    """Paint the panorama of a room in the panorama's frame, the camera at its origin, one unit above the floor."""
+    """Paint the sphere of a room in the sphere's frame, the camera at its origin, one unit above the floor."""
     height, width = size
     pixels = np.zeros((height, width, 3), dtype=np.uint8)
     walls = [shapely.LineString([vertex, vertices[(k + 1) % len(vertices)]]) for k, vertex in enumerate(vertices)]

@@ -54,7 +54,7 @@ class Evaluate:
 
     bundle: Path = field(default_factory=default_bundle)
     method: Literal["lalaloc", "oracle", "icp", "explicit", "decode"] = "lalaloc"
-    kind: Literal["layout", "panorama"] = "panorama"
+    kind: Literal["layout", "photograph"] = "sphere"
     data: Path | None = None
     dataset: Literal["structured3d", "zind", "own", "annotated"] | None = None
     generator: Literal["synth", "heldout"] = "synth"
@@ -159,7 +159,7 @@ def _evaluate(arguments: Evaluate) -> None:
     from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
     from lalaloc_core.evaluate.runs.score import score_run
 
-    method, panorama = arguments.method, arguments.kind == "panorama"
+    method, is_photograph = arguments.method, arguments.kind == "photograph"
     bundle = None if method in ("oracle", "icp") else arguments.bundle
     _check_options(arguments)
     given = {"refine": arguments.refine, "heading_error_deg": arguments.heading_error}
@@ -186,7 +186,7 @@ def _evaluate(arguments: Evaluate) -> None:
     )
     dataset = build_dataset(info)
     appearance = choose_appearance(dataset, arguments.furniture, arguments.lighting)
-    shown = {"furniture": appearance.furniture, "lighting": appearance.lighting} if panorama else {}
+    shown = {"furniture": appearance.furniture, "lighting": appearance.lighting} if is_photograph else {}
     info = replace(info, dataset=dataset.description, **shown)
     with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as temporary:
         folder = RunFolder(arguments.out or Path(temporary))
@@ -201,7 +201,7 @@ def _evaluate(arguments: Evaluate) -> None:
 def _check_options(arguments: Evaluate) -> None:
     """Check that the options of `evaluate` belong together."""
     method, kind = arguments.method, arguments.kind
-    photographs = kind == "panorama" and method == "lalaloc"
+    photographs = kind == "photograph" and method == "lalaloc"
     if arguments.data is None and arguments.dataset is not None:
         raise InvalidInputError(f"--dataset {arguments.dataset} needs --data, which is missing")
     if arguments.data is not None and arguments.generator != "synth":

@@ -19,7 +19,7 @@ class Synth:
         scenes: number of scenes in total; existing ones are kept.
         out: folder of the data set.
         split: split.
-        height: height of a panorama in pixels, half its width.
+        height: height of a sphere in pixels, half its width.
         seed: random seed of generated homes.
         textures: folder of material pictures for generated homes (default: procedural materials).
         workers: rendering processes.
@@ -36,7 +36,7 @@ class Synth:
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSheet:
-    """Write a picture with examples of synthetic panoramas.
+    """Write a picture with examples of synthetic spheres.
 
     Attributes:
         out: picture to write.
@@ -66,7 +66,7 @@ def _synth(arguments: Synth) -> None:
 def _contact_sheet(arguments: ContactSheet) -> None:
     import numpy as np
 
-    from lalaloc_core.learn.synth.rendering.panorama import contact_sheet
+    from lalaloc_core.learn.synth.rendering.sphere_renderer import contact_sheet
 
     contact_sheet(arguments.out, np.random.default_rng(arguments.seed), arguments.textures)
 

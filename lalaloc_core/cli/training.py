@@ -17,7 +17,7 @@ from lalaloc_core.errors import InvalidInputError
 if TYPE_CHECKING:
     from lalaloc_core.learn.training.config import TrainConfig
 
-# Four panoramas each; rendering one takes a third of a second, and validation uses all of them every few minutes.
+# Four spheres each; rendering one takes a third of a second, and validation uses all of them every few minutes.
 _VALIDATION_HOMES = 50
 # Ratio of validation homes to out-of-distribution homes, which take longer to render.
 _PER_HELDOUT_HOME = 3
@@ -39,10 +39,10 @@ class Train:
         minutes: training time, instead of `steps`.
         steps: number of updates (default: the preset's).
         seed: random seed (default: the preset's).
-        set_: setting of the preset as KEY=VALUE, such as image.uses_per_panorama=4 or image.supersample=[2,1].
+        set_: setting of the preset as KEY=VALUE, such as image.uses_per_sphere=4 or image.supersample=[2,1].
         from_: start from the weights of a bundle or of another run (default: random weights).
         layout_from: image stage: bundle or run with the layout encoder to use if `out` has none.
-        photographs: image stages: folders of panoramas; `teacher` predicts walls and openings of those without an
+        photographs: image stages: folders of spheres; `teacher` predicts walls and openings of those without an
             annotation (preset trunk).
         teacher: TensorFlow Lite segmenter with ADE20K's classes, or bundle whose encoder of spheres reads them.
         resume: continue from the checkpoint in `out`.

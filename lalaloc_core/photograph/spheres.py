@@ -71,7 +71,7 @@ def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: Photograp
     if sphere.part is None and abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
         fault = "" if sphere.fault is None else f"; its photo sphere metadata are invalid: {sphere.fault}"
         raise InvalidPhotographError(
-            f"the photograph is {width} x {height}; a full 360° panorama is twice as wide as high, within "
+            f"the photograph is {width} x {height}; a full 360° sphere is twice as wide as high, within "
             f"{limits.aspect_tolerance:.0%}{fault}"
         )
 

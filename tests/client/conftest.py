@@ -23,8 +23,8 @@ from tests.service.conftest import (
     app_settings,
     database_of,
     empty_database,
-    panorama,
     postgres,
+    sphere,
     start_app,
 )
 from tests.service.conftest import client as app
@@ -36,8 +36,8 @@ __all__ = [
     "app_settings",
     "database_of",
     "empty_database",
-    "panorama",
     "postgres",
+    "sphere",
     "start_app",
 ]
 

@@ -33,9 +33,9 @@ def plan_id(app: httpx.Client) -> str:
     return upload(app, FLAT)
 
 
-def query_on_threads(client: Client, plan_id: str, panorama: bytes) -> list[Any]:
+def query_on_threads(client: Client, plan_id: str, sphere: bytes) -> list[Any]:
     with ThreadPoolExecutor(COUNT) as threads:
-        return list(threads.map(lambda _: client.localise(plan_id, panorama, refine="none"), range(COUNT)))
+        return list(threads.map(lambda _: client.localise(plan_id, sphere, refine="none"), range(COUNT)))
 
 
 def count_rejections(service: httpx.Client) -> float:
@@ -44,18 +44,18 @@ def count_rejections(service: httpx.Client) -> float:
     return next(float(line.removeprefix(prefix)) for line in lines if line.startswith(prefix))
 
 
-def test_concurrent_queries_are_not_rejected(app: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_concurrent_queries_are_not_rejected(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
     before = count_rejections(app)
     with Client(str(app.base_url), retry=ONCE) as client:
-        answers = query_on_threads(client, plan_id, panorama)
+        answers = query_on_threads(client, plan_id, sphere)
     assert len({answer.position for answer in answers}) == 1
     assert count_rejections(app) == before
 
 
-def test_concurrent_queries_with_asyncio_are_not_rejected(app: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_concurrent_queries_with_asyncio_are_not_rejected(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
     async def query() -> list[Any]:
         async with AsyncClient(str(app.base_url), retry=ONCE) as client:
-            return await asyncio.gather(*(client.localise(plan_id, panorama, refine="none") for _ in range(COUNT)))
+            return await asyncio.gather(*(client.localise(plan_id, sphere, refine="none") for _ in range(COUNT)))
 
     before = count_rejections(app)
     answers = asyncio.run(query())
@@ -64,11 +64,11 @@ def test_concurrent_queries_with_asyncio_are_not_rejected(app: httpx.Client, pla
 
 
 @pytest.mark.slow
-def test_rejected_queries_are_retried(app: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_rejected_queries_are_retried(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
     before = count_rejections(app)
     patient = RetryPolicy(attempts=40, total_s=60.0)
     with Client(str(app.base_url), retry=patient, max_queries=COUNT) as client:
-        answers = query_on_threads(client, plan_id, panorama)
+        answers = query_on_threads(client, plan_id, sphere)
     assert len(answers) == COUNT
     assert count_rejections(app) > before
 

@@ -42,10 +42,10 @@ def flat(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def photograph(tmp_path: Path, panorama: bytes) -> Path:
+def photograph(tmp_path: Path, sphere: bytes) -> Path:
     """Return the file of a photograph."""
     file = tmp_path / "room.jpg"
-    file.write_bytes(panorama)
+    file.write_bytes(sphere)
     return file
 
 
@@ -104,10 +104,10 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
     _over_stdio(str(app.base_url), talk)
 
 
-def test_folder_is_pinned(start_app: StartApp, flat: Path, tmp_path: Path, panorama: bytes) -> None:
+def test_folder_is_pinned(start_app: StartApp, flat: Path, tmp_path: Path, sphere: bytes) -> None:
     folder = tmp_path / "visit"
     folder.mkdir()
-    (folder / "a.jpg").write_bytes(panorama)
+    (folder / "a.jpg").write_bytes(sphere)
     (folder / "b.png").write_bytes(encode_picture(256, 128, "PNG"))
     (folder / "c.jpg").write_bytes(b"no photograph")
     (folder / "notes.txt").write_text("left out")

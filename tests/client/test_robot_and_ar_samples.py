@@ -87,7 +87,7 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_node_publishes_pose_and_map_to_odom(
-    node_module: Any, start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    node_module: Any, start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with start_app(tmp_path) as app:
         plan_id = upload(app)
@@ -95,7 +95,7 @@ def test_node_publishes_pose_and_map_to_odom(
         monkeypatch.setattr(_Node, "parameters", given)
         node = node_module.LocaliseNode()
         photograph = _message()
-        photograph.data, photograph.header.stamp = panorama, 12
+        photograph.data, photograph.header.stamp = sphere, 12
         node.on_photograph(photograph)
         assert node.published == [], "there is no odometry yet"
         for x in (0.0, 0.5):

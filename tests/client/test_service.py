@@ -70,14 +70,14 @@ def test_steps_of_an_import_are_told(service: Any, tmp_path: Path) -> None:
     assert {step.step for step in steps} & {"opening the file", "reading SVG", "placing names and openings"}
 
 
-def test_plan_is_replaced_unless_it_has_changed(service: Any, panorama: bytes) -> None:
+def test_plan_is_replaced_unless_it_has_changed(service: Any, sphere: bytes) -> None:
     first = service.upload_floorplan(FLAT)
     second = service.replace_floorplan(first.id, FLAT | {"name": "rebuilt"}, if_match=first.etag)
     assert (second.id, second.name, second.revision_number) == (first.id, "rebuilt", 2)
     with pytest.raises(ConflictError) as caught:
         service.replace_floorplan(first.id, FLAT, if_match=first.etag)
     assert caught.value.status == 412
-    answer = service.localise(first.id, panorama, refine="none")
+    answer = service.localise(first.id, sphere, refine="none")
     assert answer.floorplan_revision == second.revision == service.floorplan(first.id).revision
 
 
@@ -142,14 +142,14 @@ def test_listings_are_searched_by_name(service: Any) -> None:
     assert [plan.id for plan in service.floorplans(name.upper(), page_size=2)] == ids[::-1]
 
 
-def test_answer_has_every_field(service: Any, app: httpx.Client, panorama: bytes) -> None:
+def test_answer_has_every_field(service: Any, app: httpx.Client, sphere: bytes) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
     options = {"heading_deg": 90.0, "heading_tolerance_deg": 10.0, "refine": "vdr", "top_k": 2}
-    answer = service.localise(plan_id, panorama, **options)
+    answer = service.localise(plan_id, sphere, **options)
     document = app.post(
         "/localise",
         data={"floorplan_id": plan_id} | {name: str(value) for name, value in options.items()},
-        files={"panorama": panorama},
+        files={"photo": sphere},
     ).json()
     # Only the times differ between the two answers.
     known = dataclasses.asdict(answer) | {"timings_ms": document["timings_ms"]}
@@ -158,12 +158,12 @@ def test_answer_has_every_field(service: Any, app: httpx.Client, panorama: bytes
     assert answer.candidates[0].position == answer.position
 
 
-def test_posterior_comes_on_request(service: Any, panorama: bytes) -> None:
+def test_posterior_comes_on_request(service: Any, sphere: bytes) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
-    posterior = service.localise(plan_id, panorama, refine="none", posterior=True).posterior
+    posterior = service.localise(plan_id, sphere, refine="none", posterior=True).posterior
     assert len(posterior.x_m) == len(posterior.y_m) == len(posterior.probability) > 10
     assert sum(posterior.probability) == pytest.approx(1.0, abs=1e-4)
-    assert service.localise(plan_id, panorama, refine="none").posterior is None
+    assert service.localise(plan_id, sphere, refine="none").posterior is None
 
 
 def test_layout_of_an_older_revision(service: Any, app: httpx.Client) -> None:
@@ -178,11 +178,11 @@ def test_layout_of_an_older_revision(service: Any, app: httpx.Client) -> None:
 
 
 def test_stored_answers_are_fetched_and_deleted(
-    start_app: StartApp, make_client: MakeClient, panorama: bytes, tmp_path: Path
+    start_app: StartApp, make_client: MakeClient, sphere: bytes, tmp_path: Path
 ) -> None:
     with start_app(tmp_path, keep_answers_s=3600.0) as app, make_client(str(app.base_url)) as service:
         plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
-        answer = service.localise(plan_id, panorama, refine="none", posterior=True)
+        answer = service.localise(plan_id, sphere, refine="none", posterior=True)
         assert service.get_answer(answer.answer_id) == answer
         service.forget_answer(answer.answer_id)
         with pytest.raises(NotFoundError, match="unknown-answer"):
@@ -191,27 +191,27 @@ def test_stored_answers_are_fetched_and_deleted(
             service.get_answer("../floorplans")
 
 
-def test_panorama_is_bytes_a_file_or_an_image(service: Any, panorama: bytes, tmp_path: Path) -> None:
+def test_sphere_is_bytes_a_file_or_an_image(service: Any, sphere: bytes, tmp_path: Path) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(json.dumps(FLAT).encode()).id).id
-    (tmp_path / "p.jpg").write_bytes(panorama)
-    panoramas = [panorama, tmp_path / "p.jpg", str(tmp_path / "p.jpg")]
-    answers = [service.localise(plan_id, source, heading_deg=0, refine="none") for source in panoramas]
+    (tmp_path / "p.jpg").write_bytes(sphere)
+    spheres = [sphere, tmp_path / "p.jpg", str(tmp_path / "p.jpg")]
+    answers = [service.localise(plan_id, source, heading_deg=0, refine="none") for source in spheres]
     assert len({(answer.position, answer.cost) for answer in answers}) == 1
-    picture = Image.open(io.BytesIO(panorama)).convert("RGBA")
+    picture = Image.open(io.BytesIO(sphere)).convert("RGBA")
     answer: Localisation = service.localise(plan_id, picture, heading_deg=0, refine="none")
     assert answer.cost == pytest.approx(answers[0].cost, rel=0.1)
 
 
-def test_invalid_request_names_the_fields(service: Any, panorama: bytes) -> None:
+def test_invalid_request_names_the_fields(service: Any, sphere: bytes) -> None:
     plan_id = service.upload_floorplan(FLAT).id
     with pytest.raises(InvalidError, match="top_k") as caught:
-        service.localise(plan_id, panorama, top_k=99)
+        service.localise(plan_id, sphere, top_k=99)
     assert caught.value.status == 422
     assert [field for field, _ in caught.value.faults] == ["top_k"]
     with pytest.raises(InvalidError, match="rooms"):
         service.upload_floorplan({"rooms": []})
     with pytest.raises(ValueError, match="heading_deg is nan"):
-        service.localise(plan_id, panorama, heading_deg=float("nan"))
+        service.localise(plan_id, sphere, heading_deg=float("nan"))
 
 
 def test_malformed_ids_reach_no_other_route(service: Any) -> None:
@@ -229,42 +229,42 @@ def test_readiness(service: Any, app: httpx.Client) -> None:
     assert state.model.sha256 == app.get("/readyz").json()["model"]["sha256"]
 
 
-def test_sequence_is_one_query(service: Any, app: httpx.Client, panorama: bytes) -> None:
+def test_sequence_is_one_query(service: Any, app: httpx.Client, sphere: bytes) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
     answer = service.localise_sequence(
-        plan_id, [panorama, panorama], motion="turn", headings_deg=[90.0, None], refine="none", top_k=2
+        plan_id, [sphere, sphere], motion="turn", headings_deg=[90.0, None], refine="none", top_k=2
     )
     document = app.post(
         "/localise/sequence",
         data={"floorplan_id": plan_id, "motion": "turn", "headings_deg": "[90, null]", "refine": "none", "top_k": "2"},
-        files=[("panorama", panorama), ("panorama", panorama)],
+        files=[("photo", sphere), ("photo", sphere)],
     ).json()
     assert len(answer.poses) == 2
     assert json.loads(json.dumps(dataclasses.asdict(answer))) == document | {"timings_ms": dict(answer.timings_ms)}
     with pytest.raises(InvalidError, match="to a session"):
-        service.localise_sequence(plan_id, [panorama, panorama])
+        service.localise_sequence(plan_id, [sphere, sphere])
     with pytest.raises(ValueError, match=r"headings_deg\[0\] is nan"):
-        service.localise_sequence(plan_id, [panorama, panorama], motion="turn", headings_deg=[float("nan"), None])
+        service.localise_sequence(plan_id, [sphere, sphere], motion="turn", headings_deg=[float("nan"), None])
 
 
-def test_options_are_sent(service: Any, panorama: bytes) -> None:
+def test_options_are_sent(service: Any, sphere: bytes) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
-    assert service.localise(plan_id, panorama, rooms="kitchen", strict=True, refine="none").room == "kitchen"
+    assert service.localise(plan_id, sphere, rooms="kitchen", strict=True, refine="none").room == "kitchen"
     near = {"x_m": 2.0, "y_m": 1.0}
-    answer = service.localise(plan_id, panorama, near=near, radius_m=1.0, strict=True, refine="none")
+    answer = service.localise(plan_id, sphere, near=near, radius_m=1.0, strict=True, refine="none")
     assert math.dist((answer.position.x_m, answer.position.y_m), near.values()) <= 1.0 + 1e-3
     with pytest.raises(InvalidError, match="no room 'attic'"):
-        service.localise(plan_id, panorama, rooms=["attic"])
+        service.localise(plan_id, sphere, rooms=["attic"])
     with pytest.raises(ValueError, match=r"near\['x_m'\] is inf"):
-        service.localise(plan_id, panorama, near={"x_m": float("inf"), "y_m": 0.0}, radius_m=1.0)
+        service.localise(plan_id, sphere, near={"x_m": float("inf"), "y_m": 0.0}, radius_m=1.0)
     with pytest.raises(TypeError, match="unknown options: headng_deg"):
-        service.localise(plan_id, panorama, headng_deg=90.0)
+        service.localise(plan_id, sphere, headng_deg=90.0)
 
 
-def test_batch_yields_an_answer_per_photograph(service: Any, panorama: bytes, tmp_path: Path) -> None:
-    (tmp_path / "hall.jpg").write_bytes(panorama)
+def test_batch_yields_an_answer_per_photograph(service: Any, sphere: bytes, tmp_path: Path) -> None:
+    (tmp_path / "hall.jpg").write_bytes(sphere)
     plan = service.wait_until_ready(service.upload_floorplan(FLAT).id, timeout_s=60.0)
-    answers = list(service.localise_batch(plan.id, [tmp_path / "hall.jpg", b"no picture", panorama], refine="none"))
+    answers = list(service.localise_batch(plan.id, [tmp_path / "hall.jpg", b"no picture", sphere], refine="none"))
     assert [(answer.index, answer.name, answer.status) for answer in answers] == [
         (0, "hall.jpg", 200),
         (1, "photo", 422),
@@ -275,7 +275,7 @@ def test_batch_yields_an_answer_per_photograph(service: Any, panorama: bytes, tm
         answers[1].result()
     assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
     with pytest.raises(NotFoundError):
-        list(service.localise_batch("f" * 32, [panorama]))
+        list(service.localise_batch("f" * 32, [sphere]))
 
 
 @pytest.fixture(scope="module")
@@ -302,8 +302,8 @@ def test_faulty_photograph_gives_its_warning_or_a_named_error(
         fault.check_refusal(str(caught.value))
 
 
-def test_earlier_names_of_arguments_are_accepted(service: Any, panorama: bytes) -> None:
+def test_earlier_names_of_arguments_are_accepted(service: Any, sphere: bytes) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
     with pytest.warns(DeprecationWarning, match="'panorama' is now 'photograph'"):
-        earlier = service.localise(plan_id, panorama=panorama, refine="none")
-    assert earlier.position == service.localise(plan_id, photograph=panorama, refine="none").position
+        earlier = service.localise(plan_id, panorama=sphere, refine="none")
+    assert earlier.position == service.localise(plan_id, photograph=sphere, refine="none").position

@@ -33,12 +33,12 @@ def pose_at(heading_deg: float) -> TrackedPose:
     return TrackedPose(1, Position(2.0, 3.0), heading_deg, "hall", "hall", COVARIANCE, 0.9, 1.5, (), (), (), {})
 
 
-def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, panorama: bytes) -> None:
+def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(app)
     with Client(str(app.base_url)) as service, service.track(plan_id, camera_height_m=1.5) as tracker:
         session_id = tracker.session.id
-        first = tracker.add(panorama)
-        second = tracker.add(panorama, Motion(forward_m=0.0, turn_deg=0.0), heading_deg=90.0, roll_deg=2.0)
+        first = tracker.add(sphere)
+        second = tracker.add(sphere, Motion(forward_m=0.0, turn_deg=0.0), heading_deg=90.0, roll_deg=2.0)
         assert [first.photographs, second.photographs] == [1, 2]
         assert second.pose is not None
         assert second.pose.view is not None
@@ -47,28 +47,28 @@ def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, panora
         # Another client counted a photograph whose answer this one did not get.
         with service.track(plan_id) as other:
             other.begin(session_id)
-            third = other.add(panorama)
-            assert tracker.add(panorama) == third
+            third = other.add(sphere)
+            assert tracker.add(sphere) == third
         with pytest.raises(NotFoundError):
             # `other` has ended the session.
-            tracker.add(panorama)
+            tracker.add(sphere)
 
 
-def test_tracker_follows_a_camera_in_a_venue(app: httpx.Client, panorama: bytes) -> None:
+def test_tracker_follows_a_camera_in_a_venue(app: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(app)
     venue = app.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 2}]}).json()
     with Client(str(app.base_url)) as service, service.track(venue_id=venue["id"], level=2.0) as tracker:
-        session = tracker.add(panorama)
+        session = tracker.add(sphere)
         assert (session.venue_id, session.venue_revision) == (venue["id"], venue["revision"])
         assert session.pose is not None
         assert (session.pose.floorplan_id, session.pose.level) == (plan_id, 2.0)
         assert (session.path[0].floorplan_id, session.path[0].level) == (plan_id, 2.0)
 
 
-def test_tracker_of_asyncio_follows_a_camera(app: httpx.Client, panorama: bytes, tmp_path: Path) -> None:
+def test_tracker_of_asyncio_follows_a_camera(app: httpx.Client, sphere: bytes, tmp_path: Path) -> None:
     plan_id = upload(app)
     path = tmp_path / "photograph.jpg"
-    path.write_bytes(panorama)
+    path.write_bytes(sphere)
 
     async def follow() -> int:
         async with AsyncClient(str(app.base_url)) as service, service.track(plan_id, rooms=["kitchen"]) as tracker:

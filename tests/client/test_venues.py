@@ -77,25 +77,25 @@ def test_files_of_plans_extend_a_venue(service: Any) -> None:
     assert service.venue(venue.id) == extended
 
 
-def test_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> None:
+def test_sphere_is_localised_in_a_venue(service: Any, sphere: bytes) -> None:
     plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
     venue = service.make_venue([VenuePlan(plan, 3) for plan in plans])
-    answer = service.localise_in_venue(venue.id, panorama, refine="none", top_k=3)
+    answer = service.localise_in_venue(venue.id, sphere, refine="none", top_k=3)
     assert (answer.venue_id, answer.level) == (venue.id, 3.0)
     assert answer.floorplan_id in plans
     assert {plan.floorplan_id for plan in answer.plans} == set(plans)
     assert {candidate.floorplan_id for candidate in answer.candidates} <= set(plans)
-    alone = service.localise(plans[0], panorama, refine="none")
+    alone = service.localise(plans[0], sphere, refine="none")
     assert (alone.venue_id, alone.level, alone.plans) == (None, None, None)
 
 
-def test_venue_query_takes_options(service: Any, panorama: bytes) -> None:
+def test_venue_query_takes_options(service: Any, sphere: bytes) -> None:
     plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
     venue = service.make_venue([VenuePlan(plan, level) for level, plan in enumerate(plans)])
-    answer = service.localise_in_venue(venue.id, panorama, level=1, rooms=["kitchen"], strict=True, refine="none")
+    answer = service.localise_in_venue(venue.id, sphere, level=1, rooms=["kitchen"], strict=True, refine="none")
     assert (answer.floorplan_id, answer.level, answer.room) == (plans[1], 1.0, "kitchen")
     with pytest.raises(InvalidError, match="no floor plan of the venue is on level 5"):
-        service.localise_in_venue(venue.id, panorama, level=5)
+        service.localise_in_venue(venue.id, sphere, level=5)
 
 
 def test_malformed_venue_id_is_rejected(service: Any) -> None:

@@ -1,4 +1,4 @@
-"""Films of a turn on one spot, cut from an example panorama and encoded by Debian's FFmpeg."""
+"""Films of a turn on one spot, cut from an example sphere and encoded by Debian's FFmpeg."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def question_at(
         grid=pose_grid(plan, step_m) if grid is None else grid,
         grid_step_m=step_m,
         camera=camera,
-        kind="layout" if photograph is None else "panorama",
+        kind="layout" if photograph is None else "photograph",
         photograph=photograph,
         heading_known=heading_known,
     )
@@ -108,7 +108,7 @@ class BareRoom:
 
 
 def paint(profile_m: np.ndarray) -> np.ndarray:
-    """Return a panorama (4, columns, 3) whose pixels encode the wall profile in units of 0.1 mm."""
+    """Return a sphere (4, columns, 3) whose pixels encode the wall profile in units of 0.1 mm."""
     value = np.round(profile_m / 1e-4).astype(np.int64)
     return np.repeat(np.stack([value >> 16, value >> 8 & 255, value & 255], axis=-1)[None], 4, axis=0).astype(np.uint8)
 

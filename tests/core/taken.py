@@ -1,4 +1,4 @@
-"""Photographs with a known camera, cut from the example panoramas."""
+"""Photographs with a known camera, cut from the example spheres."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def sphere(name: str) -> np.ndarray:
 
 
 def take(
-    panorama: np.ndarray, camera: Camera, *, pitch_deg: float = 0.0, roll_deg: float = 0.0, heading_deg: float = 0.0
+    sphere: np.ndarray, camera: Camera, *, pitch_deg: float = 0.0, roll_deg: float = 0.0, heading_deg: float = 0.0
 ) -> np.ndarray:
-    """Return the picture that a camera in the middle of a panorama takes; black where the camera sees nothing."""
-    height, width = panorama.shape[:2]
+    """Return the picture that a camera in the middle of a sphere takes; black where the camera sees nothing."""
+    height, width = sphere.shape[:2]
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.rays(np.stack([x, y], axis=-1))
     rays = rays @ camera_axes(pitch=math.radians(pitch_deg), roll=math.radians(roll_deg))
     azimuth = np.arctan2(rays[..., 0], rays[..., 1]) + math.radians(heading_deg)
     column = (azimuth / TWO_PI + 0.5) % 1.0 * width - 0.5
     row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height - 0.5
-    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    wrapped = np.concatenate([sphere[:, -1:], sphere, sphere[:, :1]], axis=1)
     return cv2.remap(
         wrapped,
         (column + 1.0).astype(np.float32),

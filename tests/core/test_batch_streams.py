@@ -1,4 +1,4 @@
-"""Streams of panoramas: replay, camera height errors, photometric changes and deferred rendering."""
+"""Streams of spheres: replay, camera height errors, photometric changes and deferred rendering."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.cli import main
 from lalaloc_core.learn.synth.augmentation.photometric import jittered
-from lalaloc_core.learn.training.batch_streams import PanoramaBatches, ReplayBuffer
+from lalaloc_core.learn.training.batch_streams import ReplayBuffer, SphereBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
@@ -24,7 +24,7 @@ from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.rotation import Rotation
 from lalaloc_core.learn.training.sources import GeneratedSource
-from lalaloc_core.learn.training.stages import build_layout_encoder, panorama_batches
+from lalaloc_core.learn.training.stages import build_layout_encoder, sphere_batches
 from tests.strategies import seeds
 
 TINY = PRESETS["tiny"]
@@ -70,18 +70,18 @@ class TestReplayBuffer:
 
 def batches(**image: Any) -> list[Batch]:
     config = TINY.with_settings({f"image.{name}": value for name, value in image.items()})
-    return list(itertools.islice(load_batches(PanoramaBatches(config, GeneratedSource(config)), 0), 6))
+    return list(itertools.islice(load_batches(SphereBatches(config, GeneratedSource(config)), 0), 6))
 
 
 def colours(found: list[Batch]) -> Counter[tuple[int, ...]]:
-    """Count panoramas by the sorted pixels of a row, which rotation and mirroring preserve."""
+    """Count spheres by the sorted pixels of a row, which rotation and mirroring preserve."""
     rows = torch.cat([batch["image"] for batch in found])[:, 16, :, 0]
     return Counter(tuple(row.tolist()) for row in rows.sort(dim=1).values)
 
 
 class TestStream:
-    def test_repeated_panoramas_are_rotated_with_their_layouts(self) -> None:
-        found = batches(uses_per_panorama=3, replay_panoramas=6)
+    def test_repeated_spheres_are_rotated_with_their_layouts(self) -> None:
+        found = batches(uses_per_sphere=3, replay_spheres=6)
         counts = colours(found)
         assert 2 <= max(counts.values()) <= 3
         most = max(counts, key=lambda key: counts[key])
@@ -103,12 +103,12 @@ class TestStream:
 
     @pytest.mark.slow
     def test_seed_determines_the_stream(self) -> None:
-        first, again = (batches(uses_per_panorama=3, replay_panoramas=6) for _ in range(2))
+        first, again = (batches(uses_per_sphere=3, replay_spheres=6) for _ in range(2))
         assert all(torch.equal(a[key], b[key]) for a, b in zip(first, again, strict=True) for key in a)
 
     @pytest.mark.slow
     def test_resumed_stage_uses_new_homes(self) -> None:
-        config = TINY.with_settings({"image.uses_per_panorama": 3, "image.replay_panoramas": 6})
+        config = TINY.with_settings({"image.uses_per_sphere": 3, "image.replay_spheres": 6})
         stage = ImageStage(config, GeneratedSource(config), build_layout_encoder(config))
         seen = colours(list(itertools.islice(stage.batches(0, 0), 6)))
         resumed = colours(list(itertools.islice(stage.batches(6, 0), 6)))
@@ -149,7 +149,7 @@ class TestPhotometric:
 
 def config_of(uses: int) -> TrainConfig:
     return TINY.with_settings(
-        {"image.batch": 6, "image.shots_per_home": 2, "image.uses_per_panorama": uses, "image.replay_panoramas": 6}
+        {"image.batch": 6, "image.shots_per_home": 2, "image.uses_per_sphere": uses, "image.replay_spheres": 6}
     )
 
 
@@ -157,7 +157,7 @@ def deferrable_batches(
     uses: int, *, deferred: bool, neighbours: bool = False, workers: int = 0, textures: Path | None = None
 ) -> list[Batch]:
     source = GeneratedSource(config_of(uses), textures, deferred)
-    found = panorama_batches(source.config, source, neighbours=neighbours, first_step=1, workers=workers, device=CPU)
+    found = sphere_batches(source.config, source, neighbours=neighbours, first_step=1, workers=workers, device=CPU)
     return list(itertools.islice(found, 6))
 
 
@@ -179,13 +179,13 @@ def test_scenes_are_rendered_once_and_evicted() -> None:
     config = config_of(3)
     source = GeneratedSource(config, deferred=True)
     renderer, shown, seen = DeferredRenderer(source.renderer(CPU, *config.image_size)), set(), 0
-    deferred = list(itertools.islice(load_batches(PanoramaBatches(source.config, source), 0), 40))
+    deferred = list(itertools.islice(load_batches(SphereBatches(source.config, source), 0), 40))
     for batch, _ in zip(deferred, renderer.render_batches(deferred), strict=True):
         assert not shown & batch.scenes.keys()
         shown |= batch.scenes.keys()
         seen += len(batch.number)
         # Scenes waiting for their next use, and scenes of the unfinished next batch.
-        assert len(renderer) <= source.config.image.replay_panoramas + source.config.image.batch
+        assert len(renderer) <= source.config.image.replay_spheres + source.config.image.batch
     assert len(shown) < seen / 2
 
 

@@ -132,8 +132,8 @@ def test_old_configuration_loads() -> None:
 @pytest.mark.parametrize(
     ("setting", "value", "message"),
     [
-        ("image.uses_per_panorama", 0, "uses_per_panorama is 0"),
-        ("image.replay_panoramas", 0, "replay_panoramas is 0"),
+        ("image.uses_per_sphere", 0, "uses_per_sphere is 0"),
+        ("image.replay_spheres", 0, "replay_spheres is 0"),
         ("image.photometric", 1.5, "photometric is 1.5"),
         ("image.camera_height_error_m", -0.1, "camera_height_error_m is -0.1"),
         ("image.optics", 1.5, "optics is 1.5"),

@@ -82,8 +82,8 @@ class TestRunning:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("heading_known", [True, False])
-    def test_every_panorama_is_answered(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
-        info = dataclasses.replace(layout_run, kind="panorama", furniture="full", heading_known=heading_known)
+    def test_every_sphere_is_answered(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
+        info = dataclasses.replace(layout_run, kind="photograph", furniture="full", heading_known=heading_known)
         predictions = run_evaluation(RunFolder(tmp_path), info, workers=0)
         assert len(predictions) == 6
         assert np.isfinite(position_errors_m(predictions)).all()
@@ -195,7 +195,7 @@ def test_scene_is_solved_as_one_album(tmp_path: Path, capsys: pytest.CaptureFixt
     (scene / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
     # The place of the study's photograph is wrong: one correction makes all rooms right.
     (scene / "poses.csv").write_text(
-        "panorama,x_m,y_m,heading_deg\nbroken.jpg,2.9,1.5,335\n"
+        "photograph,x_m,y_m,heading_deg\nbroken.jpg,2.9,1.5,335\n"
         "kitchen.jpg,7.1,2.2,250\nstudy.jpg,2.6,6.75,340\nphone.jpg,2.9,1.5,335\n"
     )
     command = ["lab", "evaluate", "--albums", "--data", str(scene.parent), "--workers", "0", "--out", str(run)]
@@ -225,7 +225,7 @@ def test_options_of_single_photographs_are_refused_for_albums(
     assert ("--albums" if "--method" in options else options[-2]) in capsys.readouterr().err
 
 
-def test_figures_cover_every_panorama_and_azimuth() -> None:
+def test_figures_cover_every_sphere_and_azimuth() -> None:
     encoders = PhotographEncoder(Bundle.open(default_bundle()), threads=1)
     figures = azimuth_figures(encoders, GeneratedScenes(homes=1, shots_per_home=3))
     assert figures["n"] == 3

@@ -114,7 +114,7 @@ def test_picture_cropped_later_has_no_focal_length() -> None:
     assert "was cropped" in cropped.warnings[0]
 
 
-def test_panorama_mode_has_no_focal_length() -> None:
+def test_sphere_mode_has_no_focal_length() -> None:
     lens = read({Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26})
     assert lens.strip
     assert lens.focal is None

@@ -125,9 +125,7 @@ class TestPredictedProfile:
         expected = wall_profile(np.array([position]), np.array([left_over]), plan.walls_m[[0]], COLUMNS)[0]
         np.testing.assert_allclose(profile, expected, atol=_ROUNDED)
 
-    def test_profile_averages_panorama_and_mirror_image(
-        self, encoders: PhotographEncoder, opened_bundle: Bundle
-    ) -> None:
+    def test_profile_averages_sphere_and_mirror_image(self, encoders: PhotographEncoder, opened_bundle: Bundle) -> None:
         image = np.random.default_rng(0).integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         profile, left_over = encoders.spheres.profile(image, 0.0, CAMERA_M)
         predicted_profiles = []

@@ -25,13 +25,13 @@ from tests.strategies import plan_document, rectangle
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "own_data"
-HEADER = "panorama,x_m,y_m,heading_deg,camera_height_m"
+HEADER = "photograph,x_m,y_m,heading_deg,camera_height_m"
 POSES = f"{HEADER}\nhall.png,1,2,90,1.4\nrooms/study.png,5.5,1,-45,\n"
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Write one scene with two rooms and two panoramas."""
+    """Write one scene with two rooms and two spheres."""
     write_scene(tmp_path, "home")
     return tmp_path
 
@@ -64,7 +64,7 @@ class TestReading:
         assert pickle.loads(pickle.dumps(dataset)) == dataset
 
     def test_spreadsheet_tables_are_read(self, tmp_path: Path) -> None:
-        rows = '\ufeffheading_deg, y_m,x_m,panorama\r\n90,2,1,"hall.png"\r\n\r\n,,,\r\n'
+        rows = '\ufeffheading_deg, y_m,x_m,photograph\r\n90,2,1,"hall.png"\r\n\r\n,,,\r\n'
         write_scene(tmp_path, "home", rows)
         (camera,) = OwnData(tmp_path).load("home").cameras
         assert (camera.position_m.tolist(), camera.camera_height_m) == ([1.0, 2.0], 1.3)
@@ -111,21 +111,21 @@ class TestBadFiles:
             ("hall.png,1,2,0,0", ["column 'camera_height_m' is '0'", "the minimum is 0.1 m"]),
             ("rooms/study.png,5,1,0,2.3", ["column 'camera_height_m' is '2.3'", "below the ceiling (2.1 m)"]),
             ("hall.png,3.5,1.5,0,1.4", ["(3.5, 1.5) m is in no room", "nearest is 'room 1', 0.5 m away"]),
-            ("attic.png,1,2,0,1.4", ["column 'panorama' is 'attic.png'", "the file does not exist"]),
-            ("rooms,1,2,0,1.4", ["column 'panorama' is 'rooms'", "the file does not exist"]),
-            (",1,2,0,1.4", ["column 'panorama' is ''", "below the scene's folder"]),
-            ("../home/hall.png,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
-            ("/etc/passwd,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
-            ("hall.png,1,2,0,", ["column 'panorama' is 'hall.png': it is a duplicate"]),
+            ("attic.png,1,2,0,1.4", ["column 'photograph' is 'attic.png'", "the file does not exist"]),
+            ("rooms,1,2,0,1.4", ["column 'photograph' is 'rooms'", "the file does not exist"]),
+            (",1,2,0,1.4", ["column 'photograph' is ''", "below the scene's folder"]),
+            ("../home/hall.png,1,2,0,1.4", ["column 'photograph'", "below the scene's folder"]),
+            ("/etc/passwd,1,2,0,1.4", ["column 'photograph'", "below the scene's folder"]),
+            ("hall.png,1,2,0,", ["column 'photograph' is 'hall.png': it is a duplicate"]),
         ],
     )
     def test_bad_cell_is_refused_or_left_out(self, tmp_path: Path, line: str, reasons: list[str]) -> None:
         folder = write_scene(tmp_path, "home", f"{HEADER}\nhall.png,2,2,0,\n{line}\n")
-        panorama = line.split(",")[0]
+        photograph = line.split(",")[0]
         with pytest.raises(DatasetError) as caught:
             OwnData(tmp_path).load("home")
         error = caught.value
-        assert (error.scene, error.room, error.path) == ("home", panorama or None, folder / "poses.csv")
+        assert (error.scene, error.room, error.path) == ("home", photograph or None, folder / "poses.csv")
         for reason in ("line 3", *reasons):
             assert reason in str(error)
         problems: list[DatasetError] = []
@@ -136,13 +136,13 @@ class TestBadFiles:
         ("content", "reason"),
         [
             (None, "cannot be read: No such file"),
-            (b"", "line 1 is ''; it must name the columns panorama,x_m"),
-            (b"panorama,x_m,y_m\n", "line 1 is 'panorama,x_m,y_m'; it must name the columns"),
-            (b"panorama;x_m;y_m;heading_deg\n", "it must name the columns"),
-            (b"panorama,x_m,y_m,heading_deg,height\n", "it must name the columns"),
-            (b"panorama,x_m,x_m,y_m,heading_deg\n", "it must name the columns"),
-            (b"panorama,x_m,y_m,heading_deg\nhall.png,1,2\n", "line 2 has 3 cells; the header has 4"),
-            (b'panorama,x_m,y_m,heading_deg\n"hall.png,1,2,3\n', "line 2 is not valid CSV"),
+            (b"", "line 1 is ''; it must name the columns photograph,x_m"),
+            (b"photograph,x_m,y_m\n", "line 1 is 'photograph,x_m,y_m'; it must name the columns"),
+            (b"photograph;x_m;y_m;heading_deg\n", "it must name the columns"),
+            (b"photograph,x_m,y_m,heading_deg,height\n", "it must name the columns"),
+            (b"photograph,x_m,x_m,y_m,heading_deg\n", "it must name the columns"),
+            (b"photograph,x_m,y_m,heading_deg\nhall.png,1,2\n", "line 2 has 3 cells; the header has 4"),
+            (b'photograph,x_m,y_m,heading_deg\n"hall.png,1,2,3\n', "line 2 is not valid CSV"),
             (b"\xff\xfe\x00", "not UTF-8"),
         ],
     )
@@ -174,7 +174,7 @@ class TestBadFiles:
         path = root / "home" / "hall.png"
         Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(path)
         scene = OwnData(root).load("home")
-        with pytest.raises(DatasetError, match="64 x 64; a full 360° panorama is twice as wide") as caught:
+        with pytest.raises(DatasetError, match="64 x 64; a full 360° sphere is twice as wide") as caught:
             scene.photograph(scene.cameras[0], Appearance()).image(64, 128)
         assert (caught.value.scene, caught.value.room, caught.value.path) == ("home", "hall.png", path)
 

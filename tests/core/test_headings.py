@@ -1,6 +1,6 @@
 """End-to-end tests of heading signs in the renderer, the encoders and the search.
 
-The image encoder is perfect: it reads the wall profile from the pixels of a painted panorama. An error in an answer
+The image encoder is perfect: it reads the wall profile from the pixels of a painted sphere. An error in an answer
 is therefore a wrong sign or an off-by-one between renderer, roll and search.
 """
 
@@ -60,7 +60,7 @@ class TestRolls:
             rolled = smooth_encoder().ring(profile.roll(2 * sectors, dims=1), *heights)
             torch.testing.assert_close(rolled, ring.roll(sectors, dims=2), atol=1e-5, rtol=1e-4)
 
-    def test_image_ring_and_profile_roll_with_the_panorama(self) -> None:
+    def test_image_ring_and_profile_roll_with_the_sphere(self) -> None:
         torch.manual_seed(0)
         encoder = RingImageEncoder(RING).eval().requires_grad_(False)
         image = torch.randint(0, 256, (2, RING.image_height, RING.image_width, 3))
@@ -83,7 +83,7 @@ class TestRealEncoders:
     def test_true_hypothesis_has_the_latent_of_heading_zero(self, encoders: PhotographEncoder, sector: int) -> None:
         rng = np.random.default_rng(sector)
         at_zero = rng.integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
-        # Turning the camera to the right rolls the panorama to the left.
+        # Turning the camera to the right rolls the sphere to the left.
         turned = np.roll(at_zero, -sector * RING.image_width // SECTORS, axis=1)
         straight = encoders.spheres.query(at_zero, 0.0, CameraHeight(CAMERA_M))
         unknown = encoders.spheres.query(turned, None, CameraHeight(CAMERA_M))

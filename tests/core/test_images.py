@@ -1,4 +1,4 @@
-"""Reading panoramas: accepted files, refused files, and robustness against damaged ones."""
+"""Reading spheres: accepted files, refused files, and robustness against damaged ones."""
 
 from __future__ import annotations
 
@@ -287,7 +287,7 @@ class TestRefused:
             (encoded(Image.new("RGB", (2, 1))), "the minimum is 64"),
         ],
     )
-    def test_invalid_panorama_error_names_the_reason(self, content: bytes, reason: str) -> None:
+    def test_invalid_sphere_error_names_the_reason(self, content: bytes, reason: str) -> None:
         with pytest.raises(InvalidPhotographError, match=reason):
             read(content)
 
@@ -358,7 +358,7 @@ class TestRefused:
     @pytest.mark.parametrize("kind", NEARLY)
     @given(data=st.data())
     @settings(max_examples=150)
-    def test_altered_bytes_raise_only_panorama_errors(self, kind: str, data: st.DataObject) -> None:
+    def test_altered_bytes_raise_only_sphere_errors(self, kind: str, data: st.DataObject) -> None:
         exif = Image.Exif()
         exif[0x0112], exif[0x010E] = 1, "description"
         content = bytearray(encoded(picture(), kind, exif=exif.tobytes(), **NEARLY[kind]))

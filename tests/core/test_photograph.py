@@ -78,10 +78,10 @@ class TestProjection:
 
     @pytest.mark.parametrize("name", ["bedroom", "kitchen", "living_room", "study"])
     def test_pictures_twice_as_wide_as_high_are_no_spheres(self, name: str) -> None:
-        panorama = sphere(name)
+        scene = sphere(name)
         pictures = {
-            "crop": panorama[64:320, 300:812],
-            "half": panorama[128:384, :512],
+            "crop": scene[64:320, 300:812],
+            "half": scene[128:384, :512],
             "photograph": view_of(Perspective.of_hfov(600, 300, math.radians(90.0)), name),
             "white": np.full((256, 512, 3), 255, np.uint8),
             "ramp": np.broadcast_to(np.linspace(0, 255, 512).astype(np.uint8)[:, None], (256, 512, 3)),
@@ -103,16 +103,16 @@ class TestProjection:
         assert opened(white, projection="equirectangular").sphere is not None
 
     def test_gpano_metadata_decide(self) -> None:
-        panorama = sphere("kitchen")
+        scene = sphere("kitchen")
         part = (
             'GPano:ProjectionType="{}" GPano:FullPanoWidthPixels="1024" GPano:FullPanoHeightPixels="512" '
             'GPano:CroppedAreaImageWidthPixels="512" GPano:CroppedAreaImageHeightPixels="256" '
             'GPano:CroppedAreaLeftPixels="256" GPano:CroppedAreaTopPixels="128"'
         )
-        view = opened(with_xmp(panorama[128:384, 256:768].copy(), part.format("equirectangular")))
+        view = opened(with_xmp(scene[128:384, 256:768].copy(), part.format("equirectangular")))
         assert (view.projection, view.projection_source) == ("equirectangular", "gpano")
         assert view.azimuths == pytest.approx((-0.5 * math.pi, 0.5 * math.pi))
-        strip = take(panorama, Around(width=512, height=256, hfov=math.pi))
+        strip = take(scene, Around(width=512, height=256, hfov=math.pi))
         view = opened(with_xmp(strip, part.format("cylindrical")))
         assert (view.projection, view.hfov.source) == ("cylindrical", "gpano")
         assert view.hfov.value == pytest.approx(math.pi)
@@ -254,7 +254,7 @@ def _placed(headings_deg: Sequence[int]) -> list[tuple[Patch, float]]:
 
 
 def patch_error(view: Photograph, name: str, heading_deg: float = 0.0) -> float:
-    """Return the mean difference (grey levels) of the patches from the panorama that the photograph was taken from."""
+    """Return the mean difference (grey levels) of the patches from the scene that the photograph was taken from."""
     size = PatchSize()
     camera = Around(width=size.width, height=2 * size.height, hfov=size.hfov, spherical=True)
     errors = []
@@ -285,7 +285,7 @@ class TestPatches:
             ),
         ],
     )
-    def test_patches_show_the_panorama(self, camera: Camera, stated: dict[str, Any]) -> None:
+    def test_patches_show_the_sphere(self, camera: Camera, stated: dict[str, Any]) -> None:
         view = opened(jpeg(view_of(camera)), pitch_deg=0.0, roll_deg=0.0, **stated)
         assert patch_error(view, "living_room") < 6.0
         assert view.azimuths == pytest.approx((-0.5 * camera.hfov, 0.5 * camera.hfov), abs=0.02)
@@ -350,9 +350,9 @@ class TestPatches:
 
     def test_verticals_of_a_tilted_photograph_become_vertical(self) -> None:
         """A white stripe on one meridian stays in one column."""
-        panorama = np.zeros((512, 1024, 3), np.uint8)
-        panorama[:, 590:598] = 255
-        pixels = take(panorama, ULTRAWIDE, pitch_deg=15.0, roll_deg=5.0)
+        scene = np.zeros((512, 1024, 3), np.uint8)
+        scene[:, 590:598] = 255
+        pixels = take(scene, ULTRAWIDE, pitch_deg=15.0, roll_deg=5.0)
         (patch,) = opened(jpeg(pixels), hfov_deg=106.2, pitch_deg=15.0, roll_deg=5.0).patches
         rows = np.flatnonzero(patch.seen[:, 180:206].all(axis=1))
         weights = patch.pixels[rows, 180:206, 0].astype(float)

@@ -34,22 +34,22 @@ def by_colour(picture: np.ndarray) -> np.ndarray:
 
 def painted() -> np.ndarray:
     """Paint a door from the floor to above the horizon, a window, and a wall whose lower part has the door's class."""
-    panorama = np.full((ROWS, COLUMNS, 3), WALL, dtype=np.uint8)
+    sphere = np.full((ROWS, COLUMNS, 3), WALL, dtype=np.uint8)
     row_of = lambda elevation_deg: round((0.5 - elevation_deg / 180.0) * ROWS)  # noqa: E731
-    panorama[row_of(20) : row_of(-60), 200:320] = DOOR
-    panorama[row_of(20) : row_of(-20), 600:680] = WINDOW
-    panorama[row_of(-60) :, 800:900] = DOOR
-    return panorama
+    sphere[row_of(20) : row_of(-60), 200:320] = DOOR
+    sphere[row_of(20) : row_of(-20), 600:680] = WINDOW
+    sphere[row_of(-60) :, 800:900] = DOOR
+    return sphere
 
 
 class TestMaps:
-    def test_class_map_matches_the_panorama(self) -> None:
-        panorama = painted()
+    def test_class_map_matches_the_sphere(self) -> None:
+        sphere = painted()
         elevation_deg = np.array([-30.0, -10.0, 10.0])
-        kind = _class_map(panorama, by_colour, np.radians(elevation_deg), COLUMNS)
+        kind = _class_map(sphere, by_colour, np.radians(elevation_deg), COLUMNS)
         row = np.floor((0.5 - elevation_deg / 180.0) * ROWS).astype(int)
         # Nearest-neighbour sampling happens twice, so edges may be off by one.
-        assert (kind == panorama[row, :, 0]).mean() > 0.99
+        assert (kind == sphere[row, :, 0]).mean() > 0.99
 
     def test_column_shares_are_probabilities(self) -> None:
         seen = read_walls_and_openings(painted(), by_colour, WIDTH).openings
@@ -64,7 +64,7 @@ class TestMaps:
 
 
 def room(half_m: tuple[float, float], ceiling_m: float = 2.5) -> np.ndarray:
-    """Paint a panorama of an empty rectangular room in the teacher's classes, seen from its centre."""
+    """Paint a sphere of an empty rectangular room in the teacher's classes, seen from its centre."""
     surfaces = painted_surfaces((2.0 * half_m[0], 2.0 * half_m[1]), half_m, ceiling_m=ceiling_m, rows=ROWS)
     return np.repeat(np.array([FLOOR, WALL, CEILING])[surfaces][..., None], 3, axis=2).astype(np.uint8)
 
@@ -83,22 +83,22 @@ class TestWalls:
         np.testing.assert_allclose(seen, expected, atol=0.05)
 
     def test_ceiling_line_replaces_a_hidden_floor_line(self) -> None:
-        panorama = room((2.0, 3.0))
-        panorama[ROWS // 2 + 20 :, 100:200] = SOFA
-        seen = read_walls_and_openings(panorama, by_colour, WIDTH).log_distance
+        sphere = room((2.0, 3.0))
+        sphere[ROWS // 2 + 20 :, 100:200] = SOFA
+        seen = read_walls_and_openings(sphere, by_colour, WIDTH).log_distance
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         np.testing.assert_allclose(seen, expected, atol=0.08)
 
     def test_hidden_lines_give_nan(self) -> None:
-        panorama = room((2.0, 3.0))
-        panorama[:, 100:200] = SOFA
+        sphere = room((2.0, 3.0))
+        sphere[:, 100:200] = SOFA
         # A ceiling that is not flat gives no distances.
         sloped = room((2.0, 3.0))
         for number, ceiling_m in enumerate((2.9, 3.4), start=1):
             there = np.arange(COLUMNS) // 16 % 3 == number
             sloped[: ROWS // 2, there] = room((2.0, 3.0), ceiling_m=ceiling_m)[: ROWS // 2, there]
         sloped[ROWS // 2 + 20 :, 100:200] = SOFA
-        for picture in (panorama, sloped):
+        for picture in (sphere, sloped):
             unseen = np.isnan(read_walls_and_openings(picture, by_colour, WIDTH).log_distance)
             assert unseen[14:24].all()
             assert not unseen[30:].any()
@@ -122,9 +122,9 @@ class TestStretching:
         np.testing.assert_array_equal(openings[0, :, 0], np.abs(azimuth) < edge)
 
     def test_unit_factors_change_nothing(self) -> None:
-        panorama = torch.randint(0, 256, (1, 16, 32, 3), dtype=torch.uint8)
-        images, _, _ = stretched(panorama, torch.zeros(1, 32, 2), torch.zeros(1, 32), torch.ones(1, 2))
-        assert int((images.int() - panorama.int()).abs().max()) <= 1
+        sphere = torch.randint(0, 256, (1, 16, 32, 3), dtype=torch.uint8)
+        images, _, _ = stretched(sphere, torch.zeros(1, 32, 2), torch.zeros(1, 32), torch.ones(1, 2))
+        assert int((images.int() - sphere.int()).abs().max()) <= 1
 
 
 class TestDrawing:

@@ -24,7 +24,7 @@ from lalaloc_core.errors import RunError
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.report import write_report
 from lalaloc_core.evaluate.report.gallery import PER_GROUP, choose_queries
-from lalaloc_core.evaluate.report.pictures import DrawnMap, draw_map, draw_panorama, layout_lines
+from lalaloc_core.evaluate.report.pictures import DrawnMap, draw_map, draw_sphere, layout_lines
 from lalaloc_core.evaluate.report.reading import TOTAL, stage_times
 from lalaloc_core.evaluate.report.report_tables import distance, number
 from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
@@ -121,7 +121,7 @@ def run_folder(path: Path, predictions: list[Prediction], **changes: Any) -> Pat
     """Write a run; its data set does not exist unless `changes` name one."""
     values: dict[str, Any] = {
         "label": "a run",
-        "kind": "panorama",
+        "kind": "photograph",
         "dataset": "Somewhere3D",
         "data": str(path / "gone"),
         "command": "lalaloc lab evaluate --data gone",
@@ -257,7 +257,7 @@ class TestFigures:
     def test_run_description_is_shown(self, page: Page) -> None:
         for words in (
             "Somewhere3D, test split",
-            "12 panorama queries",
+            "12 photograph queries",
             "1 without an answer",
             "lalaloc lab evaluate --data",
         ):
@@ -405,7 +405,7 @@ class TestGallery:
         ]
         assert not [attributes for _, attributes in page.tags if attributes.get("class") == "warning"]
         assert "Located: off by 12.0 cm and 30.0°." in page.text
-        drawings = ("panorama.jpg", "latent-distance.png", "true-layout-distance.png")
+        drawings = ("sphere.jpg", "latent-distance.png", "true-layout-distance.png")
         names = {path.name for path in pictures.iterdir()}
         charts = {f"{name}{suffix}" for name in ("error-curves", "outcomes", "times") for suffix in (".svg", ".png")}
         assert names == charts | {f"run-1-best-1-{name}" for name in drawings}
@@ -490,6 +490,6 @@ class TestDrawing:
         with Image.open(io.BytesIO(drawing.content)) as picture:
             assert picture.size == (drawing.width, drawing.height)
         black = np.zeros((64, 128, 3), dtype=np.uint8)
-        panorama = draw_panorama(black, plan, 1.5, truth, None)
-        with Image.open(io.BytesIO(panorama.content)) as picture:
+        sphere = draw_sphere(black, plan, 1.5, truth, None)
+        with Image.open(io.BytesIO(sphere.content)) as picture:
             assert np.asarray(picture).max() > 200

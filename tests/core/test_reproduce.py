@@ -92,7 +92,7 @@ class TestTables:
     def test_main_table_has_both_architectures(self) -> None:
         (table,) = (table for table in TABLES if table.name == "localisation")
         queries = {(row.query.method, row.query.kind, row.query.model) for row in table.rows}
-        for kind in ("layout", "panorama"):
+        for kind in ("layout", "photograph"):
             assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= queries
             assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= queries
         assert ("oracle", "layout", None) in queries

@@ -39,11 +39,11 @@ def opened(content: bytes, stated: StatedCamera | None = None) -> Photograph:
     return open_photograph(content, sphere_size=(128, 256), stated=stated)
 
 
-def faces(panorama: np.ndarray) -> list[np.ndarray]:
+def faces(sphere: np.ndarray) -> list[np.ndarray]:
     """Return front, right, back, left, up and down."""
     camera = Perspective.of_hfov(256, 256, 0.5 * math.pi)
-    band = [take(panorama, camera, heading_deg=heading) for heading in (0.0, 90.0, 180.0, 270.0)]
-    return [*band, take(panorama, camera, pitch_deg=90.0), take(panorama, camera, pitch_deg=-90.0)]
+    band = [take(sphere, camera, heading_deg=heading) for heading in (0.0, 90.0, 180.0, 270.0)]
+    return [*band, take(sphere, camera, pitch_deg=90.0), take(sphere, camera, pitch_deg=-90.0)]
 
 
 def equiangular(face: np.ndarray) -> np.ndarray:
@@ -53,38 +53,38 @@ def equiangular(face: np.ndarray) -> np.ndarray:
     return cv2.remap(face, *np.meshgrid(on_face, on_face), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def barred(panorama: np.ndarray, above: int, beside: int, grey: int = 0) -> np.ndarray:
-    return np.pad(panorama, ((above, above), (beside, beside), (0, 0)), constant_values=grey)
+def barred(sphere: np.ndarray, above: int, beside: int, grey: int = 0) -> np.ndarray:
+    return np.pad(sphere, ((above, above), (beside, beside), (0, 0)), constant_values=grey)
 
 
-def usable(panorama: np.ndarray) -> dict[str, np.ndarray]:
+def usable(sphere: np.ndarray) -> dict[str, np.ndarray]:
     """Return pictures from which the sphere is taken, by a word of their warning."""
     return {
-        "bars at its borders, 11%": barred(panorama, 32, 0),
-        "bars at its borders, 33%": barred(panorama, 128, 0, 255),
-        "bars at its borders, 16%": barred(panorama, 0, 100),
+        "bars at its borders, 11%": barred(sphere, 32, 0),
+        "bars at its borders, 33%": barred(sphere, 128, 0, 255),
+        "bars at its borders, 16%": barred(sphere, 0, 100),
     }
 
 
-def circle(panorama: np.ndarray, heading_deg: float) -> np.ndarray:
-    picture = take(panorama, Fisheye.of_hfov(512, 512, math.radians(190.0)), heading_deg=heading_deg)
+def circle(sphere: np.ndarray, heading_deg: float) -> np.ndarray:
+    picture = take(sphere, Fisheye.of_hfov(512, 512, math.radians(190.0)), heading_deg=heading_deg)
     place = np.arange(512) - 255.5
     return picture * (np.hypot(*np.meshgrid(place, place)) < 255.0)[..., None].astype(np.uint8)
 
 
-def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
+def unusable(sphere: np.ndarray) -> dict[str, np.ndarray]:
     """Return pictures that are refused, by a word of the refusal."""
-    front, right, back, left, up, down = faces(panorama)
+    front, right, back, left, up, down = faces(sphere)
     empty = np.zeros_like(front)
     white = empty + 255
-    other_eye = np.roll(panorama, 6, axis=1)
-    square, other_square = (cv2.resize(eye, (512, 512)) for eye in (panorama, other_eye))
+    other_eye = np.roll(sphere, 6, axis=1)
+    square, other_square = (cv2.resize(eye, (512, 512)) for eye in (sphere, other_eye))
     rows = [[empty, up, empty, empty], [left, front, right, back], [empty, down, empty, empty]]
     column = [[white, up, white], [left, front, right], [white, down, white], [white, np.rot90(back, 2), white]]
     of_video = [equiangular(face) for face in (front, right, back, left, up, down)]
     turned = [np.rot90(of_video[5]), np.rot90(of_video[2], -1), np.rot90(of_video[4])]
-    two = [circle(panorama, heading_deg) for heading_deg in (0.0, 180.0)]
-    half, other_half = (eye[:, 256:768] for eye in (panorama, other_eye))
+    two = [circle(sphere, heading_deg) for heading_deg in (0.0, 180.0)]
+    half, other_half = (eye[:, 256:768] for eye in (sphere, other_eye))
     return {
         "cube map, 3 x 2 faces": np.vstack([np.hstack([right, left, up]), np.hstack([down, front, back])]),
         "cube map, 3 x 2 faces: convert": np.vstack([np.hstack([of_video[i] for i in (3, 0, 1)]), np.hstack(turned)]),
@@ -98,8 +98,8 @@ def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
         "cube map, 1 x 6": np.vstack([front, right, back, left, up, down]),
         "cross of 4 x 3": np.vstack([np.hstack(row) for row in rows]),
         "cross of 3 x 4": np.vstack([np.hstack(row) for row in column]),
-        "one eye above the other: cut out": np.vstack([panorama, other_eye]),
-        "one eye beside the other: cut out": np.hstack([panorama, other_eye]),
+        "one eye above the other: cut out": np.vstack([sphere, other_eye]),
+        "one eye beside the other: cut out": np.hstack([sphere, other_eye]),
         "stereo sphere, one eye beside": np.hstack([square, other_square]),
         "VR180, two eyes": np.hstack([half, other_half]),
         "dual fisheye": np.hstack(two),
@@ -111,10 +111,10 @@ def unusable(panorama: np.ndarray) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_sphere_is_taken_out_of_its_bars(name: str) -> None:
-    panorama = small(name)
-    whole = opened(jpeg(panorama)).sphere
+    sphere = small(name)
+    whole = opened(jpeg(sphere)).sphere
     assert whole is not None
-    for words, pixels in usable(panorama).items():
+    for words, pixels in usable(sphere).items():
         view = opened(jpeg(pixels))
         assert (view.projection, view.projection_source) == ("equirectangular", "estimated"), words
         assert words in view.warnings[0]
@@ -170,16 +170,16 @@ def test_orientation_of_a_sphere_is_ignored(orientation: int) -> None:
     assert f"Exif orientation {orientation}, which is ignored" in view.warnings[0]
 
 
-def ordinary(panorama: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, bool]]:
+def ordinary(sphere: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, bool]]:
     """Yield views of usual lenses and shapes, and crops, whose lines are bent; and whether it is a crop."""
     for hfov_deg in (50.0, 67.0, 106.0):
         for width, height in ((640, 480), (480, 640), (600, 400), (360, 640), (640, 360), (500, 500), (800, 400)):
             across = 2.0 * math.atan(math.tan(0.5 * math.radians(hfov_deg)) * min(1.0, width / height))
             tilt = {"heading_deg": rng.uniform(0.0, 360.0), "pitch_deg": rng.uniform(-15.0, 15.0)}
-            yield take(panorama, Perspective.of_hfov(width, height, across), **tilt), False
+            yield take(sphere, Perspective.of_hfov(width, height, across), **tilt), False
     for width, height in ((600, 300), (480, 320), (512, 384), (400, 400), (300, 450), (900, 400)):
         left, top = int(rng.integers(0, 1024 - width)), int(rng.integers(0, 512 - height))
-        yield panorama[top : top + height, left : left + width], True
+        yield sphere[top : top + height, left : left + width], True
 
 
 @pytest.mark.parametrize("name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])])

@@ -43,13 +43,13 @@ STANDS = (Stand(room_index=0, x_m=1.1, y_m=0.9), Stand(room_index=2, x_m=3.2, y_
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Create scenes of small panoramas, with one test scene of two cameras."""
+    """Create scenes of small spheres, with one test scene of two cameras."""
     write_synthetic(tmp_path)
     write_scene(tmp_path / NAME, crooked_flat(), STANDS, np.random.default_rng(1))
     return tmp_path
 
 
-def panorama_of(root: Path, room_index: int = 0) -> Path:
+def sphere_of(root: Path, room_index: int = 0) -> Path:
     return root / NAME / "2D_rendering" / room_id(room_index) / "panorama"
 
 
@@ -371,7 +371,7 @@ class TestCameras:
         write_scene(root / "scene_03251", crooked_flat(), [], np.random.default_rng(0))
         assert Structured3D(root).load("scene_03251").cameras == ()
 
-    def test_rooms_without_panorama_are_skipped(self, root: Path) -> None:
+    def test_rooms_without_sphere_are_skipped(self, root: Path) -> None:
         rendering = root / NAME / "2D_rendering"
         (rendering / "77" / "perspective").mkdir(parents=True)
         (rendering / ".cache").mkdir()
@@ -398,7 +398,7 @@ class TestCameras:
         ],
     )
     def test_bad_camera_position_is_refused_or_left_out(self, root: Path, content: bytes, reasons: list[str]) -> None:
-        path = panorama_of(root) / "camera_xyz.txt"
+        path = sphere_of(root) / "camera_xyz.txt"
         path.write_bytes(content)
         error = refused(root, *reasons, room=room_id(0))
         assert error.path == path
@@ -408,7 +408,7 @@ class TestCameras:
         assert [str(problem) for problem in problems] == [str(error)]
 
     def test_missing_camera_position_is_refused(self, root: Path) -> None:
-        (panorama_of(root) / "camera_xyz.txt").unlink()
+        (sphere_of(root) / "camera_xyz.txt").unlink()
         refused(root, "cannot be read: No such file", "camera_xyz.txt", room=room_id(0))
 
     def test_unknown_room_folder_is_refused(self, root: Path) -> None:
@@ -420,9 +420,9 @@ class TestCameras:
         planes = drawing.prism(np.array([[9000.0, 0.0], [9300.0, 0.0], [9300.0, 300.0], [9000.0, 300.0]]), 0, 2500)
         drawing.semantics.append({"ID": 5, "type": "store room", "planeID": planes})
         write_annotation(root / NAME, drawing.to_document(np.random.default_rng(0)))
-        panorama = root / NAME / "2D_rendering" / "5" / "panorama"
-        panorama.mkdir(parents=True)
-        write_camera(panorama, 9150.0, 150.0, 1400.0)
+        sphere = root / NAME / "2D_rendering" / "5" / "panorama"
+        sphere.mkdir(parents=True)
+        write_camera(sphere, 9150.0, 150.0, 1400.0)
         refused(root, "below the minimum area", room="5")
 
 
@@ -444,13 +444,13 @@ class TestPhotographs:
     def test_photographs_return_their_pixels(self, root: Path) -> None:
         scene = Structured3D(root).load(NAME)
         photograph = scene.photograph(scene.cameras[0], Appearance("full", "warm"))
-        stored = np.asarray(Image.open(panorama_of(root) / "full" / "rgb_warmlight.png"))
+        stored = np.asarray(Image.open(sphere_of(root) / "full" / "rgb_warmlight.png"))
         np.testing.assert_array_equal(photograph.image(HEIGHT, WIDTH), stored)
         assert photograph.image(16, 32).shape == (16, 32, 3)
         np.testing.assert_array_equal(pickle.loads(pickle.dumps(photograph)).image(HEIGHT, WIDTH), stored)
 
     def test_depth_without_reading_is_nan(self, root: Path) -> None:
-        path = panorama_of(root) / "full" / "depth.png"
+        path = sphere_of(root) / "full" / "depth.png"
         depth = np.asarray(Image.open(path)).copy()
         depth[3, 4] = 0
         Image.fromarray(depth).save(path)
@@ -481,7 +481,7 @@ class TestPhotographs:
         self, root: Path, file: str, content: bytes | slice | None, reason: str
     ) -> None:
         scene = Structured3D(root).load(NAME)
-        path = panorama_of(root) / "full" / file
+        path = sphere_of(root) / "full" / file
         stored = path.read_bytes()
         path.unlink()
         if content is not None:
@@ -492,7 +492,7 @@ class TestPhotographs:
         assert (caught.value.scene, caught.value.room, caught.value.path) == (NAME, room_id(0), path)
 
     def test_eight_bit_depth_is_refused(self, root: Path) -> None:
-        path = panorama_of(root) / "full" / "depth.png"
+        path = sphere_of(root) / "full" / "depth.png"
         Image.fromarray(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)).save(path)
         scene = Structured3D(root).load(NAME)
         with pytest.raises(DatasetError, match="mode L; a 16-bit grey PNG is required"):
@@ -527,10 +527,10 @@ class TestDataset:
     def test_synthetic_scenes_have_their_own_description(self, root: Path) -> None:
         dataset = Structured3D(root)
         assert dataset.description == "synthetic scenes (seed 5)"
-        assert dataset.panorama_size == (HEIGHT, WIDTH)
+        assert dataset.sphere_size == (HEIGHT, WIDTH)
         (root / "synthetic.json").unlink()
         assert Structured3D(root).description == "Structured3D"
-        assert Structured3D(root).panorama_size == (512, 1024)
+        assert Structured3D(root).sphere_size == (512, 1024)
 
     @pytest.mark.parametrize(
         ("changes", "reason"),

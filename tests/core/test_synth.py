@@ -19,7 +19,7 @@ from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
 from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, Home, generate_home
 from lalaloc_core.learn.synth.homes.plans import home_of as home_of_split
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, contact_sheet, sample_shots
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, contact_sheet, sample_shots
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
@@ -30,8 +30,8 @@ ROWS, COLUMNS = 64, 128
 
 
 @pytest.fixture(scope="module")
-def renderer(materials: MaterialLibrary) -> PanoramaRenderer:
-    return PanoramaRenderer(materials, height=ROWS, width=COLUMNS)
+def renderer(materials: MaterialLibrary) -> SphereRenderer:
+    return SphereRenderer(materials, height=ROWS, width=COLUMNS)
 
 
 def home_of(seed: int) -> Home:
@@ -165,7 +165,7 @@ def test_homes_are_varied() -> None:
 @pytest.mark.slow
 @given(seed=seeds())
 @settings(max_examples=25)
-def test_empty_closed_room_shows_its_layout(renderer: PanoramaRenderer, seed: int) -> None:
+def test_empty_closed_room_shows_its_layout(renderer: SphereRenderer, seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = shut(generate_home(rng))
     shots = sample_shots(home, 3, rng, "empty")
@@ -184,7 +184,7 @@ def test_empty_closed_room_shows_its_layout(renderer: PanoramaRenderer, seed: in
 
 @given(seed=seeds())
 @settings(max_examples=10)
-def test_rays_end_at_walls_except_through_openings(renderer: PanoramaRenderer, seed: int) -> None:
+def test_rays_end_at_walls_except_through_openings(renderer: SphereRenderer, seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     (shot,) = sample_shots(home, 1, rng, "empty")
@@ -197,7 +197,7 @@ def test_rays_end_at_walls_except_through_openings(renderer: PanoramaRenderer, s
     assert hits.distance_m.isfinite().all()
 
 
-def test_picture_does_not_depend_on_its_batch(renderer: PanoramaRenderer) -> None:
+def test_picture_does_not_depend_on_its_batch(renderer: SphereRenderer) -> None:
     rng = np.random.default_rng(3)
     shots = [shot for seed in range(4) for shot in sample_shots(home_of(seed), 2, rng)]
     together = renderer.render(shots)
@@ -210,7 +210,7 @@ def test_picture_does_not_depend_on_its_batch(renderer: PanoramaRenderer) -> Non
     assert not torch.equal(together[:1], reseeded)
 
 
-def test_pictures_are_well_exposed(renderer: PanoramaRenderer) -> None:
+def test_pictures_are_well_exposed(renderer: SphereRenderer) -> None:
     rng = np.random.default_rng(4)
     shots = [shot for seed in range(20) for shot in sample_shots(home_of(seed), 2, rng)]
     mean = renderer.render(shots).float().mean(dim=(1, 2, 3))
@@ -219,7 +219,7 @@ def test_pictures_are_well_exposed(renderer: PanoramaRenderer) -> None:
     assert float(mean.std()) > 10.0
 
 
-def test_turned_camera_rolls_the_picture(renderer: PanoramaRenderer) -> None:
+def test_turned_camera_rolls_the_picture(renderer: SphereRenderer) -> None:
     (shot,) = sample_shots(home_of(5), 1, np.random.default_rng(5), "full")
     turned = dataclasses.replace(shot, heading=shot.heading + 2.0 * np.pi * 32 / COLUMNS)
     hits = renderer.hits([shot, turned])
@@ -228,7 +228,7 @@ def test_turned_camera_rolls_the_picture(renderer: PanoramaRenderer) -> None:
 
 
 @pytest.mark.slow
-def test_furniture_hides_the_layout(renderer: PanoramaRenderer) -> None:
+def test_furniture_hides_the_layout(renderer: SphereRenderer) -> None:
     shares = []
     for level in FURNITURE_LEVELS:
         rng = np.random.default_rng(6)
@@ -316,10 +316,10 @@ def test_textures_folder_without_pictures_is_refused(tmp_path: Path) -> None:
 
 def test_odd_height_is_refused(materials: MaterialLibrary) -> None:
     with pytest.raises(InvalidInputError, match="even"):
-        PanoramaRenderer(materials, height=63, width=128)
+        SphereRenderer(materials, height=63, width=128)
 
 
-def test_contact_sheet_shows_sixteen_panoramas(tmp_path: Path) -> None:
+def test_contact_sheet_shows_sixteen_spheres(tmp_path: Path) -> None:
     path = tmp_path / "sheet.png"
     contact_sheet(path, np.random.default_rng(0), height=16)
     with Image.open(path) as sheet:

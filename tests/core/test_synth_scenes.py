@@ -23,7 +23,7 @@ from lalaloc_core.learn.synth.camera.patches import cover_poles
 from lalaloc_core.learn.synth.furniture.furnish import furnish, rectangle, wall_frame
 from lalaloc_core.learn.synth.homes.plans import TRAIN, generate_home, home_of
 from lalaloc_core.learn.synth.records import Column, Joined, Records
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.ceilings import ceiling_boxes
 from lalaloc_core.learn.synth.scene.doors import boards, hang_leaves
@@ -105,7 +105,7 @@ def test_facts_match_the_scene(known: list[tuple[Shot, frozenset[str]]], materia
 
 def test_sun_patches_are_lit(known: list[tuple[Shot, frozenset[str]]], materials: MaterialLibrary) -> None:
     """The picture without the sun differs if the facts name a sun patch."""
-    renderer = PanoramaRenderer(materials, height=64, width=128)
+    renderer = SphereRenderer(materials, height=64, width=128)
     seen = differs = 0
     for shot, facts in known:
         if "sun_patch" not in facts or shot.furniture == "full":
@@ -385,8 +385,8 @@ def test_staged_cameras_have_no_flaws(seed: int) -> None:
 def test_supersampling_keeps_the_picture(materials: MaterialLibrary, rays: tuple[int, int]) -> None:
     rng = np.random.default_rng(11)
     shots = [shot for _ in range(3) for shot in sample_shots(generate_home(rng), 2, rng, "empty")]
-    few = PanoramaRenderer(materials, height=ROWS, width=COLUMNS).render(shots).float()
-    many = PanoramaRenderer(materials, height=ROWS, width=COLUMNS, supersample=rays).render(shots).float()
+    few = SphereRenderer(materials, height=ROWS, width=COLUMNS).render(shots).float()
+    many = SphereRenderer(materials, height=ROWS, width=COLUMNS, supersample=rays).render(shots).float()
     assert few.shape == many.shape
     assert float((few - many).abs().median()) <= 2.0
     # Averaging takes contrast away, never adds any.
@@ -397,11 +397,11 @@ def test_supersampling_keeps_the_picture(materials: MaterialLibrary, rays: tuple
 def test_single_supersample_applies_to_both_axes(materials: MaterialLibrary) -> None:
     shots = sample_shots(generate_home(np.random.default_rng(1)), 1, np.random.default_rng(1))
     first, second = (
-        PanoramaRenderer(materials, height=32, width=64, supersample=rays).render(shots) for rays in (2, (2, 2))
+        SphereRenderer(materials, height=32, width=64, supersample=rays).render(shots) for rays in (2, (2, 2))
     )
     assert torch.equal(first, second)
 
 
 def test_supersample_below_one_is_refused(materials: MaterialLibrary) -> None:
     with pytest.raises(InvalidInputError, match="at least 1"):
-        PanoramaRenderer(materials, supersample=(0, 1))
+        SphereRenderer(materials, supersample=(0, 1))

@@ -72,14 +72,14 @@ def homes_of(root: Path) -> Iterator[tuple[Path, Home, list[Shot]]]:
         yield root / f"scene_{number:05d}", home, stage_rooms(home, rng)
 
 
-def panoramas_of(root: Path) -> Iterator[tuple[Path, Shot]]:
+def spheres_of(root: Path) -> Iterator[tuple[Path, Shot]]:
     for folder, _, shots in homes_of(root):
         yield from ((folder / "2D_rendering" / str(shot.room_index) / "panorama", shot) for shot in shots)
 
 
-def depth_of(panorama: Path, furniture: str) -> np.ndarray:
+def depth_of(sphere: Path, furniture: str) -> np.ndarray:
     """Return a depth image in millimetres."""
-    return np.asarray(Image.open(panorama / furniture / "depth.png"), dtype=int)
+    return np.asarray(Image.open(sphere / furniture / "depth.png"), dtype=int)
 
 
 # The annotation
@@ -228,7 +228,7 @@ def test_rooms_have_structured3d_types() -> None:
 
 def test_written_scene_is_read_back(root: Path) -> None:
     dataset = Structured3D(root)
-    assert dataset.panorama_size == (HEIGHT, 2 * HEIGHT)
+    assert dataset.sphere_size == (HEIGHT, 2 * HEIGHT)
     assert dataset.scenes("test") == ["scene_03250", "scene_03251"]
     assert dataset.scenes("train") == []
     for folder, home, shots in homes_of(root):
@@ -298,14 +298,14 @@ def test_layout_pixels_match_visible_corners(seed: int) -> None:
 # Pictures
 
 
-def test_every_room_has_nine_panoramas_and_three_depths(root: Path) -> None:
-    for panorama, shot in panoramas_of(root):
-        assert {path.name for path in panorama.iterdir()} == {"camera_xyz.txt", "layout.txt", *FURNITURE}
+def test_every_room_has_nine_spheres_and_three_depths(root: Path) -> None:
+    for sphere, shot in spheres_of(root):
+        assert {path.name for path in sphere.iterdir()} == {"camera_xyz.txt", "layout.txt", *FURNITURE}
         room = shot.home.plan.rooms[shot.room_index]
         expected = layout_pixels(room, shot.position_m, shot.camera_height_m)
-        np.testing.assert_allclose(np.loadtxt(panorama / "layout.txt"), expected, atol=1e-3)
+        np.testing.assert_allclose(np.loadtxt(sphere / "layout.txt"), expected, atol=1e-3)
         for furniture in FURNITURE:
-            files = {path.name: path for path in (panorama / furniture).iterdir()}
+            files = {path.name: path for path in (sphere / furniture).iterdir()}
             assert set(files) == {"depth.png", *(f"rgb_{light}light.png" for light in LIGHTING)}
             for name, path in files.items():
                 with Image.open(path) as image:
@@ -314,8 +314,8 @@ def test_every_room_has_nine_panoramas_and_three_depths(root: Path) -> None:
 
 
 def test_empty_depth_matches_the_layout_except_doors(root: Path) -> None:
-    for panorama, shot in panoramas_of(root):
-        depth_m, room = depth_of(panorama, "empty") / 1000.0, shot.home.plan.rooms[shot.room_index]
+    for sphere, shot in spheres_of(root):
+        depth_m, room = depth_of(sphere, "empty") / 1000.0, shot.home.plan.rooms[shot.room_index]
         profile = wall_profile(shot.position_m[None], np.zeros(1), room.walls_m[None], 2 * HEIGHT)
         heights = np.array([shot.camera_height_m]), np.array([room.ceiling_height_m])
         layout_m = layout_depth(profile, *heights, HEIGHT)[0]
@@ -335,8 +335,8 @@ def test_empty_depth_matches_the_layout_except_doors(root: Path) -> None:
 
 def test_furniture_only_shortens_depth(root: Path) -> None:
     hidden = []
-    for panorama, _ in panoramas_of(root):
-        empty, simple, full = (depth_of(panorama, level) for level in ("empty", "simple", "full"))
+    for sphere, _ in spheres_of(root):
+        empty, simple, full = (depth_of(sphere, level) for level in ("empty", "simple", "full"))
         assert (np.maximum(simple, full) <= empty + 1).all()
         hidden.append([(depth < empty - 1).mean() for depth in (simple, full)])
     simple, full = np.mean(hidden, axis=0)
@@ -344,10 +344,10 @@ def test_furniture_only_shortens_depth(root: Path) -> None:
 
 
 def test_light_changes_colours(root: Path) -> None:
-    for (panorama, _), level in itertools.product(panoramas_of(root), FURNITURE):
+    for (sphere, _), level in itertools.product(spheres_of(root), FURNITURE):
         blueness = []
         for light in ("cold", "raw", "warm"):
-            pixels = np.asarray(Image.open(panorama / level / f"rgb_{light}light.png"), dtype=float)
+            pixels = np.asarray(Image.open(sphere / level / f"rgb_{light}light.png"), dtype=float)
             blueness.append(math.log(pixels[..., 2].mean() / pixels[..., 0].mean()))
             assert 40.0 < pixels.mean() < 220.0
         assert blueness[0] - 0.05 > blueness[1] > blueness[2] + 0.05

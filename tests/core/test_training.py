@@ -27,7 +27,7 @@ from lalaloc_core.learn.metrics import chamfer_distance
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.training import batches, sources
 from lalaloc_core.learn.training import layout_stage as layout_stage_module
-from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
+from lalaloc_core.learn.training.batch_streams import LayoutBatches, SphereBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import ImageStageConfig, OptimiserConfig, TrainConfig, Turns
@@ -57,9 +57,9 @@ def layout_batches(config: TrainConfig = TINY, first: int = 0) -> Iterator[Batch
     return load_batches(LayoutBatches(config, GeneratedSource(config), first), 0)
 
 
-def panorama_batches(config: TrainConfig = TINY, *, neighbours: bool = False) -> Iterator[Batch]:
+def sphere_batches(config: TrainConfig = TINY, *, neighbours: bool = False) -> Iterator[Batch]:
     """Yield stage 2's batches of generated homes, made in this process."""
-    return load_batches(PanoramaBatches(config, GeneratedSource(config), neighbours), 0)
+    return load_batches(SphereBatches(config, GeneratedSource(config), neighbours), 0)
 
 
 def changed(part: str, config: TrainConfig, **settings: Any) -> TrainConfig:
@@ -319,8 +319,8 @@ class TestStreams:
         resumed = next(layout_stage().batches(2, 0))
         assert not any(torch.equal(resumed["profile_m"], batch["profile_m"]) for batch in seen)
 
-    def test_panorama_batch_holds_pictures_with_layouts(self) -> None:
-        batch = next(panorama_batches())
+    def test_sphere_batch_holds_pictures_with_layouts(self) -> None:
+        batch = next(sphere_batches())
         count, (height, width) = TINY.image.batch, TINY.image_size
         assert batch["image"].shape == (count, height, width, 3)
         assert batch["image"].dtype == torch.uint8
@@ -328,12 +328,12 @@ class TestStreams:
         assert batch["camera_height_m"].shape == batch["ceiling_height_m"].shape == (count,)
         assert bool(torch.isfinite(batch["profile_m"]).all())
         assert bool((batch["camera_height_m"] < batch["ceiling_height_m"]).all())
-        again = next(panorama_batches())
+        again = next(sphere_batches())
         assert all(torch.equal(batch[key], again[key]) for key in batch)
 
     @pytest.mark.parametrize("turns", get_args(Turns))
     @given(seed=seeds(), heading=st.floats(-7.0, 7.0), columns=st.sampled_from([16, 24, 48]))
-    def test_rotated_panorama_matches_its_layout(self, turns: Turns, seed: int, heading: float, columns: int) -> None:
+    def test_rotated_sphere_matches_its_layout(self, turns: Turns, seed: int, heading: float, columns: int) -> None:
         rng = np.random.default_rng(seed)
         plan, width = crooked_flat(), 48
         poses = random_poses(plan, 1, rng)
@@ -364,8 +364,8 @@ class TestStreams:
         drawn = [sample_rotation(turns, 0.0, 8, rng) for _ in range(300)]
         assert len({(round(turn.heading % TWO_PI, 6), turn.mirrored) for turn in drawn}) == count
 
-    def test_neighbours_are_rotated_like_their_panorama(self) -> None:
-        batch = next(panorama_batches(neighbours=True))
+    def test_neighbours_are_rotated_like_their_sphere(self) -> None:
+        batch = next(sphere_batches(neighbours=True))
         sampling = TINY.layout.triplets
         count = sampling.positives + sampling.negatives
         assert batch["neighbour_profile_m"].shape == (TINY.image.batch, count, TINY.profile_columns)

@@ -20,7 +20,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.errors import CheckpointError, DatasetError
 from lalaloc_core.learn.data.folder import OwnData
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
+from lalaloc_core.learn.training.batch_streams import LayoutBatches, SphereBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.presets import PRESETS
@@ -43,7 +43,7 @@ CONFIG = PRESETS["tiny"].with_settings(
 
 @pytest.fixture
 def data(tmp_path: Path) -> OwnData:
-    """Write scenes 0 to 4 for training and one for validation; panorama k of scene s has grey 40 s + 10 k."""
+    """Write scenes 0 to 4 for training and one for validation; sphere k of scene s has grey 40 s + 10 k."""
     root = tmp_path / "data"
     plan = crooked_flat()
     with_split = [(f"scene {number}", "train") for number in range(SCENES)] + [("scene v", "validation")]
@@ -54,7 +54,7 @@ def data(tmp_path: Path) -> OwnData:
         poses = random_poses(plan, CAMERAS, np.random.default_rng(number), 0.3)
         with (folder / "poses.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["panorama", "x_m", "y_m", "heading_deg", "camera_height_m"])
+            writer.writerow(["photograph", "x_m", "y_m", "heading_deg", "camera_height_m"])
             for k, (x, y) in enumerate(poses.position_m):
                 writer.writerow([f"{k}.png", x, y, HEADING_DEG, 1.2 + 0.1 * k])
                 Image.new("RGB", (128, 64), (40 * number + 10 * k,) * 3).save(folder / f"{k}.png")
@@ -62,8 +62,8 @@ def data(tmp_path: Path) -> OwnData:
     return OwnData(root)
 
 
-def panoramas(source: SceneSource, *, neighbours: bool = False) -> Iterator[Batch]:
-    return load_batches(PanoramaBatches(source.config, source, neighbours), 0)
+def spheres(source: SceneSource, *, neighbours: bool = False) -> Iterator[Batch]:
+    return load_batches(SphereBatches(source.config, source, neighbours), 0)
 
 
 def greys(batches: Iterator[Batch], count: int) -> list[int]:
@@ -71,8 +71,8 @@ def greys(batches: Iterator[Batch], count: int) -> list[int]:
 
 
 class TestDrawing:
-    def test_panorama_has_its_layout_at_its_heading(self, data: OwnData) -> None:
-        batch = next(panoramas(SceneSource(CONFIG, data)))
+    def test_sphere_has_its_layout_at_its_heading(self, data: OwnData) -> None:
+        batch = next(spheres(SceneSource(CONFIG, data)))
         # "none" rotates the pictures to heading 0 by whole pixels of 1/64 turn.
         pixel = 2.0 * math.pi / CONFIG.image_size[1]
         heading = math.radians(HEADING_DEG) % pixel
@@ -95,13 +95,13 @@ class TestDrawing:
 
     def test_epochs_visit_every_scene_in_new_orders(self, data: OwnData) -> None:
         config = CONFIG.with_settings({"image.batch": SCENES})
-        scenes = np.array(greys(panoramas(SceneSource(config, data)), 6)).reshape(6, SCENES) // 40
+        scenes = np.array(greys(spheres(SceneSource(config, data)), 6)).reshape(6, SCENES) // 40
         assert all(sorted(epoch) == list(range(SCENES)) for epoch in scenes.tolist())
         assert len({tuple(epoch) for epoch in scenes.tolist()}) > 3
 
     def test_seed_determines_the_samples(self, data: OwnData) -> None:
-        first, again = (greys(panoramas(SceneSource(CONFIG, data)), 5) for _ in range(2))
-        different = greys(panoramas(SceneSource(dataclasses.replace(CONFIG, seed=1), data)), 5)
+        first, again = (greys(spheres(SceneSource(CONFIG, data)), 5) for _ in range(2))
+        different = greys(spheres(SceneSource(dataclasses.replace(CONFIG, seed=1), data)), 5)
         assert first == again != different
 
     def test_samples_do_not_depend_on_the_worker(self, data: OwnData) -> None:
@@ -149,13 +149,13 @@ class TestBadFiles:
     def test_bad_file_ends_training(self, data: OwnData) -> None:
         named = self.damaged(data)
         with pytest.raises(DatasetError) as raised:
-            greys(panoramas(SceneSource(CONFIG, data)), 40)
+            greys(spheres(SceneSource(CONFIG, data)), 40)
         assert present(raised.value.path).name in named
 
     def test_skipped_files_are_logged_once(self, data: OwnData, caplog: pytest.LogCaptureFixture) -> None:
         named = self.damaged(data)
         with caplog.at_level(logging.WARNING):
-            drawn = set(greys(panoramas(SceneSource(CONFIG, data, skip_bad=True)), 60))
+            drawn = set(greys(spheres(SceneSource(CONFIG, data, skip_bad=True)), 60))
         good = {40 * scene + 10 * camera for scene in range(SCENES) for camera in range(CAMERAS)}
         assert drawn == good - {60} - {120, 130, 140}
         messages = [record.getMessage() for record in caplog.records]
@@ -166,7 +166,7 @@ class TestBadFiles:
     def test_data_set_without_usable_scene_is_refused(self, data: OwnData) -> None:
         for number in range(SCENES):
             (data.root / f"scene {number}" / "plan.json").write_text("{}", encoding="utf-8")
-        for stream in (LayoutBatches, PanoramaBatches):
+        for stream in (LayoutBatches, SphereBatches):
             with pytest.raises(DatasetError, match="in a row"):
                 next(load_batches(stream(CONFIG, SceneSource(CONFIG, data, skip_bad=True)), 0))
 

@@ -300,7 +300,7 @@ def service(bundle: Bundle) -> PhotographEncoder:
     return PhotographEncoder(bundle, threads=1)
 
 
-def panorama() -> np.ndarray:
+def sphere() -> np.ndarray:
     return pictures(1, TINY.trunk)[0].numpy()
 
 
@@ -326,7 +326,7 @@ class TestBundle:
         assert sum(manifest.room_type_prior) == pytest.approx(1.0)
 
     def test_query_has_openings_ceiling_and_room_type(self, service: PhotographEncoder) -> None:
-        query = service.spheres.query(panorama(), None, CameraHeight(1.5))
+        query = service.spheres.query(sphere(), None, CameraHeight(1.5))
         shape = (TINY.ring.sectors, TINY.profile_columns, len(OPENING_CLASSES))
         assert present(query.openings).log_probability.shape == shape
         np.testing.assert_allclose(np.exp(present(query.openings).log_probability).sum(axis=2), 1.0, rtol=1e-5)
@@ -335,16 +335,16 @@ class TestBundle:
         assert np.isfinite([present(query.ceiling).log_m, present(query.ceiling).log_scale]).all()
 
     def test_openings_rotate_with_the_hypotheses(self, service: PhotographEncoder) -> None:
-        query = service.spheres.query(panorama(), None, CameraHeight(1.5))
+        query = service.spheres.query(sphere(), None, CameraHeight(1.5))
         assert query.openings is not None
         shifts = np.arange(TINY.ring.sectors) * (TINY.profile_columns // TINY.ring.sectors)
         np.testing.assert_array_equal(present(query.profile).log_m, rolled(present(query.profile).log_m[0], shifts))
         np.testing.assert_array_equal(query.openings.log_probability, rolled(query.openings.log_probability[0], shifts))
         assert not np.allclose(query.openings.log_probability[0], query.openings.log_probability[1])
 
-    def test_mirrored_panorama_gives_mirrored_predictions(self, service: PhotographEncoder) -> None:
+    def test_mirrored_sphere_gives_mirrored_predictions(self, service: PhotographEncoder) -> None:
         plain, mirrored = (
-            service.spheres.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1])
+            service.spheres.query(image, 0.0, CameraHeight(1.5)) for image in (sphere(), sphere()[:, ::-1])
         )
         for found, expected in (
             (present(mirrored.profile).log_m, present(plain.profile).log_m[:, ::-1]),

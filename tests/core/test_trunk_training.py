@@ -21,7 +21,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.export.run_export import export_into, export_run
 from lalaloc_core.learn.training import losses, run
-from lalaloc_core.learn.training.batch_streams import UNKNOWN, PanoramaBatches, opening_kinds
+from lalaloc_core.learn.training.batch_streams import UNKNOWN, SphereBatches, opening_kinds
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.end_to_end import EndToEndStage
@@ -72,7 +72,7 @@ def parts_with_gradient(stage: ImageStage) -> set[str]:
 
 @pytest.fixture(scope="module")
 def batch() -> dict[str, torch.Tensor]:
-    found: Any = next(iter(PanoramaBatches(TINY, GeneratedSource(TINY))))
+    found: Any = next(iter(SphereBatches(TINY, GeneratedSource(TINY))))
     return found
 
 
@@ -108,7 +108,7 @@ class TestLabels:
         assert bool(((batch["room_type"] >= 1) & (batch["room_type"] < len(ROOM_TYPES))).all())
 
     def test_other_architectures_have_no_class_labels(self) -> None:
-        found: Any = next(iter(PanoramaBatches(PRESETS["tiny"], GeneratedSource(PRESETS["tiny"]))))
+        found: Any = next(iter(SphereBatches(PRESETS["tiny"], GeneratedSource(PRESETS["tiny"]))))
         assert not {"opening_kind", "room_type"} & set(found)
 
 
@@ -332,11 +332,11 @@ class TestWarmStart:
             "version": "test",
             "sha256": parent.sha256,
             "minutes_in_all": before["minutes"],
-            "panoramas_in_all": before["panoramas"],
+            "spheres_in_all": before["spheres"],
         }
         batch = SHORT_RING.image.batch
-        assert entry["panoramas_in_all"] == before["panoramas"] + entry["panoramas"]
-        assert entry["panoramas"] == entry["steps"] * batch
+        assert entry["spheres_in_all"] == before["spheres"] + entry["spheres"]
+        assert entry["spheres"] == entry["steps"] * batch
         assert entry["minutes_in_all"] >= before["minutes"]
         # The layout encoder and the decoder are bit-identical to the parent's.
         for name in ("layout_encoder.safetensors", "decoder.safetensors"):
@@ -345,8 +345,8 @@ class TestWarmStart:
         # Totals of a grandchild include all ancestors.
         trained(tmp_path / "next", tmp_path / "child")
         grandchild = export_run(tmp_path / "next", tmp_path / "grandchild", name="grandchild", version="3")
-        in_all = grandchild.manifest.training["image"]["panoramas_in_all"]
-        assert in_all == before["panoramas"] + entry["panoramas"] + 2 * batch
+        in_all = grandchild.manifest.training["image"]["spheres_in_all"]
+        assert in_all == before["spheres"] + entry["spheres"] + 2 * batch
 
     def test_stage_starts_from_bundle_weights(self, tiny_bundle: Path) -> None:
         stage = ImageStage(RING, GeneratedSource(RING), build_layout_encoder(RING))
@@ -409,11 +409,11 @@ class TestWarmStart:
             "--out",
             str(tmp_path),
         ]
-        words += ["--from", str(tiny_bundle), "--set", "image.uses_per_panorama=2", "--set", "image.batch=4"]
+        words += ["--from", str(tiny_bundle), "--set", "image.uses_per_sphere=2", "--set", "image.batch=4"]
         words += ["--validation-homes", "1"]
         assert main([*words, "--steps", "1"]) == 0
         config = Checkpoint.load(tmp_path / "image.pt").config
-        assert (config.image.uses_per_panorama, config.image.batch) == (2, 4)
+        assert (config.image.uses_per_sphere, config.image.batch) == (2, 4)
         assert main([*words, "--resume"]) == 2
         assert main(["lab", "train", "layout", "--out", str(tmp_path), "--set", "image.batch"]) == 2
         assert (

@@ -14,7 +14,7 @@ from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import EXAMPLES, jpeg
 
 PLAN = str(EXAMPLES / "flat.json")
-# Of the panorama that the pictures are cut from.
+# Of the sphere that the pictures are cut from.
 TRUTH = next(pose for pose in json.loads((EXAMPLES / "poses.json").read_text()) if pose["file"] == "living_room.jpg")
 
 
@@ -23,7 +23,7 @@ def answer_of(capsys: pytest.CaptureFixture[str], path: Path, *options: str) -> 
     (answer,) = json.loads(capsys.readouterr().out)
     position = answer["position"]
     assert math.hypot(position["x_m"] - TRUTH["x_m"], position["y_m"] - TRUTH["y_m"]) < 0.5
-    # The pictures look along the panorama's centre first, and turn by 60° in a second.
+    # The pictures look along the sphere's centre first, and turn by 60° in a second.
     turned_deg = 60.0 * answer["poses"][0].get("time_s", 0.0)
     assert answer["heading_deg"] == pytest.approx(TRUTH["heading_deg"] + turned_deg, abs=4.0)
     return answer

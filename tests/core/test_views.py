@@ -19,7 +19,7 @@ from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
 from lalaloc_core.learn.export.run_export import export_into
 from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
 from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window, sample_shots
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -55,10 +55,10 @@ class TestRendering:
         home, rng = home_of(TRAIN, 0, 1)
         materials = MaterialLibrary.create(np.random.default_rng(0), None)
         shots = sample_shots(home, 2, rng)
-        sphere = PanoramaRenderer(materials, height=64, width=128).hits(shots).distance_m
+        sphere = SphereRenderer(materials, height=64, width=128).hits(shots).distance_m
         # A quarter of the azimuths, from 45 degrees above the horizon to 45 below.
         window = Window(TWO_PI / 4.0, math.pi / 4.0)
-        part = PanoramaRenderer(materials, height=32, width=32, window=window).hits(shots).distance_m
+        part = SphereRenderer(materials, height=32, width=32, window=window).hits(shots).distance_m
         torch.testing.assert_close(part, sphere[:, 48:80, 16:48], rtol=1e-3, atol=1e-3)
 
     def test_a_level_camera_sees_its_fields_of_view(self) -> None:

@@ -25,17 +25,7 @@ from lalaloc_core.learn.data.zind import Zind
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.sampling import random_poses
 from tests.strategies import crooked_flat, plan_document, plan_of, plans, rectangle, same_ring, seeds
-from tests.zind_home import (
-    CEILING_GREY,
-    FLOOR,
-    FLOOR_GREY,
-    HEIGHT,
-    PANORAMAS,
-    WIDTH,
-    TruePanorama,
-    wall_colour,
-    write_home,
-)
+from tests.zind_home import CEILING_GREY, FLOOR, FLOOR_GREY, HEIGHT, SPHERES, WIDTH, TrueSphere, wall_colour, write_home
 from tests.zind_home import write_homes as write_zind_homes
 
 NAME = "0002/floor_01"
@@ -55,16 +45,16 @@ def change_home(root: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path.write_text(json.dumps(document))
 
 
-def panorama(document: dict[str, Any], room: int = 1, pano: int = 0) -> dict[str, Any]:
+def sphere(document: dict[str, Any], room: int = 1, pano: int = 0) -> dict[str, Any]:
     return document["merger"]["floor_01"][f"complete_room_{room:02d}"][f"partial_room_{room:02d}"][f"pano_{pano}"]
 
 
 def changed(room: int = 1, pano: int = 0, **changes: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda document: panorama(document, room, pano).update(changes)
+    return lambda document: sphere(document, room, pano).update(changes)
 
 
 def moved(**changes: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda document: panorama(document)["floor_plan_transformation"].update(changes)
+    return lambda document: sphere(document)["floor_plan_transformation"].update(changes)
 
 
 class TestRoundTrip:
@@ -77,8 +67,8 @@ class TestRoundTrip:
         rng = np.random.default_rng(seed)
         poses = random_poses(plan, 4, rng)
         taken = sorted(zip(poses.room_index.tolist(), poses.position_m.tolist(), strict=True))
-        panoramas = [
-            TruePanorama(
+        spheres = [
+            TrueSphere(
                 room_index=room,
                 x_m=x_m,
                 y_m=y_m,
@@ -88,15 +78,15 @@ class TestRoundTrip:
             for room, (x_m, y_m) in taken
         ]
         root = tmp_path_factory.mktemp("zind")
-        write_home(root / "0002", plan, panoramas, rng, size=(4, 8))
+        write_home(root / "0002", plan, spheres, rng, size=(4, 8))
         scene = Zind(root).load(NAME)
         rooms = sorted({room for room, _ in taken})
         assert len(scene.plan.rooms) == len(rooms)
         for found, room in zip(scene.plan.rooms, rooms, strict=True):
             assert same_ring(found.polygon_m, plan.rooms[room].polygon_m, 1e-6)
             assert found.ceiling_height_m == pytest.approx(plan.rooms[room].ceiling_height_m, abs=1e-9)
-        assert len(scene.cameras) == len(panoramas)
-        for number, (camera, true) in enumerate(zip(scene.cameras, panoramas, strict=True)):
+        assert len(scene.cameras) == len(spheres)
+        for number, (camera, true) in enumerate(zip(scene.cameras, spheres, strict=True)):
             assert camera.name == true.name(number)
             assert camera.position_m.tolist() == pytest.approx([true.x_m, true.y_m], abs=1e-6)
             assert wrap_angle(camera.heading - true.heading) == pytest.approx(0.0, abs=1e-9)
@@ -107,7 +97,7 @@ class TestRoundTrip:
     def test_pixels_show_the_wall_at_their_azimuth(self, tmp_path: Path) -> None:
         """The picture is painted in ZInD's frame; the test casts the same rays in the plan frame."""
         plan = crooked_flat()
-        write_home(tmp_path / "0002", plan, PANORAMAS, np.random.default_rng(8))
+        write_home(tmp_path / "0002", plan, SPHERES, np.random.default_rng(8))
         scene = Zind(tmp_path).load(NAME)
         for camera in scene.cameras:
             pixels = scene.photograph(camera, Appearance()).image(HEIGHT, WIDTH).astype(int)
@@ -124,7 +114,7 @@ class TestRoundTrip:
 def expected_pixels(
     plan: FloorPlan, room_index: int, position_m: np.ndarray, heading: float, camera_height_m: float
 ) -> np.ndarray:
-    """Render the panorama by this project's conventions."""
+    """Render the sphere by this project's conventions."""
     room = plan.rooms[room_index]
     pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=int)
     for column, azimuth in enumerate(heading + column_azimuths(WIDTH)):
@@ -213,20 +203,20 @@ class TestDataset:
 
 
 class TestRooms:
-    def test_outline_comes_from_a_primary_panorama(self, root: Path) -> None:
-        """The layout of a secondary panorama is ignored."""
-        change_home(root, lambda document: panorama(document, 1, 1).update(layout_complete={"vertices": "none"}))
+    def test_outline_comes_from_a_primary_sphere(self, root: Path) -> None:
+        """The layout of a secondary sphere is ignored."""
+        change_home(root, lambda document: sphere(document, 1, 1).update(layout_complete={"vertices": "none"}))
         assert len(Zind(root).load(NAME).plan.rooms) == 3
 
-    def test_first_primary_panorama_with_layout_is_used(self, root: Path) -> None:
+    def test_first_primary_sphere_with_layout_is_used(self, root: Path) -> None:
         def change(document: dict[str, Any]) -> None:
-            del panorama(document, 1, 0)["layout_complete"]
-            panorama(document, 1, 1)["is_primary"] = True
+            del sphere(document, 1, 0)["layout_complete"]
+            sphere(document, 1, 1)["is_primary"] = True
 
         change_home(root, change)
         scene = Zind(root).load(NAME)
         assert same_ring(scene.plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-6)
-        assert len(scene.cameras) == len(PANORAMAS)
+        assert len(scene.cameras) == len(SPHERES)
 
     def test_inner_walls_are_holes(self, tmp_path: Path) -> None:
         document = plan_document(rectangle(5.0, 4.0))
@@ -235,7 +225,7 @@ class TestRooms:
         write_home(
             tmp_path / "0002",
             plan,
-            [TruePanorama(room_index=0, x_m=1.0, y_m=1.0, heading=0.7)],
+            [TrueSphere(room_index=0, x_m=1.0, y_m=1.0, heading=0.7)],
             np.random.default_rng(3),
             (4, 8),
         )
@@ -263,15 +253,15 @@ class TestRooms:
         write_home(
             tmp_path / "0002",
             plan_of(rectangle(5.0, 4.0)),
-            [TruePanorama(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)],
+            [TrueSphere(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)],
             np.random.default_rng(3),
             (4, 8),
         )
 
         def change(document: dict[str, Any]) -> None:
-            layout = panorama(document)["layout_complete"]
+            layout = sphere(document)["layout_complete"]
             shift = np.array(layout["vertices"][0])
-            # The panorama's frame is mirrored, has the camera height of 1.5 m as its unit, and the same directions.
+            # The sphere's frame is mirrored, has the camera height of 1.5 m as its unit, and the same directions.
             layout["internal"] = (
                 internal
                 if not isinstance(internal, list)
@@ -287,7 +277,7 @@ class TestRooms:
         assert [warning in told for told in plan.warnings] == [True] if warning else plan.warnings == ()
 
     def test_room_without_layout_is_a_problem(self, root: Path) -> None:
-        change_home(root, lambda document: panorama(document, 2, 2).pop("layout_complete"))
+        change_home(root, lambda document: sphere(document, 2, 2).pop("layout_complete"))
         problems: list[DatasetError] = []
         scene = Zind(root).load(NAME, problems)
         assert [room.name for room in scene.plan.rooms] == ["label 1 complete_room_01", "label 3 complete_room_03"]
@@ -314,13 +304,13 @@ class TestRooms:
             (changed(image_path=7), "image_path is 7"),
         ],
     )
-    def test_bad_panorama_is_refused_or_left_out(
+    def test_bad_sphere_is_refused_or_left_out(
         self, root: Path, change: Callable[[dict[str, Any]], None], reason: str
     ) -> None:
-        # Another primary panorama draws the room, so that this one is a camera only.
+        # Another primary sphere draws the room, so that this one is a camera only.
         def both(document: dict[str, Any]) -> None:
-            panorama(document, 1, 1)["is_primary"] = True
-            panorama(document, 1, 0)["is_primary"] = False
+            sphere(document, 1, 1)["is_primary"] = True
+            sphere(document, 1, 0)["is_primary"] = False
             change(document)
 
         change_home(root, both)
@@ -331,7 +321,7 @@ class TestRooms:
         problems: list[DatasetError] = []
         scene = Zind(root).load(NAME, problems)
         assert [str(problem) for problem in problems] == [str(caught.value)]
-        assert len(scene.cameras) == len(PANORAMAS) - 1
+        assert len(scene.cameras) == len(SPHERES) - 1
 
     @pytest.mark.parametrize(
         ("change", "reason"),
@@ -404,7 +394,7 @@ def test_unreadable_door_is_a_warning(tmp_path: Path) -> None:
 @pytest.fixture
 def zind(tmp_path: Path) -> Path:
     """Write a ZInD home with a door between two rooms, drawn in both, and a window in the first."""
-    write_home(tmp_path / "0000", crooked_flat(), PANORAMAS, np.random.default_rng(0))
+    write_home(tmp_path / "0000", crooked_flat(), SPHERES, np.random.default_rng(0))
     path = tmp_path / "0000" / "zind_data.json"
     document = json.loads(path.read_text())
     merger = document["merger"][FLOOR]
@@ -414,7 +404,7 @@ def zind(tmp_path: Path) -> Path:
         return next(iter(partial.values()))["layout_complete"]
 
     def between(room: int, wall: int, begin: float, end: float) -> list[list[float]]:
-        """Return a piece of a room's wall in the frame of the room's panorama."""
+        """Return a piece of a room's wall in the frame of the room's sphere."""
         vertices = layout_of(room)["vertices"]
         start, stop = (np.array(vertices[(wall + k) % len(vertices)]) for k in (0, 1))
         return [(start + share * (stop - start)).tolist() for share in (begin, end)]

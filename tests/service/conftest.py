@@ -89,8 +89,8 @@ def _forked_workers() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def panorama() -> bytes:
-    """Return a valid panorama without content: smooth colours, 512 x 256."""
+def sphere() -> bytes:
+    """Return a valid sphere without content: smooth colours, 512 x 256."""
     return encode_picture(512, 256, "JPEG")
 
 
@@ -318,7 +318,7 @@ def original_of(store: Store, plan_id: str) -> bytes:
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
     """Send a query."""
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
-    return client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+    return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:

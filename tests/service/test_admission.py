@@ -76,23 +76,23 @@ def test_refusal_does_not_wait_for_the_body(small: httpx.Client) -> None:
     wait_for(lambda: _in_flight(small) == 0)
 
 
-def test_excess_query_is_refused_before_its_upload(small: httpx.Client, panorama: bytes) -> None:
+def test_excess_query_is_refused_before_its_upload(small: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(small)
     with ThreadPoolExecutor(8) as threads:
-        answers = list(threads.map(lambda _: localise(small, plan_id, panorama), range(24)))
+        answers = list(threads.map(lambda _: localise(small, plan_id, sphere), range(24)))
     refused = [answer for answer in answers if answer.status_code != 200]
     assert refused
     assert len(refused) < len(answers)
     for answer in refused:
         assert_problem(answer, 503, "overloaded")
-    assert localise(small, plan_id, panorama).status_code == 200
+    assert localise(small, plan_id, sphere).status_code == 200
     assert 'lalaloc_rejections_total{reason="overloaded"}' in small.get("/metrics").text
 
 
-def test_parallel_queries_of_one_client_are_all_answered(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_parallel_queries_of_one_client_are_all_answered(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, max_queries=4) as client, ThreadPoolExecutor(14) as threads:
         plan_id = upload(client)
-        answers = list(threads.map(lambda _: localise(client, plan_id, panorama, refine="none"), range(14)))
+        answers = list(threads.map(lambda _: localise(client, plan_id, sphere, refine="none"), range(14)))
         assert [answer.status_code for answer in answers] == [200] * 14
         assert _metric(client, "lalaloc_queries_waiting") == _metric(client, "lalaloc_queries_in_work") == 0
 
@@ -183,21 +183,21 @@ def test_query_that_would_miss_its_deadline_is_refused_at_once() -> None:
     asyncio.run(scenario())
 
 
-def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, panorama: bytes) -> None:
+def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, sphere: bytes) -> None:
     ready, preparing = upload(small), upload(small, HALL, wait=False)
     with ThreadPoolExecutor(1) as threads:
-        waiting = threads.submit(localise, small, preparing, panorama)
+        waiting = threads.submit(localise, small, preparing, sphere)
         # Until its picture is encoded, it takes the place of a query.
         wait_for(lambda: _in_flight(small) == 1)
-        wait_for(lambda: localise(small, ready, panorama).status_code == 200)
+        wait_for(lambda: localise(small, ready, sphere).status_code == 200)
         assert not waiting.done()
         assert small.delete(f"/floorplans/{preparing}").status_code == 204
         assert waiting.result().status_code in (200, 404, 503)
 
 
-def test_disconnect_frees_the_slot(small: httpx.Client, panorama: bytes) -> None:
+def test_disconnect_frees_the_slot(small: httpx.Client, sphere: bytes) -> None:
     preparing = upload(small, HALL, wait=False)
-    body, content_type = _multipart(preparing, panorama)
+    body, content_type = _multipart(preparing, sphere)
     with socket.create_connection((small.base_url.host, small.base_url.port or 80), timeout=10.0) as connection:
         lines = ["POST /localise HTTP/1.1", "Host: localhost", f"Content-Type: {content_type}"]
         head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
@@ -209,8 +209,8 @@ def test_disconnect_frees_the_slot(small: httpx.Client, panorama: bytes) -> None
     assert _metric(small, "lalaloc_queries_in_work") == 0
 
 
-def _multipart(plan_id: str, panorama: bytes) -> tuple[bytes, str]:
+def _multipart(plan_id: str, sphere: bytes) -> tuple[bytes, str]:
     request = httpx.Request(
-        "POST", "http://test", data={"floorplan_id": plan_id}, files={"panorama": ("p.jpg", panorama, "image/jpeg")}
+        "POST", "http://test", data={"floorplan_id": plan_id}, files={"photo": ("p.jpg", sphere, "image/jpeg")}
     )
     return request.read(), request.headers["content-type"]

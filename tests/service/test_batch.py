@@ -38,8 +38,8 @@ def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
     return [json.loads(line) for line in response.text.splitlines()]
 
 
-def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    lines = lines_of(ask(client, plan_id, [panorama, b"no picture", bytes(500_001), panorama], heading_deg="90"))
+def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
+    lines = lines_of(ask(client, plan_id, [sphere, b"no picture", bytes(500_001), sphere], heading_deg="90"))
     assert [(line["index"], line["name"], line["status"]) for line in lines] == [
         (0, "0.jpg", 200),
         (1, "1.jpg", 422),
@@ -48,15 +48,15 @@ def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, plan_
     ]
     assert lines[1]["problem"]["type"] == "urn:lalaloc:problem:invalid-photograph"
     assert "LALALOC_MAX_PHOTOGRAPH_BYTES" in lines[2]["problem"]["detail"]
-    alone = localise(client, plan_id, panorama, refine="none", heading_deg=90).json()
+    alone = localise(client, plan_id, sphere, refine="none", heading_deg=90).json()
     for line in (lines[0], lines[3]):
         assert line["answer"]["position"] == alone["position"]
         assert line["answer"]["heading_source"] == alone["heading_source"]
 
 
-def test_batch_searches_a_venue(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_batch_searches_a_venue(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     venue = client.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 2}]}).json()
-    files = [("photo", ("p.jpg", panorama, "image/jpeg"))]
+    files = [("photo", ("p.jpg", sphere, "image/jpeg"))]
     response = client.post("/localise/batch", data={"venue_id": venue["id"], "refine": "none"}, files=files)
     assert [line["answer"]["level"] for line in lines_of(response)] == [2]
 
@@ -68,27 +68,27 @@ def test_number_of_photographs_is_limited(client: httpx.Client, plan_id: str, co
     assert client.get("/limits").json()["max_batch_photographs"] == 30
 
 
-def test_refusals_of_the_whole_batch_precede_the_lines(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    assert_problem(ask(client, "f" * 32, [panorama]), 404, "unknown-floorplan")
+def test_refusals_of_the_whole_batch_precede_the_lines(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
+    assert_problem(ask(client, "f" * 32, [sphere]), 404, "unknown-floorplan")
     assert_problem(ask(client, plan_id, 9 * [bytes(480_000)]), 413, "upload-too-large")
-    assert_problem(ask(client, plan_id, [panorama], heading_deg="x"), 422, "invalid-request")
+    assert_problem(ask(client, plan_id, [sphere], heading_deg="x"), 422, "invalid-request")
 
 
 def test_error_about_the_plan_is_the_error_of_all_photographs(
-    client: httpx.Client, plan_id: str, panorama: bytes
+    client: httpx.Client, plan_id: str, sphere: bytes
 ) -> None:
-    lines = lines_of(ask(client, plan_id, 5 * [panorama], rooms="attic"))
+    lines = lines_of(ask(client, plan_id, 5 * [sphere], rooms="attic"))
     assert {line["problem"]["type"] for line in lines} == {"urn:lalaloc:problem:invalid-hint"}
 
 
 @pytest.mark.one_replica
-def test_client_that_leaves_ends_the_batch(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_client_that_leaves_ends_the_batch(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     def metric(name: str) -> float:
         lines = client.get("/metrics").text.splitlines()
         return sum(float(line.split()[-1]) for line in lines if line.startswith(name))
 
     before = metric("lalaloc_localise_answers_total")
-    files = [("photo", ("p.jpg", panorama, "image/jpeg"))] * 30
+    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 30
     with client.stream("POST", "/localise/batch", data={"floorplan_id": plan_id}, files=files) as response:
         assert json.loads(next(response.iter_lines()))["index"] == 0
     wait_for(lambda: metric("lalaloc_requests_in_flight") == 0)
@@ -98,7 +98,7 @@ def test_client_that_leaves_ends_the_batch(client: httpx.Client, plan_id: str, p
 
 @pytest.mark.one_replica
 def test_each_photograph_counts_for_the_rate_limit(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=8, rate_burst=0) as client:
         store = Store(database_of(tmp_path))
@@ -106,11 +106,11 @@ def test_each_photograph_counts_for_the_rate_limit(
         client.headers.update(bearer(unlimited))
         plan_id = upload(client)
         client.headers.update(bearer(make_key(store)))
-        assert len(lines_of(ask(client, plan_id, 6 * [panorama]))) == 6
-        problem = assert_problem(ask(client, plan_id, 6 * [panorama]), 429, "rate-limited")
+        assert len(lines_of(ask(client, plan_id, 6 * [sphere]))) == 6
+        problem = assert_problem(ask(client, plan_id, 6 * [sphere]), 429, "rate-limited")
         assert "8 requests per minute" in problem["detail"]
         client.headers.update(bearer(make_key(store)))
-        problem = assert_problem(ask(client, plan_id, 9 * [panorama]), 422, "invalid-request")
+        problem = assert_problem(ask(client, plan_id, 9 * [sphere]), 422, "invalid-request")
         assert "the rate limit is 8 per minute" in problem["errors"][0]["message"]
         store.close()
 

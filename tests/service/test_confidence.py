@@ -135,14 +135,14 @@ def upside_down(picture: np.ndarray) -> np.ndarray:
 
 
 def cut_out(picture: np.ndarray) -> np.ndarray:
-    """Return the view of an ordinary camera, enlarged to the size of a panorama."""
+    """Return the view of an ordinary camera, enlarged to the size of a sphere."""
     part = Image.fromarray(picture[HEIGHT // 3 : 2 * HEIGHT // 3, WIDTH // 4 : WIDTH // 2])
     return np.array(part.resize((WIDTH, HEIGHT), Image.Resampling.BILINEAR))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [upside_down, cut_out])
-def test_changed_panorama_is_not_trusted(
+def test_changed_sphere_is_not_trusted(
     shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool, change: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     answers = []

@@ -48,11 +48,11 @@ def kill(service: RunningService) -> None:
 
 @pytest.mark.slow
 def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
-    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], panorama: bytes
+    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], sphere: bytes
 ) -> None:
     with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
         session_id = begin(service.client, upload(service.client))
-        assert send(service.client, session_id, panorama, number=1).status_code == 200
+        assert send(service.client, session_id, sphere, number=1).status_code == 200
         before = service.client.get(f"/sessions/{session_id}").json()
         for decoder in children(service.process.pid):
             os.kill(decoder, signal.SIGSTOP)
@@ -61,14 +61,14 @@ def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
         def send_second() -> None:
             with httpx.Client(base_url=service.client.base_url, timeout=120.0) as client:
                 try:
-                    send(client, session_id, panorama, number=2, forward_m=0, turn_deg=0)
+                    send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
                 except httpx.TransportError as error:
                     lost.append(error)
 
         sender = threading.Thread(target=send_second)
         sender.start()
         # A number out of order claims nothing, and is refused differently while the photograph holds the claim.
-        probe = partial(send, service.client, session_id, panorama, number=9)
+        probe = partial(send, service.client, session_id, sphere, number=9)
         wait_for(lambda: probe().json()["type"] == "urn:lalaloc:problem:session-busy")
         kill(service)
         sender.join(60.0)
@@ -79,7 +79,7 @@ def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
         answers: list[httpx.Response] = []
 
         def accepted() -> bool:
-            answers.append(send(service.client, session_id, panorama, number=2, forward_m=0, turn_deg=0))
+            answers.append(send(service.client, session_id, sphere, number=2, forward_m=0, turn_deg=0))
             assert answers[-1].status_code in (200, 409), answers[-1].text
             return answers[-1].status_code == 200
 
@@ -90,7 +90,7 @@ def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
 
 @pytest.mark.slow
 def test_session_survives_kills_at_any_moment(
-    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], panorama: bytes
+    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str], sphere: bytes
 ) -> None:
     rng, answered, session_id = random.Random(5), 0, ""
     for _ in range(5):
@@ -104,7 +104,7 @@ def test_session_survives_kills_at_any_moment(
             killer = threading.Timer(rng.uniform(0.0, 1.0), service.process.kill)
             try:
                 while True:
-                    answer = send(service.client, session_id, panorama, number=answered + 1)
+                    answer = send(service.client, session_id, sphere, number=answered + 1)
                     if answer.status_code == 200:
                         answered += 1
                         assert answer.json()["photographs"] == answered

@@ -28,7 +28,7 @@ def _sqlite(data_dir: Path) -> Path:
     return path
 
 
-def test_damaged_plan_can_be_replaced_and_deleted(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_damaged_plan_can_be_replaced_and_deleted(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path) as client:
         replaced, deleted = upload(client), upload(client)
     with sqlite3.connect(_sqlite(tmp_path)) as raw:
@@ -37,13 +37,13 @@ def test_damaged_plan_can_be_replaced_and_deleted(start_app: StartApp, tmp_path:
     with start_app(tmp_path) as client:
         for path in ("", "/preview.svg", "/mesh.glb"):
             assert_problem(client.get(f"/floorplans/{deleted}{path}"), 500, "internal")
-        assert_problem(localise(client, deleted, panorama), 500, "internal")
+        assert_problem(localise(client, deleted, sphere), 500, "internal")
         assert client.get(f"/floorplans/{deleted}/original").json() == FLAT
         assert {entry["id"] for entry in client.get("/floorplans").json()["floorplans"]} == {replaced, deleted}
         assert client.delete(f"/floorplans/{deleted}").status_code == 204
         assert_problem(client.get(f"/floorplans/{deleted}"), 404, "unknown-floorplan")
         assert client.put(f"/floorplans/{replaced}", json=FLAT).status_code == 200
-        assert localise(client, replaced, panorama, refine="none").status_code == 200
+        assert localise(client, replaced, sphere, refine="none").status_code == 200
 
 
 def test_deleted_data_folder_is_store_unavailable(start_app: StartApp, tmp_path: Path) -> None:
@@ -89,11 +89,7 @@ def _zero_header(path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [_truncate, _overwrite, _zero_header])
 def test_file_that_is_damaged_while_the_service_runs_is_store_unavailable(
-    start_app: StartApp,
-    tmp_path: Path,
-    panorama: bytes,
-    damage: Callable[[Path], None],
-    caplog: pytest.LogCaptureFixture,
+    start_app: StartApp, tmp_path: Path, sphere: bytes, damage: Callable[[Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:
     # It does not pass its records on to the root logger.
     logger = logging.getLogger(LOGGER_NAME)
@@ -101,7 +97,7 @@ def test_file_that_is_damaged_while_the_service_runs_is_store_unavailable(
         logger.addHandler(caplog.handler)
         stack.callback(logger.removeHandler, caplog.handler)
         plan_id = upload(client)
-        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert localise(client, plan_id, sphere, refine="none").status_code == 200
         assert client.get("/readyz").json()["database"] == "answers"
         assert "lalaloc_database_up 1.0" in client.get("/metrics").text
         path = _sqlite(tmp_path)
@@ -114,7 +110,7 @@ def test_file_that_is_damaged_while_the_service_runs_is_store_unavailable(
         assert "restore a backup" in problem["detail"]
         wait_for(lambda: client.get("/readyz").json()["database"] == "damaged")
         for _ in range(3):
-            assert localise(client, plan_id, panorama, refine="none").status_code == 200
+            assert localise(client, plan_id, sphere, refine="none").status_code == 200
         for url in ("/floorplans", "/usage", "/venues"):
             assert client.get(url).status_code in (200, 503)
         assert client.get("/readyz").status_code == 200

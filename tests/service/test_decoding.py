@@ -1,4 +1,4 @@
-"""Decoding of panoramas in processes that can die."""
+"""Decoding of spheres in processes that can die."""
 
 from __future__ import annotations
 
@@ -81,19 +81,19 @@ def black(width: int, height: int, kind: str, **options: object) -> bytes:
 
 
 @pytest.mark.slow
-def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         for _ in range(3):
             ready(client)
             os.kill(decoder(), signal.SIGKILL)
-            assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+            assert localise(client, plan_id, sphere, **QUICK).status_code == 200
         assert restarts(client) == 3.0
     assert decoders() == [], "the pool left a process behind"
 
 
 @pytest.mark.slow
-def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     slow = black_png(10_000, 5_000)
     with start_app(tmp_path, decode_stall_s=0.2) as client:
         plan_id = upload(client)
@@ -104,11 +104,11 @@ def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, panor
         ready(client)
         assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-photograph")
         wait_for(lambda: restarts(client) == 2.0)
-        assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+        assert localise(client, plan_id, sphere, **QUICK).status_code == 200
 
 
 def test_full_decode_queue_rejects_at_once(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "_QUEUE", 1)
     # With few cores, the others would wait for a permit to compute instead.
@@ -116,7 +116,7 @@ def test_full_decode_queue_rejects_at_once(
         plan_id = upload(client)
         ready(client)
         os.kill(decoder(), signal.SIGSTOP)
-        pictures = [panorama + bytes([i]) for i in range(4)]
+        pictures = [sphere + bytes([i]) for i in range(4)]
         answers = [threads.submit(localise, client, plan_id, picture, **QUICK) for picture in pictures]
         wait_for(lambda: sum(answer.done() for answer in answers) == 2)
         os.kill(decoder(), signal.SIGCONT)
@@ -139,7 +139,7 @@ class TestBombs:
         [("PNG", {}), ("WEBP", {"lossless": True, "method": 0}), ("JPEG", {"progressive": True, "subsampling": 0})],
     )
     def test_memory_limit_rejects_the_picture_only(
-        self, start_app: StartApp, tmp_path: Path, panorama: bytes, kind: str, options: dict[str, object]
+        self, start_app: StartApp, tmp_path: Path, sphere: bytes, kind: str, options: dict[str, object]
     ) -> None:
         bomb = black_png(7_000, 3_500) if kind == "PNG" else black(7_000, 3_500, kind, **options)
         assert len(bomb) < MIB
@@ -148,22 +148,22 @@ class TestBombs:
             ready(client)
             pid, before = decoder(), most_memory(decoder())
             assert_problem(localise(client, plan_id, bomb, **BLACK), 422, "invalid-photograph")
-            assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+            assert localise(client, plan_id, sphere, **QUICK).status_code == 200
             assert decoder() == pid, "it did not have to die for that"
             assert most_memory(pid) < before + self.CAP + self.MAPPED
 
-    def test_pixel_limit_is_checked_on_the_header(self, start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    def test_pixel_limit_is_checked_on_the_header(self, start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
         bombs = {kind: black(4_000, 2_000, kind) for kind in ("PNG", "WEBP", "JPEG")}
         with start_app(tmp_path, max_pixels=1_000_000) as client:
             plan_id = upload(client)
-            assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+            assert localise(client, plan_id, sphere, **QUICK).status_code == 200
             before = most_memory(decoder())
             for kind, bomb in bombs.items():
                 problem = assert_problem(localise(client, plan_id, bomb, **QUICK), 422, "invalid-photograph")
                 assert "4000 x 2000 = 8000000 pixels; the limit is 1000000 (max_pixels)" in problem["detail"], kind
             assert most_memory(decoder()) < before + 12 * MIB
 
-    def test_large_panorama_needs_little_memory(self, start_app: StartApp, tmp_path: Path) -> None:
+    def test_large_sphere_needs_little_memory(self, start_app: StartApp, tmp_path: Path) -> None:
         with start_app(tmp_path, decode_memory_bytes=64 * MIB) as client:
             plan_id = upload(client)
             assert localise(client, plan_id, black(10_000, 5_000, "JPEG"), **BLACK).status_code == 200

@@ -380,14 +380,14 @@ def _gauge(client: httpx.Client, name: str) -> float:
 
 
 @pytest.mark.one_replica
-def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     head = "POST /localise HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
     with start_app(tmp_path, max_pending_requests=8) as client, ExitStack() as attack:
         plan_id = upload(client)
         for _ in range(10):
             attack.enter_context(_sent(client, f"{head}Content-Length: 100000\r\n\r\n--b"))
         wait_for(lambda: _gauge(client, "lalaloc_requests_in_flight") == 6)
-        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert localise(client, plan_id, sphere, refine="none").status_code == 200
         assert client.post("/floorplans", json=FLAT).status_code == 201
         with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
             problem = assert_problem(worst.post("/floorplans", json=FLAT), 503, "overloaded")
@@ -433,13 +433,13 @@ def test_streams_of_one_client_leave_slots_for_others(start_app: StartApp, tmp_p
 
 
 @pytest.mark.one_replica
-def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     slow = _endless_picture()
     with start_app(tmp_path, decode_workers=2, decode_stall_s=1.5, max_scans=10_000) as client, ExitStack() as attack:
         plan_id = upload(client)
         wait_for(lambda: client.get("/readyz").status_code == 200)
         request = httpx.Request(
-            "POST", "http://localhost/localise", data={"floorplan_id": plan_id}, files={"panorama": ("p", slow)}
+            "POST", "http://localhost/localise", data={"floorplan_id": plan_id}, files={"photo": ("p", slow)}
         )
         lines = ["POST /localise HTTP/1.1", *(f"{name}: {value}" for name, value in request.headers.items())]
         for _ in range(3):
@@ -448,7 +448,7 @@ def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path
         wait_for(lambda: _gauge(client, "lalaloc_queries_in_work") >= 2)
         # Three pictures of 1.5 s and more: one after the other they would be in the way for 4.5 s.
         begin = monotonic()
-        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert localise(client, plan_id, sphere, refine="none").status_code == 200
         assert _gauge(client, "lalaloc_queries_in_work") >= 2, f"all were done after {monotonic() - begin:.1f} s"
 
 

@@ -231,7 +231,7 @@ def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_p
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "failed")
         assert "the limit is 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]
         response = client.post(
-            "/localise", data={"floorplan_id": plan_id}, files={"panorama": ("p.jpg", _panorama(), "image/jpeg")}
+            "/localise", data={"floorplan_id": plan_id}, files={"photo": ("p.jpg", _sphere(), "image/jpeg")}
         )
         assert_problem(response, 409, "floorplan-failed")
     with start_app(tmp_path, grid_step_m=0.25) as client:
@@ -239,7 +239,7 @@ def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_p
         assert client.get(f"/floorplans/{plan_id}").json()["reason"] is None
 
 
-def _panorama() -> bytes:
+def _sphere() -> bytes:
     from tests.service.conftest import encode_picture
 
     return encode_picture(256, 128, "JPEG")

@@ -136,13 +136,13 @@ def test_invalid_anchor_is_refused(client: httpx.Client, anchor: Any, words: str
     assert words in assert_problem(response, 422, "invalid-floorplan")["detail"]
 
 
-def test_earth_hint_equals_plan_hint(client: httpx.Client, panorama: bytes) -> None:
+def test_earth_hint_equals_plan_hint(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[2.0, 1.0]]))
     on_earth = json.dumps({"latitude": lat, "longitude": lon})
     fields = {"radius_m": 1.0, "strict": "true", "refine": "none"}
-    found = localise(client, plan_id, panorama, near=on_earth, **fields).json()
-    in_plan = localise(client, plan_id, panorama, near='{"x_m": 2, "y_m": 1}', **fields).json()
+    found = localise(client, plan_id, sphere, near=on_earth, **fields).json()
+    in_plan = localise(client, plan_id, sphere, near='{"x_m": 2, "y_m": 1}', **fields).json()
     assert [pose["position"] for pose in found["candidates"]] == [pose["position"] for pose in in_plan["candidates"]]
     assert all(math.dist(pose["position"].values(), (2.0, 1.0)) <= 1.0 + 1e-3 for pose in found["candidates"])
 
@@ -158,15 +158,15 @@ def test_earth_hint_equals_plan_hint(client: httpx.Client, panorama: bytes) -> N
     ],
 )
 def test_invalid_earth_hint_is_refused(
-    client: httpx.Client, panorama: bytes, near: dict[str, float], slug: str, words: str
+    client: httpx.Client, sphere: bytes, near: dict[str, float], slug: str, words: str
 ) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    problem = assert_problem(localise(client, plan_id, panorama, near=json.dumps(near), radius_m=5), 422, slug)
+    problem = assert_problem(localise(client, plan_id, sphere, near=json.dumps(near), radius_m=5), 422, slug)
     assert words in problem["detail"]
 
 
-def test_earth_hint_needs_an_anchor(client: httpx.Client, panorama: bytes) -> None:
-    response = localise(client, upload(client), panorama, near='{"latitude": 48, "longitude": 11}', radius_m=5)
+def test_earth_hint_needs_an_anchor(client: httpx.Client, sphere: bytes) -> None:
+    response = localise(client, upload(client), sphere, near='{"latitude": 48, "longitude": 11}', radius_m=5)
     assert "the plan has no anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
 
 
@@ -178,9 +178,9 @@ def test_plan_keeps_its_anchor_and_north(client: httpx.Client) -> None:
     assert FloorPlan.from_dict(plan).to_dict() == plan
 
 
-def test_answers_have_a_geopose(client: httpx.Client, panorama: bytes) -> None:
+def test_answers_have_a_geopose(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    answer = localise(client, plan_id, panorama, heading_deg=115, refine="none").json()
+    answer = localise(client, plan_id, sphere, heading_deg=115, refine="none").json()
     geopose = answer["geopose"]
     check_schema(geopose)
     ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[*answer["position"].values()]]))
@@ -190,7 +190,7 @@ def test_answers_have_a_geopose(client: httpx.Client, panorama: bytes) -> None:
     assert answer["heading_deg"] == 115.0
     assert geopose["angles"] == pytest.approx({"yaw": -90.0, "pitch": 0.0, "roll": 0.0}, abs=1e-3)
     fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
-    file = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    file = {"photo": ("p.jpg", sphere, "image/jpeg")}
     response = client.post("/localise", data=fields, files=file, headers={"Accept": "application/geo+json"})
     assert response.headers["content-type"] == "application/geo+json"
     feature = response.json()
@@ -200,11 +200,11 @@ def test_answers_have_a_geopose(client: httpx.Client, panorama: bytes) -> None:
     assert feature["properties"]["room"] == answer["room"]
 
 
-def test_answer_as_a_geopose(client: httpx.Client, panorama: bytes) -> None:
+def test_answer_as_a_geopose(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
-    geopose = client.post("/localise", data=fields, files={"photo": panorama}).json()["geopose"]
-    response = client.post("/localise", data=fields, files={"photo": panorama}, headers=AS_GEOPOSE)
+    geopose = client.post("/localise", data=fields, files={"photo": sphere}).json()["geopose"]
+    response = client.post("/localise", data=fields, files={"photo": sphere}, headers=AS_GEOPOSE)
     assert response.headers["content-type"] == "application/geopose+json"
     assert response.headers["vary"] == "Accept"
     assert_quaternion(response.json(), geopose)
@@ -213,18 +213,18 @@ def test_answer_as_a_geopose(client: httpx.Client, panorama: bytes) -> None:
         {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}, abs=1e-5
     )
     keyed = client.post(
-        "/localise", data=fields, files={"photo": panorama}, headers=AS_GEOPOSE | {"Idempotency-Key": "k"}
+        "/localise", data=fields, files={"photo": sphere}, headers=AS_GEOPOSE | {"Idempotency-Key": "k"}
     )
     assert_problem(keyed, 422, "invalid-request")
     refused = client.post(
-        "/localise", data=fields | {"floorplan_id": upload(client)}, files={"photo": panorama}, headers=AS_GEOPOSE
+        "/localise", data=fields | {"floorplan_id": upload(client)}, files={"photo": sphere}, headers=AS_GEOPOSE
     )
     assert "has no anchor" in assert_problem(refused, 409, "floorplan-unanchored")["detail"]
 
 
-def test_sequence_as_geoposes(client: httpx.Client, panorama: bytes) -> None:
+def test_sequence_as_geoposes(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("photo", panorama)] * 2
+    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("photo", sphere)] * 2
     poses = client.post("/localise/sequence", data=fields, files=files).json()["poses"]
     response = client.post("/localise/sequence", data=fields, files=files, headers=AS_GEOPOSE)
     assert response.headers["content-type"] == "application/geopose+json"
@@ -236,22 +236,22 @@ def test_sequence_as_geoposes(client: httpx.Client, panorama: bytes) -> None:
     assert_problem(refused, 409, "floorplan-unanchored")
 
 
-def test_session_as_geoposes(client: httpx.Client, panorama: bytes) -> None:
+def test_session_as_geoposes(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
     path = f"/sessions/{client.post('/sessions', json={'floorplan_id': plan_id}).json()['id']}"
-    response = client.post(f"{path}/photographs", files={"photo": panorama}, headers=AS_GEOPOSE)
+    response = client.post(f"{path}/photographs", files={"photo": sphere}, headers=AS_GEOPOSE)
     assert response.headers["content-type"] == "application/geopose+json"
     assert_quaternion(response.json(), client.get(path).json()["pose"]["geopose"])
     unanchored = f"/sessions/{client.post('/sessions', json={'floorplan_id': upload(client)}).json()['id']}"
-    refused = client.post(f"{unanchored}/photographs", files={"photo": panorama}, headers=AS_GEOPOSE)
+    refused = client.post(f"{unanchored}/photographs", files={"photo": sphere}, headers=AS_GEOPOSE)
     assert_problem(refused, 409, "floorplan-unanchored")
     # The refused photograph has not moved the camera.
     assert client.get(unanchored).json()["photographs"] == 0
 
 
-def test_every_candidate_has_a_geopose(client: httpx.Client, panorama: bytes) -> None:
+def test_every_candidate_has_a_geopose(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    answer = localise(client, plan_id, panorama, refine="none", top_k=5).json()
+    answer = localise(client, plan_id, sphere, refine="none", top_k=5).json()
     assert len(answer["candidates"]) > 1
     assert answer["candidates"][0]["geopose"] == answer["geopose"]
     for candidate in answer["candidates"]:
@@ -259,7 +259,7 @@ def test_every_candidate_has_a_geopose(client: httpx.Client, panorama: bytes) ->
         assert_at(candidate["geopose"], candidate, Anchor(**ANCHOR, north_deg=25.0))
 
 
-def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, panorama: bytes) -> None:
+def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, sphere: bytes) -> None:
     venue_anchor = {"latitude": -33.86, "longitude": 151.21, "altitude_m": 3.0, "north_deg": 90.0}
     ids = [upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25}), upload(client)]
     far = FLAT | {"rooms": [{"name": "far", "polygon": [[x + 2e4, y] for x, y in FLAT["rooms"][0]["polygon"]]}]}
@@ -267,7 +267,7 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, panorama: bytes
     anchors = {ids[0]: Anchor(**ANCHOR, north_deg=25.0), ids[1]: Anchor(**venue_anchor)}
     plans = [{"floorplan_id": plan_id} for plan_id in ids]
     venue_id = client.post("/venues", json={"plans": plans, "anchor": venue_anchor}).json()["id"]
-    fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"panorama": panorama}
+    fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"photo": sphere}
     response = client.post("/localise", data=fields, files=file)
     assert response.status_code == 200, response.text
     found = response.json()["candidates"]
@@ -284,18 +284,18 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, panorama: bytes
     assert feature["geometry"]["coordinates"] == [place["lon"], place["lat"], place["h"]]
 
 
-def test_unanchored_venue_has_no_geopose(client: httpx.Client, panorama: bytes) -> None:
+def test_unanchored_venue_has_no_geopose(client: httpx.Client, sphere: bytes) -> None:
     venue_id = client.post("/venues", json={"plans": [{"floorplan_id": upload(client)}]}).json()["id"]
     headers, fields = {"Accept": "application/geo+json"}, {"venue_id": venue_id, "refine": "none"}
-    response = client.post("/localise", data=fields, files={"panorama": panorama}, headers=headers)
+    response = client.post("/localise", data=fields, files={"photo": sphere}, headers=headers)
     assert "nor has venue" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
-    picture = client.post("/localise", data=fields, files={"panorama": panorama}, headers={"Accept": "image/png"})
+    picture = client.post("/localise", data=fields, files={"photo": sphere}, headers={"Accept": "image/png"})
     assert "a picture shows one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
 
 
-def test_sequence_is_a_feature_collection(client: httpx.Client, panorama: bytes) -> None:
+def test_sequence_is_a_feature_collection(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("panorama", panorama)] * 2
+    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("photo", sphere)] * 2
     answer = client.post("/localise/sequence", data=fields, files=files).json()
     headers = {"Accept": "application/geo+json"}
     response = client.post("/localise/sequence", data=fields, files=files, headers=headers)
@@ -316,10 +316,10 @@ def test_sequence_is_a_feature_collection(client: httpx.Client, panorama: bytes)
     assert_problem(keyed, 422, "invalid-request")
 
 
-def test_unanchored_plan_has_no_geopose(client: httpx.Client, panorama: bytes) -> None:
+def test_unanchored_plan_has_no_geopose(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client)
-    assert localise(client, plan_id, panorama, refine="none").json()["geopose"] is None
-    file = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    assert localise(client, plan_id, sphere, refine="none").json()["geopose"] is None
+    file = {"photo": ("p.jpg", sphere, "image/jpeg")}
     response = client.post(
         "/localise", data={"floorplan_id": plan_id}, files=file, headers={"Accept": "application/geo+json"}
     )

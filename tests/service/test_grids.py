@@ -597,23 +597,23 @@ def postgres_app(start_app: StartApp, postgres: PostgresServer, tmp_path_factory
     return lambda: start_app(tmp_path_factory.mktemp("data"), database_url=url, sweep_s=0.2)
 
 
-def test_two_replicas_serve_the_same_plans(postgres_app: Any, panorama: bytes) -> None:
+def test_two_replicas_serve_the_same_plans(postgres_app: Any, sphere: bytes) -> None:
     with postgres_app() as first, postgres_app() as second:
         plan_id = upload(first, wait=False)
-        assert localise(second, plan_id, panorama, refine="none").status_code == 200
+        assert localise(second, plan_id, sphere, refine="none").status_code == 200
         assert second.delete(f"/floorplans/{plan_id}").status_code == 204
-        assert_problem(localise(first, plan_id, panorama, refine="none"), 404, "unknown-floorplan")
+        assert_problem(localise(first, plan_id, sphere, refine="none"), 404, "unknown-floorplan")
         wait_for(lambda: "lalaloc_grid_cache_bytes 0.0" in first.get("/metrics").text)
 
 
 @pytest.mark.one_replica
-def test_queries_continue_during_an_outage(postgres_app: Any, postgres: PostgresServer, panorama: bytes) -> None:
+def test_queries_continue_during_an_outage(postgres_app: Any, postgres: PostgresServer, sphere: bytes) -> None:
     with postgres_app() as client:
         plan_id = upload(client)
-        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert localise(client, plan_id, sphere, refine="none").status_code == 200
         postgres.stop()
         try:
-            assert localise(client, plan_id, panorama, refine="none").status_code == 200
+            assert localise(client, plan_id, sphere, refine="none").status_code == 200
             refused = client.get(f"/floorplans/{plan_id}")
             assert_problem(refused, 503, "store-unavailable")
             assert int(refused.headers["retry-after"]) > 0
@@ -656,10 +656,10 @@ def test_rounded_height_is_below_the_ceiling(asked_m: float) -> None:
 
 
 @pytest.mark.one_replica
-def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
+def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path / "data") as client:
         plan_id = upload(client)
-        old = localise(client, plan_id, panorama, refine="none").json()["model"]["sha256"]
+        old = localise(client, plan_id, sphere, refine="none").json()["model"]["sha256"]
     other = tmp_path / "other"
     shutil.copytree(tiny_bundle, other)
     (other / "note.txt").write_text("another model")
@@ -668,17 +668,17 @@ def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_
     with start_app(tmp_path / "data", bundle=other) as client:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
         assert "lalaloc_grid_seconds_count 1.0" in client.get("/metrics").text
-        assert localise(client, plan_id, panorama, refine="none").json()["model"]["sha256"] == bundle.sha256
+        assert localise(client, plan_id, sphere, refine="none").json()["model"]["sha256"] == bundle.sha256
 
 
 def test_profile_model_needs_one_grid_for_all_heights(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(builder, "_MAX_GRIDS_PER_PLAN", 3)
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         for height_m in (1.6, 1.7, 1.8, 1.9):
-            _localise_at(client, plan_id, panorama, height_m)
+            _localise_at(client, plan_id, sphere, height_m)
     store = Store(database_of(tmp_path))
     with start_app(tmp_path) as client:
         sha256 = client.get("/readyz").json()["model"]["sha256"]
@@ -686,6 +686,6 @@ def test_profile_model_needs_one_grid_for_all_heights(
     store.close()
 
 
-def _localise_at(client: httpx.Client, plan_id: str, panorama: bytes, height_m: float) -> None:
-    answer = localise(client, plan_id, panorama, refine="none", camera_height_m=height_m)
+def _localise_at(client: httpx.Client, plan_id: str, sphere: bytes, height_m: float) -> None:
+    answer = localise(client, plan_id, sphere, refine="none", camera_height_m=height_m)
     assert answer.json()["camera_height_m"] == height_m

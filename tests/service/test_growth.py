@@ -88,7 +88,7 @@ def test_head_parsing_is_linear(kind: str, unit: str) -> None:
     assert_no_worse_than_linear(make_work, _HEAD)
 
 
-_PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
+_PART = b'--b\r\nContent-Disposition: form-data; name="photo"; filename="p"\r\n\r\n'
 _BODIES: dict[str, Callable[[int], bytes]] = {
     "plain": lambda size: _PART + b"a" * size,
     "boundary's letter": lambda size: _PART + b"b" * size,
@@ -124,7 +124,7 @@ def test_form_parsing_is_linear(kind: str, chunk: int) -> None:
             headers = [(b"content-type", b"multipart/form-data; boundary=b")]
             scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
             with suppress(LaLaLocError):
-                await read_parts(Request(scope, receive), _LIMITS, files={"panorama"}, fields={"x"})
+                await read_parts(Request(scope, receive), _LIMITS, files={"photo"}, fields={"x"})
 
         return lambda: asyncio.run(read())
 

@@ -47,23 +47,23 @@ def plan_id(client: httpx.Client) -> str:
 )
 @pytest.mark.parametrize("refine", ["none", "lpo"])
 def test_strict_rooms_exclude_others(
-    client: httpx.Client, plan_id: str, panorama: bytes, rooms: str, possible: set[str], refine: str
+    client: httpx.Client, plan_id: str, sphere: bytes, rooms: str, possible: set[str], refine: str
 ) -> None:
-    response = localise(client, plan_id, panorama, rooms=rooms, strict="true", refine=refine)
+    response = localise(client, plan_id, sphere, rooms=rooms, strict="true", refine=refine)
     assert response.status_code == 200, response.text
     assert {candidate["room_id"] for candidate in response.json()["candidates"]} <= possible
 
 
-def test_strict_point_bounds_all_candidates(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_strict_point_bounds_all_candidates(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     fields = {"near": json.dumps({"x_m": 6.0, "y_m": 1.0}), "radius_m": 1.2}
-    answer = localise(client, plan_id, panorama, strict="true", **fields).json()
+    answer = localise(client, plan_id, sphere, strict="true", **fields).json()
     for candidate in answer["candidates"]:
         assert np.hypot(candidate["position"]["x_m"] - 6.0, candidate["position"]["y_m"] - 1.0) <= 1.2 + 1e-3
 
 
-def test_room_hint_raises_its_candidates(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_room_hint_raises_its_candidates(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     def rooms_found(**fields: Any) -> list[str]:
-        found = localise(client, plan_id, panorama, refine="none", **fields).json()
+        found = localise(client, plan_id, sphere, refine="none", **fields).json()
         return [candidate["room_id"] for candidate in found["candidates"]]
 
     free, hinted = rooms_found(), rooms_found(rooms="hall")
@@ -90,9 +90,9 @@ def test_room_hint_raises_its_candidates(client: httpx.Client, plan_id: str, pan
     ],
 )
 def test_invalid_hints_are_rejected(
-    client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], field: str, message: str
+    client: httpx.Client, plan_id: str, sphere: bytes, fields: dict[str, Any], field: str, message: str
 ) -> None:
-    problem = assert_problem(localise(client, plan_id, panorama, **fields), 422, "invalid-request")
+    problem = assert_problem(localise(client, plan_id, sphere, **fields), 422, "invalid-request")
     assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
 
 
@@ -105,9 +105,9 @@ def test_invalid_hints_are_rejected(
     ],
 )
 def test_hints_outside_the_plan_are_rejected(
-    client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], detail: str
+    client: httpx.Client, plan_id: str, sphere: bytes, fields: dict[str, Any], detail: str
 ) -> None:
-    problem = assert_problem(localise(client, plan_id, panorama, **fields), 422, "invalid-hint")
+    problem = assert_problem(localise(client, plan_id, sphere, **fields), 422, "invalid-hint")
     assert detail in problem["detail"]
 
 

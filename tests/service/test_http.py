@@ -206,9 +206,9 @@ def test_waiting_reads_do_not_block_health(start_app: StartApp, postgres: Postgr
 
 
 @pytest.mark.one_replica
-def test_metrics_count_requests_and_queries(client: httpx.Client, panorama: bytes) -> None:
+def test_metrics_count_requests_and_queries(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client)
-    localise(client, plan_id, panorama, refine="vdr")
+    localise(client, plan_id, sphere, refine="vdr")
     client.get("/no/such/route")
     text = client.get("/metrics").text
     assert 'lalaloc_http_requests_total{method="GET",route="/floorplans/{floorplan_id}",status="200"}' in text

@@ -53,7 +53,7 @@ def _post(client: httpx.Client, key: str, plan: Any = None) -> httpx.Response:
 
 def _query(client: httpx.Client, key: str, plan_id: str, picture: bytes, **fields: str) -> httpx.Response:
     data = {"floorplan_id": plan_id, "refine": "none"} | fields
-    return client.post("/localise", data=data, files={"panorama": ("p.jpg", picture)}, headers=_keyed(key))
+    return client.post("/localise", data=data, files={"photo": ("p.jpg", picture)}, headers=_keyed(key))
 
 
 def _count(client: httpx.Client) -> int:
@@ -115,9 +115,9 @@ def test_visible_ascii_keys_are_accepted(client: httpx.Client, key: str) -> None
 
 
 @pytest.mark.parametrize("key", ["", "x" * 256, "a b", "a\tb", "é"])
-def test_invalid_key_is_refused(client: httpx.Client, panorama: bytes, key: str) -> None:
+def test_invalid_key_is_refused(client: httpx.Client, sphere: bytes, key: str) -> None:
     headers = [(b"Idempotency-Key", key.encode("latin-1"))]
-    form = {"data": {"floorplan_id": "x"}, "files": {"panorama": ("p.jpg", panorama)}}
+    form = {"data": {"floorplan_id": "x"}, "files": {"photo": ("p.jpg", sphere)}}
     for response in (
         client.post("/floorplans", json=FLAT, headers=headers),
         client.post("/localise", headers=headers, **form),
@@ -132,26 +132,26 @@ def test_two_keys_are_refused(client: httpx.Client) -> None:
     assert_problem(client.post("/floorplans", json=FLAT, headers=headers), 422, "invalid-request")
 
 
-def test_repeated_query_returns_the_same_answer(own: httpx.Client, panorama: bytes) -> None:
+def test_repeated_query_returns_the_same_answer(own: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(own)
-    first = _query(own, "a", plan_id, panorama)
+    first = _query(own, "a", plan_id, sphere)
     assert first.status_code == 200
     # Timings are equal too.
-    assert _same(first, _query(own, "a", plan_id, panorama))
-    assert_problem(_query(own, "a", plan_id, panorama, top_k="1"), 422, "idempotency-key-reused")
-    assert_problem(_query(own, "a", plan_id, panorama + b"\0"), 422, "idempotency-key-reused")
+    assert _same(first, _query(own, "a", plan_id, sphere))
+    assert_problem(_query(own, "a", plan_id, sphere, top_k="1"), 422, "idempotency-key-reused")
+    assert_problem(_query(own, "a", plan_id, sphere + b"\0"), 422, "idempotency-key-reused")
     # Keys of queries and uploads are separate.
     assert _post(own, "a").status_code == 201
 
 
-def test_permanent_refusal_is_kept_temporary_is_not(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_permanent_refusal_is_kept_temporary_is_not(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, max_floorplans=1) as client:
         bad = {"rooms": []}
         assert _same(_post(client, "bad", bad), _post(client, "bad", bad))
         # It contains the id of the request that was executed.
         assert _post(client, "bad", bad).json()["type"] == "urn:lalaloc:problem:invalid-floorplan"
         never = "0" * 32
-        assert _same(_query(client, "q", never, panorama), _query(client, "q", never, panorama))
+        assert _same(_query(client, "q", never, sphere), _query(client, "q", never, sphere))
         plan_id = upload(client)
         assert_problem(_post(client, "full"), 507, "too-many-floorplans")
         client.delete(f"/floorplans/{plan_id}")
@@ -215,7 +215,7 @@ def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:
     assert _count(own) == 1
 
 
-def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
         plan_id = upload(client, hall, wait=False)
@@ -224,7 +224,7 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
             "POST",
             "/localise",
             data={"floorplan_id": plan_id, "refine": "none"},
-            files={"panorama": ("p.jpg", panorama)},
+            files={"photo": ("p.jpg", sphere)},
             headers=_keyed("a"),
         )
         body = query.read()
@@ -234,7 +234,7 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
             wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
         wait_for(lambda: "lalaloc_requests_in_flight 0.0" in client.get("/metrics").text)
         client.delete(f"/floorplans/{plan_id}")
-        assert_problem(_query(client, "a", plan_id, panorama), 404, "unknown-floorplan")
+        assert_problem(_query(client, "a", plan_id, sphere), 404, "unknown-floorplan")
 
 
 def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Kept answers: off by default, limited in time and number, without the panorama."""
+"""Kept answers: off by default, limited in time and number, without the sphere."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from service.storage.tables import KEPT_ANSWERS
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
 
-def test_answers_are_not_kept_by_default(client: httpx.Client, panorama: bytes) -> None:
-    assert localise(client, upload(client), panorama).json()["answer_id"] is None
+def test_answers_are_not_kept_by_default(client: httpx.Client, sphere: bytes) -> None:
+    assert localise(client, upload(client), sphere).json()["answer_id"] is None
     assert_problem(client.get(f"/answers/{'0' * 32}"), 404, "unknown-answer")
 
 
-def test_kept_answer_is_identical_until_deleted(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_kept_answer_is_identical_until_deleted(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, keep_answers_s=3600.0) as client:
         plan_id = upload(client)
-        answer = localise(client, plan_id, panorama, include="posterior")
+        answer = localise(client, plan_id, sphere, include="posterior")
         address = f"/answers/{answer.json()['answer_id']}"
         assert client.get(address).content == answer.content
-        second_id = localise(client, plan_id, panorama).json()["answer_id"]
+        second_id = localise(client, plan_id, sphere).json()["answer_id"]
         assert client.delete(address).status_code == 204
         assert_problem(client.get(address), 404, "unknown-answer")
         assert_problem(client.delete(address), 404, "unknown-answer")
@@ -33,9 +33,9 @@ def test_kept_answer_is_identical_until_deleted(start_app: StartApp, tmp_path: P
         assert_problem(client.get(f"/answers/{second_id}"), 404, "unknown-answer")
 
 
-def test_kept_answer_expires(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_kept_answer_expires(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, keep_answers_s=0.5) as client:
-        answer_id = localise(client, upload(client), panorama).json()["answer_id"]
+        answer_id = localise(client, upload(client), sphere).json()["answer_id"]
         wait_for(lambda: client.get(f"/answers/{answer_id}").status_code == 404)
         assert_problem(client.get(f"/answers/{answer_id}"), 404, "unknown-answer")
 

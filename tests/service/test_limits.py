@@ -65,7 +65,7 @@ def test_plan_quota_is_enforced(start_app: StartApp, tmp_path: Path) -> None:
         assert re.search(r"\((LALALOC_)?max_floorplans\)", problem["detail"], re.IGNORECASE)
 
 
-def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     many_scans = encode_picture(256, 128, "JPEG", progressive=True)
     with start_app(tmp_path, max_pixels=100_000, max_scans=9, max_top_k=3, max_photograph_bytes=100_000) as client:
         plan_id = upload(client)
@@ -74,9 +74,9 @@ def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, pano
         assert allowed.status_code == 200
         assert len(allowed.json()["candidates"]) <= 3
         refusals = {
-            "max_pixels": localise(client, plan_id, panorama, top_k=3),
+            "max_pixels": localise(client, plan_id, sphere, top_k=3),
             "max_scans": localise(client, plan_id, many_scans, top_k=3),
-            "max_top_k": localise(client, plan_id, panorama, top_k=4),
+            "max_top_k": localise(client, plan_id, sphere, top_k=4),
             "max_photograph_bytes": localise(client, plan_id, bytes(100_001), top_k=3),
         }
         for name, response in refusals.items():

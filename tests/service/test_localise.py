@@ -48,10 +48,10 @@ def flat(client: httpx.Client) -> str:
 @pytest.mark.parametrize("heading", [None, 0.0, 90.0, -360.0, 360.0, 123.456])
 @pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "vdr")])
 def test_answer_lies_in_the_plan_and_names_its_stage(
-    client: httpx.Client, flat: str, panorama: bytes, heading: float | None, refine: str, stage: str
+    client: httpx.Client, flat: str, sphere: bytes, heading: float | None, refine: str, stage: str
 ) -> None:
     fields = {} if heading is None else {"heading_deg": heading}
-    response = localise(client, flat, panorama, refine=refine, **fields)
+    response = localise(client, flat, sphere, refine=refine, **fields)
     assert response.status_code == 200, response.text
     answer = response.json()
     # This app has no LPO workers, so the best stage is VDR.
@@ -67,8 +67,8 @@ def test_answer_lies_in_the_plan_and_names_its_stage(
         assert abs((answer["heading_deg"] - heading + 180.0) % 360.0 - 180.0) < 1e-2
 
 
-def test_candidates_are_distinct_and_sorted(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    answer = localise(client, flat, panorama, refine="none", top_k=10).json()
+def test_candidates_are_distinct_and_sorted(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    answer = localise(client, flat, sphere, refine="none", top_k=10).json()
     candidates = answer["candidates"]
     assert 2 <= len(candidates) <= 10
     costs = [candidate["cost"] for candidate in candidates]
@@ -85,14 +85,14 @@ def test_candidates_are_distinct_and_sorted(client: httpx.Client, flat: str, pan
 
 
 @pytest.mark.parametrize("top_k", [1, 3, 10])
-def test_top_k_limits_candidates(client: httpx.Client, flat: str, panorama: bytes, top_k: int) -> None:
-    candidates = localise(client, flat, panorama, refine="none", top_k=top_k).json()["candidates"]
-    everything = localise(client, flat, panorama, refine="none", top_k=10).json()["candidates"]
+def test_top_k_limits_candidates(client: httpx.Client, flat: str, sphere: bytes, top_k: int) -> None:
+    candidates = localise(client, flat, sphere, refine="none", top_k=top_k).json()["candidates"]
+    everything = localise(client, flat, sphere, refine="none", top_k=10).json()["candidates"]
     assert candidates == everything[:top_k]
 
 
-def test_answer_has_timings_and_model(client: httpx.Client, flat: str, panorama: bytes, tiny_bundle: Path) -> None:
-    answer = localise(client, flat, panorama, refine="vdr").json()
+def test_answer_has_timings_and_model(client: httpx.Client, flat: str, sphere: bytes, tiny_bundle: Path) -> None:
+    answer = localise(client, flat, sphere, refine="vdr").json()
     timings = answer["timings_ms"]
     assert set(timings) == set(TimingsAnswer.model_fields)
     assert timings["lpo"] == 0.0
@@ -103,8 +103,8 @@ def test_answer_has_timings_and_model(client: httpx.Client, flat: str, panorama:
     assert answer["model"]["name"] == bundle.manifest.name
 
 
-def test_same_query_has_the_same_answer(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    first, second = (localise(client, flat, panorama, refine="vdr").json() for _ in range(2))
+def test_same_query_has_the_same_answer(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    first, second = (localise(client, flat, sphere, refine="vdr").json() for _ in range(2))
     assert first["candidates"] == second["candidates"]
 
 
@@ -139,32 +139,32 @@ BAD_FIELDS = {
 
 @pytest.mark.parametrize(("fields", "name", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS.keys())
 def test_invalid_field_is_rejected_with_its_limit(
-    client: httpx.Client, flat: str, panorama: bytes, fields: dict[str, str], name: str, message: str
+    client: httpx.Client, flat: str, sphere: bytes, fields: dict[str, str], name: str, message: str
 ) -> None:
     response = client.post(
-        "/localise", data={"floorplan_id": flat} | fields, files={"panorama": ("p.jpg", panorama, "image/jpeg")}
+        "/localise", data={"floorplan_id": flat} | fields, files={"photo": ("p.jpg", sphere, "image/jpeg")}
     )
     faults = {fault["field"]: fault["message"] for fault in assert_problem(response, 422, "invalid-request")["errors"]}
     assert message in faults[name]
     assert not re.search("string|float|integer|parse|None|sys", faults[name])
 
 
-def test_all_form_faults_are_reported_at_once(client: httpx.Client, panorama: bytes) -> None:
+def test_all_form_faults_are_reported_at_once(client: httpx.Client, sphere: bytes) -> None:
     fields = {"headng_deg": "1", "heading_deg": "361", "top_k": "1000", "camera_height_m": "nan", "refine": "all"}
-    response = client.post("/localise", data=fields, files={"picture": ("p.jpg", panorama)})
+    response = client.post("/localise", data=fields, files={"picture": ("p.jpg", sphere)})
     faults = [fault["field"] for fault in assert_problem(response, 422, "invalid-request")["errors"]]
     expected = {"headng_deg", "picture", "photo", "floorplan_id"} | (fields.keys() - {"headng_deg"})
     assert sorted(faults) == sorted(expected)
 
 
-def test_empty_optional_field_counts_as_missing(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    empty = localise(client, flat, panorama, refine="none", heading_deg="", heading_tolerance_deg="", top_k="")
+def test_empty_optional_field_counts_as_missing(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    empty = localise(client, flat, sphere, refine="none", heading_deg="", heading_tolerance_deg="", top_k="")
     assert empty.status_code == 200
 
 
-def test_heading_is_searched_within_its_tolerance(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_heading_is_searched_within_its_tolerance(client: httpx.Client, flat: str, sphere: bytes) -> None:
     def headings(**fields: Any) -> np.ndarray:
-        candidates = localise(client, flat, panorama, refine="none", top_k=10, heading_deg=30, **fields)
+        candidates = localise(client, flat, sphere, refine="none", top_k=10, heading_deg=30, **fields)
         found = np.array([candidate["heading_deg"] for candidate in candidates.json()["candidates"]])
         return np.abs((found - 30.0 + 180.0) % 360.0 - 180.0)
 
@@ -175,20 +175,20 @@ def test_heading_is_searched_within_its_tolerance(client: httpx.Client, flat: st
     assert 1.0 < searched.max() <= 45.01
 
 
-def test_every_part_is_required(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    picture = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+def test_every_part_is_required(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    picture = {"photo": ("p.jpg", sphere, "image/jpeg")}
     no_plan = assert_problem(client.post("/localise", files=picture), 422, "invalid-request")
     assert no_plan["errors"] == [{"field": "floorplan_id", "message": "is missing"}]
     no_picture = client.post("/localise", files={"floorplan_id": (None, flat)})
     assert assert_problem(no_picture, 422, "invalid-request")["errors"][0]["field"] == "photo"
-    not_a_file = client.post("/localise", files={"floorplan_id": (None, flat), "panorama": (None, "x")})
+    not_a_file = client.post("/localise", files={"floorplan_id": (None, flat), "photo": (None, "x")})
     assert "file" in assert_problem(not_a_file, 422, "invalid-request")["detail"]
     assert_problem(client.post("/localise", json={"floorplan_id": flat}), 415, "unsupported-media")
     assert_problem(client.post("/localise"), 415, "unsupported-media")
 
 
-def test_unknown_plan_is_not_found(client: httpx.Client, panorama: bytes) -> None:
-    assert "'nowhere'" in assert_problem(localise(client, "nowhere", panorama), 404, "unknown-floorplan")["detail"]
+def test_unknown_plan_is_not_found(client: httpx.Client, sphere: bytes) -> None:
+    assert "'nowhere'" in assert_problem(localise(client, "nowhere", sphere), 404, "unknown-floorplan")["detail"]
 
 
 def _png_header(width: int, height: int) -> bytes:
@@ -214,59 +214,58 @@ BAD_PICTURES = {
 
 
 @pytest.mark.parametrize(("picture", "message"), BAD_PICTURES.values(), ids=BAD_PICTURES.keys())
-def test_invalid_panorama_is_rejected_with_its_fault(
+def test_invalid_sphere_is_rejected_with_its_fault(
     client: httpx.Client, flat: str, picture: bytes, message: str
 ) -> None:
     assert message in assert_problem(localise(client, flat, picture), 422, "invalid-photograph")["detail"]
 
 
-def test_too_large_picture_is_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
-    with start_app(tmp_path, max_photograph_bytes=len(panorama) - 1) as client:
+def test_too_large_picture_is_rejected(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
+    with start_app(tmp_path, max_photograph_bytes=len(sphere) - 1) as client:
         plan_id = upload(client)
         assert (
-            str(len(panorama) - 1)
-            in assert_problem(localise(client, plan_id, panorama), 413, "upload-too-large")["detail"]
+            str(len(sphere) - 1) in assert_problem(localise(client, plan_id, sphere), 413, "upload-too-large")["detail"]
         )
 
 
-def test_camera_height_is_solved_unless_exact(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    exact = localise(client, flat, panorama, refine="vdr", camera_height_m=1.713, camera_height_std_m=0).json()
+def test_camera_height_is_solved_unless_exact(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    exact = localise(client, flat, sphere, refine="vdr", camera_height_m=1.713, camera_height_std_m=0).json()
     assert exact["camera_height_m"] == 1.713
-    inexact = localise(client, flat, panorama, refine="none", camera_height_m=1.713, camera_height_std_m=0.3).json()
+    inexact = localise(client, flat, sphere, refine="none", camera_height_m=1.713, camera_height_std_m=0.3).json()
     assert inexact["candidates"] != exact["candidates"]
     assert abs(inexact["camera_height_m"] - 1.713) <= 0.5
-    at_most = localise(client, flat, panorama, refine="none", camera_height_m=2.399, camera_height_std_m=0).json()
+    at_most = localise(client, flat, sphere, refine="none", camera_height_m=2.399, camera_height_std_m=0).json()
     assert at_most["camera_height_m"] == 2.399
-    above = assert_problem(localise(client, flat, panorama, camera_height_m=2.4), 422, "invalid-pose")
+    above = assert_problem(localise(client, flat, sphere, camera_height_m=2.4), 422, "invalid-pose")
     assert "2.4 m" in above["detail"]
 
 
-def test_all_heights_share_one_grid(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_all_heights_share_one_grid(client: httpx.Client, flat: str, sphere: bytes) -> None:
     for height_m in (1.2, 1.6, 1.9):
-        assert localise(client, flat, panorama, refine="none", camera_height_m=height_m).status_code == 200
+        assert localise(client, flat, sphere, refine="none", camera_height_m=height_m).status_code == 200
     text = client.get("/metrics").text
     assert "lalaloc_grids_pending 0.0" in text
 
 
 @pytest.mark.parametrize(("std_m", "limit"), [("-0.1", "0"), ("2.1", "2"), ("nan", "finite")])
-def test_height_deviation_has_limits(client: httpx.Client, flat: str, panorama: bytes, std_m: str, limit: str) -> None:
-    problem = assert_problem(localise(client, flat, panorama, camera_height_std_m=std_m), 422, "invalid-request")
+def test_height_deviation_has_limits(client: httpx.Client, flat: str, sphere: bytes, std_m: str, limit: str) -> None:
+    problem = assert_problem(localise(client, flat, sphere, camera_height_std_m=std_m), 422, "invalid-request")
     assert problem["errors"][0]["field"] == "camera_height_std_m"
     assert limit in problem["errors"][0]["message"]
 
 
-def test_unknown_camera_height_is_searched(client: httpx.Client, panorama: bytes) -> None:
+def test_unknown_camera_height_is_searched(client: httpx.Client, sphere: bytes) -> None:
     document = {key: value for key, value in FLAT.items() if key != "camera_height_m"}
     plan = client.post("/floorplans", json=document).json()["id"]
-    found = localise(client, plan, panorama, refine="none", top_k=10).json()
-    stated = localise(client, plan, panorama, refine="none", top_k=10, camera_height_m=1.5).json()
+    found = localise(client, plan, sphere, refine="none", top_k=10).json()
+    stated = localise(client, plan, sphere, refine="none", top_k=10, camera_height_m=1.5).json()
     assert 0.8 <= found["camera_height_m"] <= 2.2
     # More heights to choose from can only lower the cost.
     assert found["candidates"][0]["cost"] <= stated["candidates"][0]["cost"] + 1e-6
 
 
-def test_answer_has_room_ids(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    answer = localise(client, flat, panorama, refine="none", top_k=10).json()
+def test_answer_has_room_ids(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    answer = localise(client, flat, sphere, refine="none", top_k=10).json()
     ids = {room["name"]: room["id"] for room in FloorPlan.from_dict(FLAT).to_dict()["rooms"]}
     assert answer["room_id"] == ids[answer["room"]]
     assert all(candidate["room_id"] == ids[candidate["room"]] for candidate in answer["candidates"])
@@ -275,7 +274,7 @@ def test_answer_has_room_ids(client: httpx.Client, flat: str, panorama: bytes) -
 
 @pytest.mark.parametrize("heading", [None, 30.0])
 def test_confidence_does_not_depend_on_top_k(
-    start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes, heading: float | None
+    start_app: StartApp, tiny_bundle: Path, tmp_path: Path, sphere: bytes, heading: float | None
 ) -> None:
     copy = tmp_path / "bundle"
     shutil.copytree(tiny_bundle, copy)
@@ -287,9 +286,9 @@ def test_confidence_does_not_depend_on_top_k(
     fields = {} if heading is None else {"heading_deg": heading}
     with start_app(tmp_path / "data", bundle=copy) as client:
         plan_id = upload(client)
-        answers = [localise(client, plan_id, panorama, refine="none", top_k=k, **fields).json() for k in (1, 2, 10)]
-        unfitted = localise(client, plan_id, panorama, refine="vdr", **fields).json()
-    found = _retrieved(tiny_bundle, panorama, heading)
+        answers = [localise(client, plan_id, sphere, refine="none", top_k=k, **fields).json() for k in (1, 2, 10)]
+        unfitted = localise(client, plan_id, sphere, refine="vdr", **fields).json()
+    found = _retrieved(tiny_bundle, sphere, heading)
     expected = found.confidence(model)
     assert expected is not None
     assert 0.0 < expected.position < 1.0
@@ -321,22 +320,22 @@ def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipel
     return pipeline.localise(plan, grid, encoders.layouts, query, refine="none")
 
 
-def test_confidence_is_null_without_a_model(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    answer = localise(client, flat, panorama, refine="none").json()
+def test_confidence_is_null_without_a_model(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    answer = localise(client, flat, sphere, refine="none").json()
     assert answer["confidence"] is None
     assert answer["covariance_m2"] is None
     assert answer["heading_std_deg"] is None
 
 
-def test_query_waits_for_a_preparing_plan(client: httpx.Client, panorama: bytes) -> None:
+def test_query_waits_for_a_preparing_plan(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, HALL, wait=False)
     assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
-    assert localise(client, plan_id, panorama, refine="none").status_code == 200
+    assert localise(client, plan_id, sphere, refine="none").status_code == 200
     client.delete(f"/floorplans/{plan_id}")
 
 
 def test_waiting_ends_at_the_deadline(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     released, embed = threading.Event(), builder.embed
     monkeypatch.setattr(builder, "embed", lambda *args, **options: (released.wait(60.0), embed(*args, **options))[1])
@@ -345,28 +344,28 @@ def test_waiting_ends_at_the_deadline(
         # Otherwise the query can wait for the decoder instead.
         wait_for(lambda: client.get("/readyz").status_code == 200)
         plan_id = upload(client, HALL, wait=False)
-        response = localise(client, plan_id, panorama, refine="none")
+        response = localise(client, plan_id, sphere, refine="none")
         assert "still preparing" in assert_problem(response, 503, "floorplan-not-ready")["detail"]
         assert int(response.headers["retry-after"]) > 0
         released.set()
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
     with start_app(tmp_path) as client:
-        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert localise(client, plan_id, sphere, refine="none").status_code == 200
 
 
-def test_slow_query_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_slow_query_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, request_deadline_s=1e-6) as client:
-        response = localise(client, upload(client), panorama)
+        response = localise(client, upload(client), sphere)
         assert_problem(response, 504, "deadline-exceeded")
 
 
 @pytest.mark.one_replica
-def test_queries_beyond_the_limit_are_rejected(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_queries_beyond_the_limit_are_rejected(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, max_pending_requests=1) as client, ThreadPoolExecutor(1) as threads:
         plan_id = upload(client, HALL, wait=False)
-        waiting = threads.submit(localise, client, plan_id, panorama, refine="none")
+        waiting = threads.submit(localise, client, plan_id, sphere, refine="none")
         wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
-        refused = localise(client, plan_id, panorama, refine="none")
+        refused = localise(client, plan_id, sphere, refine="none")
         assert_problem(refused, 503, "overloaded")
         assert refused.headers["retry-after"] == "1"
         assert waiting.result().status_code == 200
@@ -375,33 +374,33 @@ def test_queries_beyond_the_limit_are_rejected(start_app: StartApp, tmp_path: Pa
 @pytest.mark.slow
 @pytest.mark.one_replica
 def test_hanging_database_does_not_block_known_plans(
-    start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
+    start_app: StartApp, postgres: PostgresServer, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path, database_url=postgres.new_database(), database_wait_s=4.0) as client:
         known, unknown = upload(client), "0" * 32
-        assert localise(client, known, panorama, refine="none").status_code == 200
+        assert localise(client, known, sphere, refine="none").status_code == 200
         with postgres.silent():
             begin = monotonic()
             for _ in range(8):
-                assert localise(client, known, panorama, refine="none").status_code == 200
+                assert localise(client, known, sphere, refine="none").status_code == 200
             # Not every query waits 4 s, and waiting queries leave threads free.
             assert monotonic() - begin < 28.0
-            assert_problem(localise(client, unknown, panorama, refine="none"), 503, "store-unavailable")
+            assert_problem(localise(client, unknown, sphere, refine="none"), 503, "store-unavailable")
             assert_problem(
                 client.post(
                     "/localise",
                     data={"floorplan_id": known},
-                    files={"panorama": ("p.jpg", panorama, "image/jpeg")},
+                    files={"photo": ("p.jpg", sphere, "image/jpeg")},
                     headers={"Idempotency-Key": "silent"},
                 ),
                 503,
                 "store-unavailable",
             )
-        wait_for(lambda: localise(client, unknown, panorama, refine="none").status_code == 404)
+        wait_for(lambda: localise(client, unknown, sphere, refine="none").status_code == 404)
 
 
 @pytest.mark.slow
-def test_uploads_do_not_block_queries(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_uploads_do_not_block_queries(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     plan = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, inline_grid_poses=10**6) as client:
         plan_id = upload(client)
@@ -418,16 +417,16 @@ def test_uploads_do_not_block_queries(start_app: StartApp, tmp_path: Path, panor
                 wait_for(lambda: "lalaloc_requests_in_flight 12.0" in client.get("/metrics").text)
                 begin = monotonic()
                 for _ in range(8):
-                    assert localise(client, plan_id, panorama, refine="none").status_code == 200
+                    assert localise(client, plan_id, sphere, refine="none").status_code == 200
                 assert monotonic() - begin < 6.0
             finally:
                 stop.set()
 
 
-def test_deleting_a_plan_ends_waiting_queries(client: httpx.Client, panorama: bytes) -> None:
+def test_deleting_a_plan_ends_waiting_queries(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, HALL, wait=False)
     responses: list[httpx.Response] = []
-    waiting = threading.Thread(target=lambda: responses.append(localise(client, plan_id, panorama, refine="none")))
+    waiting = threading.Thread(target=lambda: responses.append(localise(client, plan_id, sphere, refine="none")))
     waiting.start()
     wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
     assert client.delete(f"/floorplans/{plan_id}").status_code == 204

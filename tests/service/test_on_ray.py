@@ -75,22 +75,22 @@ def wider(plan: dict[str, Any], factor: float) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_ray_answers_like_one_process(
-    on_ray: httpx.Client, plan_id: str, start_app: StartApp, data_dir: Path, panorama: bytes
+    on_ray: httpx.Client, plan_id: str, start_app: StartApp, data_dir: Path, sphere: bytes
 ) -> None:
     assert on_ray.get("/readyz").status_code == 200
-    answer = localise(on_ray, plan_id, panorama, refine="vdr", heading_deg=30).json()
+    answer = localise(on_ray, plan_id, sphere, refine="vdr", heading_deg=30).json()
     with start_app(data_dir) as alone:
-        expected = localise(alone, plan_id, panorama, refine="vdr", heading_deg=30).json()
+        expected = localise(alone, plan_id, sphere, refine="vdr", heading_deg=30).json()
     for name in ("position", "heading_deg", "room", "cost", "stage", "model", "floorplan_revision"):
         assert answer[name] == pytest.approx(expected[name]), name
-    optimised = localise(on_ray, plan_id, panorama, heading_deg=30).json()
+    optimised = localise(on_ray, plan_id, sphere, heading_deg=30).json()
     assert optimised["stage"] == "lpo"
     assert optimised["cost"] <= answer["cost"]
 
 
 @pytest.mark.slow
-def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
+def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id: str, sphere: bytes) -> None:
+    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
     sequence = on_ray.post("/localise/sequence", data={"floorplan_id": plan_id, "motion": "turn"}, files=files)
     assert sequence.status_code == 200, sequence.text
     venue = on_ray.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 1}]}).json()["id"]
@@ -102,17 +102,17 @@ def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id
 
 
 @pytest.mark.slow
-def test_replica_errors_reach_the_client(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_replica_errors_reach_the_client(on_ray: httpx.Client, plan_id: str, sphere: bytes) -> None:
     assert_problem(localise(on_ray, plan_id, b"no picture"), 422, "invalid-photograph")
-    assert_problem(localise(on_ray, plan_id, panorama, rooms=json.dumps(["nowhere"])), 422, "invalid-hint")
-    assert_problem(localise(on_ray, "0" * 32, panorama), 404, "unknown-floorplan")
-    assert_problem(localise(on_ray, plan_id, panorama, camera_height_m=2.6), 422, "invalid-pose")
+    assert_problem(localise(on_ray, plan_id, sphere, rooms=json.dumps(["nowhere"])), 422, "invalid-hint")
+    assert_problem(localise(on_ray, "0" * 32, sphere), 404, "unknown-floorplan")
+    assert_problem(localise(on_ray, plan_id, sphere, camera_height_m=2.6), 422, "invalid-pose")
 
 
 @pytest.mark.slow
-def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, panorama: bytes) -> None:
+def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, sphere: bytes) -> None:
     plans = [upload(on_ray, FLAT | {"name": f"flat {number}"}) for number in range(8)]
-    revisions = {localise(on_ray, plan, panorama, refine="none").json()["floorplan_revision"] for plan in plans * 2}
+    revisions = {localise(on_ray, plan, sphere, refine="none").json()["floorplan_revision"] for plan in plans * 2}
     search = serve.get_deployment_handle("search", NAME)
     # Enough requests to reach both replicas.
     kept = {search.options(session_id=str(number)).revisions.remote().result(timeout_s=30) for number in range(16)}
@@ -123,10 +123,10 @@ def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, panorama: bytes) -
 
 
 @pytest.mark.slow
-def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, sphere: bytes) -> None:
     kill_replica("lpo")
     # Single photographs are refined by the search replicas.
-    files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
+    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
 
     def ask() -> httpx.Response:
         return on_ray.post("/localise/sequence", data={"floorplan_id": plan_id, "motion": "turn"}, files=files)
@@ -137,14 +137,14 @@ def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, panora
 
 @pytest.mark.slow
 def test_index_in_shards_chooses_the_same_plans(
-    on_ray: httpx.Client, start_app: StartApp, data_dir: Path, panorama: bytes
+    on_ray: httpx.Client, start_app: StartApp, data_dir: Path, sphere: bytes
 ) -> None:
     plans = [upload(on_ray, wider(FLAT, 1.0 + 0.04 * number)) for number in range(7)]
     venue = venue_of(on_ray, *plans)
 
     def answers(client: httpx.Client) -> list[dict[str, Any]]:
         stated: list[dict[str, Any]] = [{}, {"heading_deg": 30}]
-        found = [ask(client, venue, panorama, refine="none", top_k=10, **fields) for fields in stated]
+        found = [ask(client, venue, sphere, refine="none", top_k=10, **fields) for fields in stated]
         return [{name: one.json()[name] for name in ("position", "plans")} for one in found]
 
     found = answers(on_ray)

@@ -27,10 +27,10 @@ GUIDES = Path(__file__).parents[2] / "docs" / "how-to"
 PAGE = (GUIDES / "operate.md").read_text(encoding="utf-8")
 
 
-def stored(client: httpx.Client, panorama: bytes) -> tuple[list[dict[str, object]], object]:
-    """Return all plans, and the position of the panorama in the oldest plan."""
+def stored(client: httpx.Client, sphere: bytes) -> tuple[list[dict[str, object]], object]:
+    """Return all plans, and the position of the sphere in the oldest plan."""
     plans = client.get("/floorplans").json()["floorplans"]
-    answer = localise(client, plans[-1]["id"], panorama, heading_deg=0)
+    answer = localise(client, plans[-1]["id"], sphere, heading_deg=0)
     assert answer.status_code == 200, answer.text
     return plans, answer.json()["position"]
 
@@ -49,12 +49,12 @@ def on_sqlite(data: Path) -> dict[str, Any]:
 
 
 def test_sqlite_backup_restores_everything(
-    start_app: StartApp, panorama: bytes, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    start_app: StartApp, sphere: bytes, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     backup = str(tmp_path / "backup.sqlite3")
     with start_app(**on_sqlite(data)) as client:
         upload(client)
-        before = stored(client, panorama)
+        before = stored(client, sphere)
         assert lalaloc_service(["backup", backup]) == 0
         later = upload(client)
         # A running service would go on in the file before.
@@ -65,7 +65,7 @@ def test_sqlite_backup_restores_everything(
     earlier = re.search(r"is '(.*)'; delete it", capsys.readouterr().out)
     assert earlier is not None
     with start_app(**on_sqlite(data)) as client:
-        assert stored(client, panorama) == before
+        assert stored(client, sphere) == before
         assert client.get(f"/floorplans/{later}").status_code == 404
     # The database before is a backup as well.
     assert lalaloc_service(["restore", earlier[1], "--yes"]) == 0
@@ -102,12 +102,12 @@ def test_sqlite_backup_restores_albums(start_app: StartApp, data: Path, tmp_path
 
 
 def test_lost_or_damaged_database_is_restored(
-    start_app: StartApp, panorama: bytes, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    start_app: StartApp, sphere: bytes, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     backup, database = str(tmp_path / "backup.sqlite3"), data / "lalaloc.sqlite3"
     with start_app(**on_sqlite(data)) as client:
         upload(client)
-        before = stored(client, panorama)
+        before = stored(client, sphere)
         assert lalaloc_service(["backup", backup]) == 0
     for content in (None, b"no database" * 1000):
         shutil.rmtree(data)
@@ -118,7 +118,7 @@ def test_lost_or_damaged_database_is_restored(
         assert lalaloc_service(["restore", backup, "--yes"]) == 0
         assert ("the database before" in capsys.readouterr().out) == (content is not None)
         with start_app(**on_sqlite(data)) as client:
-            assert stored(client, panorama) == before
+            assert stored(client, sphere) == before
 
 
 def test_commits_in_the_log_of_a_copy_are_restored(data: Path, tmp_path: Path) -> None:
@@ -200,14 +200,14 @@ def test_backup_of_postgresql_names_its_programs(
 
 @pytest.mark.parametrize("with_grids", [True, False])
 def test_postgresql_dump_restores_everything(
-    start_app: StartApp, postgres: PostgresServer, panorama: bytes, tmp_path: Path, with_grids: bool
+    start_app: StartApp, postgres: PostgresServer, sphere: bytes, tmp_path: Path, with_grids: bool
 ) -> None:
     url, dump = own_database(postgres), str(tmp_path / "backup.dump")
     left_out = [] if with_grids else re.findall(r"--exclude-table-data=\w+", PAGE)
     assert with_grids or len(left_out) == 2
     with start_app(tmp_path / "a", database_url=url) as client:
         upload(client)
-        before = stored(client, panorama)
+        before = stored(client, sphere)
         run(postgres, "pg_dump", "--format=custom", f"--file={dump}", *left_out, url)
         upload(client)
     options = re.search(r"pg_restore (.*) --dbname", PAGE)
@@ -215,7 +215,7 @@ def test_postgresql_dump_restores_everything(
     run(postgres, "pg_restore", *options[1].split(), f"--dbname={url}", dump)
     with start_app(tmp_path / "b", database_url=url) as client:
         wait_for(lambda: client.get("/readyz").json()["plans_preparing"] == 0)
-        assert stored(client, panorama) == before
+        assert stored(client, sphere) == before
 
 
 @pytest.mark.slow
@@ -235,7 +235,7 @@ def test_postgresql_dump_restores_albums(start_app: StartApp, postgres: Postgres
 
 
 def test_replicas_of_two_models_coexist(
-    start_app: StartApp, postgres: PostgresServer, tiny_bundle: Path, panorama: bytes, tmp_path: Path
+    start_app: StartApp, postgres: PostgresServer, tiny_bundle: Path, sphere: bytes, tmp_path: Path
 ) -> None:
     url, bundle = postgres.new_database(), tmp_path / "next"
     shutil.copytree(tiny_bundle, bundle)
@@ -247,8 +247,7 @@ def test_replicas_of_two_models_coexist(
             wait_for(lambda: new.get("/readyz").json()["plans_preparing"] == 0)
             for _ in range(2):
                 versions = [
-                    localise(client, plan_id, panorama, heading_deg=0).json()["model"]["version"]
-                    for client in (old, new)
+                    localise(client, plan_id, sphere, heading_deg=0).json()["model"]["version"] for client in (old, new)
                 ]
                 assert versions[1] == "next" != versions[0]
 

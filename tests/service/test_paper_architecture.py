@@ -35,14 +35,14 @@ def app_settings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.mark.parametrize("heading", [None, 90.0])
 @pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "lpo")])
 def test_query_reaches_each_stage(
-    client: httpx.Client, panorama: bytes, refine: str, stage: str, heading: float | None
+    client: httpx.Client, sphere: bytes, refine: str, stage: str, heading: float | None
 ) -> None:
     plan_id = upload(client)
     fields = {} if heading is None else {"heading_deg": heading}
     answers: list[dict[str, Any]] = []
 
     def reached() -> bool:
-        response = localise(client, plan_id, panorama, refine=refine, **fields)
+        response = localise(client, plan_id, sphere, refine=refine, **fields)
         assert response.status_code == 200, response.text
         answers.append(response.json())
         return answers[-1]["stage"] == stage
@@ -59,8 +59,8 @@ def test_query_reaches_each_stage(
 
 
 @pytest.mark.slow
-def test_sequence_ends_at_retrieval(client: httpx.Client, panorama: bytes) -> None:
-    files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
+def test_sequence_ends_at_retrieval(client: httpx.Client, sphere: bytes) -> None:
+    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
     fields = {"floorplan_id": upload(client), "motion": "turn"}
     response = client.post("/localise/sequence", data=fields, files=files)
     assert response.status_code == 200, response.text

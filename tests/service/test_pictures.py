@@ -28,14 +28,14 @@ def request_picture(
     client: httpx.Client, plan_id: str, photograph: bytes, accept: str, query: str = "", **headers: str
 ) -> httpx.Response:
     data = {"floorplan_id": plan_id, "heading_deg": "30", "refine": "vdr"}
-    files: dict[str, Any] = {"panorama": ("p.jpg", photograph, "image/jpeg")}
+    files: dict[str, Any] = {"photo": ("p.jpg", photograph, "image/jpeg")}
     return client.post(f"/localise{query}", data=data, files=files, headers={"Accept": accept} | headers)
 
 
 @pytest.mark.parametrize("picture", ["plan", "photograph", "both"])
-def test_answer_is_drawn_as_svg(client: httpx.Client, flat: str, panorama: bytes, picture: str) -> None:
-    answer = request_picture(client, flat, panorama, JSON).json()
-    response = request_picture(client, flat, panorama, SVG, f"?picture={picture}")
+def test_answer_is_drawn_as_svg(client: httpx.Client, flat: str, sphere: bytes, picture: str) -> None:
+    answer = request_picture(client, flat, sphere, JSON).json()
+    response = request_picture(client, flat, sphere, SVG, f"?picture={picture}")
     assert response.status_code == 200, response.text
     assert response.headers["content-type"].split(";")[0] == SVG
     assert "Accept" in response.headers["vary"]
@@ -52,11 +52,11 @@ def test_answer_is_drawn_as_svg(client: httpx.Client, flat: str, panorama: bytes
     assert all(href.startswith("data:image/") for href in hrefs), "nothing is loaded from elsewhere"
 
 
-def test_png_contains_the_photograph(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    response = request_picture(client, flat, panorama, PNG, "?picture=photograph")
+def test_png_contains_the_photograph(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    response = request_picture(client, flat, sphere, PNG, "?picture=photograph")
     assert response.status_code == 200, response.text
     assert response.headers["content-type"] == PNG
-    with Image.open(io.BytesIO(response.content)) as drawn, Image.open(io.BytesIO(panorama)) as sent:
+    with Image.open(io.BytesIO(response.content)) as drawn, Image.open(io.BytesIO(sphere)) as sent:
         assert drawn.width == 1600
         # Upper part of the photograph, without lines.
         inside = np.asarray(drawn.convert("RGB").crop((36, 104, 36 + 1528, 104 + 150)).resize((64, 8))).astype(float)
@@ -64,32 +64,32 @@ def test_png_contains_the_photograph(client: httpx.Client, flat: str, panorama: 
     assert np.abs(inside - above).mean() < 6.0
 
 
-def test_picture_shows_both_by_default(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_picture_shows_both_by_default(client: httpx.Client, flat: str, sphere: bytes) -> None:
     classes = {
         element.get("class")
-        for element in ElementTree.fromstring(request_picture(client, flat, panorama, SVG).text).iter()
+        for element in ElementTree.fromstring(request_picture(client, flat, sphere, SVG).text).iter()
     }
     assert {"layout", "camera"} <= classes
 
 
-def test_problems_are_json(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_problems_are_json(client: httpx.Client, flat: str, sphere: bytes) -> None:
     assert_problem(request_picture(client, flat, b"no picture", PNG), 422, "invalid-photograph")
-    assert_problem(request_picture(client, "0" * 32, panorama, PNG), 404, "unknown-floorplan")
-    problem = assert_problem(request_picture(client, flat, panorama, PNG, "?picture=mesh"), 422, "invalid-request")
+    assert_problem(request_picture(client, "0" * 32, sphere, PNG), 404, "unknown-floorplan")
+    problem = assert_problem(request_picture(client, flat, sphere, PNG, "?picture=mesh"), 422, "invalid-request")
     assert problem["errors"][0]["field"] == "picture"
-    problem = assert_problem(request_picture(client, flat, panorama, JSON, "?picture=plan"), 422, "invalid-request")
+    problem = assert_problem(request_picture(client, flat, sphere, JSON, "?picture=plan"), 422, "invalid-request")
     assert "Accept: image/png" in problem["errors"][0]["message"]
-    keyed = request_picture(client, flat, panorama, PNG, **{"Idempotency-Key": "one"})
+    keyed = request_picture(client, flat, sphere, PNG, **{"Idempotency-Key": "one"})
     problem = assert_problem(keyed, 422, "invalid-request")
     assert problem["errors"][0]["field"] == "Idempotency-Key"
 
 
-def test_client_requests_pictures(client: httpx.Client, flat: str, panorama: bytes) -> None:
+def test_client_requests_pictures(client: httpx.Client, flat: str, sphere: bytes) -> None:
     with Client(str(client.base_url)) as service:
-        svg = service.picture(flat, panorama, "plan", picture_format="svg", heading_deg=30.0, refine="none")
+        svg = service.picture(flat, sphere, "plan", picture_format="svg", heading_deg=30.0, refine="none")
         assert svg.startswith(b"<svg")
         with pytest.raises(ValueError, match="'gif'"):
-            service.picture(flat, panorama, picture_format="gif")  # pyright: ignore[reportArgumentType]
+            service.picture(flat, sphere, picture_format="gif")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ DOORS = [
 ]
 
 
-def test_posterior_is_included_on_request(client: httpx.Client, panorama: bytes) -> None:
+def test_posterior_is_included_on_request(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client)
-    answer = localise(client, plan_id, panorama, include="posterior", heading_deg=10.0).json()
+    answer = localise(client, plan_id, sphere, include="posterior", heading_deg=10.0).json()
     posterior = answer["posterior"]
     step_m = client.get(f"/floorplans/{plan_id}").json()["grid"]["step_m"]
     assert posterior["step_m"] == step_m
@@ -27,11 +27,11 @@ def test_posterior_is_included_on_request(client: httpx.Client, panorama: bytes)
     plan = FloorPlan.from_dict(FLAT)
     places = np.array([posterior["x_m"], posterior["y_m"]]).T
     assert all(any(room.shape.covers(type(room.shape.centroid)(*place)) for room in plan.rooms) for place in places)
-    assert localise(client, plan_id, panorama, heading_deg=10.0).json()["posterior"] is None
+    assert localise(client, plan_id, sphere, heading_deg=10.0).json()["posterior"] is None
 
 
-def test_unknown_include_is_rejected(client: httpx.Client, panorama: bytes) -> None:
-    problem = assert_problem(localise(client, upload(client), panorama, include="grid"), 422, "invalid-request")
+def test_unknown_include_is_rejected(client: httpx.Client, sphere: bytes) -> None:
+    problem = assert_problem(localise(client, upload(client), sphere, include="grid"), 422, "invalid-request")
     (fault,) = problem["errors"]
     assert fault["field"] == "include"
     assert "posterior" in fault["message"]

@@ -94,17 +94,17 @@ def _warm(client: httpx.Client) -> bool:
     return client.get("/readyz").json()["lpo_pool"]["ready"] > 0
 
 
-def test_plans_and_grids_survive_a_restart(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
+def test_plans_and_grids_survive_a_restart(tiny_bundle: Path, tmp_path: Path, sphere: bytes) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data", LPO_DEADLINE_S="9")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
         early = client.get("/readyz")
         assert early.status_code == (200 if early.json()["ready"] else 503)
         wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
         plan_id = upload(client)
-        before = localise(client, plan_id, panorama).json()
+        before = localise(client, plan_id, sphere).json()
         assert before["stage"] == "lpo"
         assert before["timings_ms"]["lpo"] > 0.0
-        coarse = localise(client, plan_id, panorama, refine="none").json()
+        coarse = localise(client, plan_id, sphere, refine="none").json()
         workers = children(process.pid)
         assert workers
         process.send_signal(signal.SIGTERM)
@@ -116,11 +116,11 @@ def test_plans_and_grids_survive_a_restart(tiny_bundle: Path, tmp_path: Path, pa
         # Ready at once: the grid was read, not computed.
         assert client.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
         assert "lalaloc_grid_seconds_count 0.0" in client.get("/metrics").text
-        assert localise(client, plan_id, panorama, refine="none").json()["candidates"] == coarse["candidates"]
+        assert localise(client, plan_id, sphere, refine="none").json()["candidates"] == coarse["candidates"]
 
 
 @pytest.mark.slow
-def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
+def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, sphere: bytes) -> None:
     rng = random.Random(3)
     environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="2", MAX_QUERIES="8")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
@@ -131,7 +131,7 @@ def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, panor
         def ask_until_the_end() -> list[httpx.Response]:
             answers = []
             while monotonic() < end:
-                answers.append(localise(client, plan_id, panorama, refine="lpo"))
+                answers.append(localise(client, plan_id, sphere, refine="lpo"))
             return answers
 
         with ThreadPoolExecutor(4) as threads:
@@ -147,7 +147,7 @@ def test_killed_workers_cost_no_answers(tiny_bundle: Path, tmp_path: Path, panor
         assert {answer.status_code for answer in answers} == {200}
         assert {answer.json()["stage"] for answer in answers} <= {"lpo", "vdr"}
         wait_for(lambda: _warm(client), 120.0)
-        assert localise(client, plan_id, panorama).json()["stage"] == "lpo"
+        assert localise(client, plan_id, sphere).json()["stage"] == "lpo"
         assert 'lalaloc_pool_restarts_total{pool="lpo"} 0.0' not in client.get("/metrics").text
 
 

@@ -65,7 +65,7 @@ def _listens(client: httpx.Client, status: int) -> bool:
 
 
 def test_two_replicas_act_as_one_service(
-    start_app: StartApp, postgres: PostgresServer, panorama: bytes, tmp_path: Path
+    start_app: StartApp, postgres: PostgresServer, sphere: bytes, tmp_path: Path
 ) -> None:
     url = postgres.new_database()
     with ExitStack() as second, start_app(tmp_path / "a", database_url=url) as a:
@@ -75,8 +75,8 @@ def test_two_replicas_act_as_one_service(
             # Either replica alone knows what came through the proxy.
             for replica in (a, b):
                 assert replica.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
-                assert localise(replica, plan_id, panorama, heading_deg=0).status_code == 200
-            answers = [localise(proxy, plan_id, panorama, heading_deg=0) for _ in range(4)]
+                assert localise(replica, plan_id, sphere, heading_deg=0).status_code == 200
+            answers = [localise(proxy, plan_id, sphere, heading_deg=0) for _ in range(4)]
             assert {answer.status_code for answer in answers} == {200}
             assert len({answer.json()["position"]["x_m"] for answer in answers}) == 1
             named = proxy.get(f"/floorplans/{plan_id}", headers={"X-Request-ID": "mine-1"})
@@ -84,10 +84,10 @@ def test_two_replicas_act_as_one_service(
             assert proxy.get("/metrics").status_code == 404
             # One replica goes: what it would have answered, the other one does.
             second.close()
-            answers = [localise(proxy, plan_id, panorama, heading_deg=0) for _ in range(4)]
+            answers = [localise(proxy, plan_id, sphere, heading_deg=0) for _ in range(4)]
             assert {answer.status_code for answer in answers} == {200}
             assert proxy.delete(f"/floorplans/{plan_id}").status_code == 204
-            assert localise(a, plan_id, panorama, heading_deg=0).status_code == 404
+            assert localise(a, plan_id, sphere, heading_deg=0).status_code == 404
 
 
 def test_replicas_answer_the_same_album(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_proxy_accepts_the_largest_uploads(start_app: StartApp, postgres: Postgr
     with start_app(tmp_path / "a", database_url=url) as a, nginx(tmp_path, [a, a]) as proxy:
         limit = a.get("/limits").json()["max_photograph_bytes"]
         # The service's own refusal, a problem document, and not the proxy's page.
-        answer = proxy.post("/localise", files={"panorama": ("p.jpg", bytes(limit - 1))})
+        answer = proxy.post("/localise", files={"photo": ("p.jpg", bytes(limit - 1))})
         assert answer.status_code == 422, answer.text
         assert answer.headers["content-type"] == "application/problem+json"
 

@@ -217,15 +217,15 @@ def test_kept_revisions_can_be_read(start_app: StartApp, tmp_path: Path) -> None
             assert_problem(client.get(url, params={"revision": unknown}), 404, "unknown-revision")
 
 
-def test_answers_name_the_searched_revision(client: httpx.Client, panorama: bytes) -> None:
+def test_answers_name_the_searched_revision(client: httpx.Client, sphere: bytes) -> None:
     created = client.post("/floorplans", json=FLAT).json()
-    answers = [localise(client, created["id"], panorama, refine="none").json()]
+    answers = [localise(client, created["id"], sphere, refine="none").json()]
     replaced = client.put(f"/floorplans/{created['id']}", json=_named("other")).json()
-    answers.append(localise(client, created["id"], panorama, refine="none").json())
+    answers.append(localise(client, created["id"], sphere, refine="none").json())
     assert [answer["floorplan_revision"] for answer in answers] == [created["revision"], replaced["revision"]]
 
 
-def test_running_queries_survive_a_replacement(client: httpx.Client, panorama: bytes) -> None:
+def test_running_queries_survive_a_replacement(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client)
     url = f"/floorplans/{plan_id}"
     known, stop = {client.get(url).json()["revision"]}, threading.Event()
@@ -236,7 +236,7 @@ def test_running_queries_survive_a_replacement(client: httpx.Client, panorama: b
 
     with ThreadPoolExecutor(4) as threads:
         replacing = threads.submit(replace)
-        queries = [threads.submit(localise, client, plan_id, panorama, refine="none") for _ in range(12)]
+        queries = [threads.submit(localise, client, plan_id, sphere, refine="none") for _ in range(12)]
         answers = [query.result() for query in queries]
         stop.set()
         replacing.result()
@@ -318,12 +318,12 @@ def test_replacing_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path:
 
 
 @pytest.mark.slow
-def test_deleting_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_deleting_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
         plan_id = upload(client, HALL, wait=False)
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
         with ThreadPoolExecutor(1) as threads:
-            waiting = threads.submit(localise, client, plan_id, panorama)
+            waiting = threads.submit(localise, client, plan_id, sphere)
             wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
             assert client.delete(f"/floorplans/{plan_id}").status_code == 204
             assert_problem(waiting.result(), 404, "unknown-floorplan")
@@ -340,12 +340,12 @@ def test_preparation_resumes_after_a_restart(start_app: StartApp, tmp_path: Path
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
 
 
-def test_queries_run_while_a_large_plan_is_prepared(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_queries_run_while_a_large_plan_is_prepared(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
         small = upload(client)
         large = upload(client, HALL, wait=False)
         wait_for(lambda: client.get(f"/floorplans/{large}").json()["progress"] > 0.0)
-        assert localise(client, small, panorama, refine="vdr").status_code == 200
+        assert localise(client, small, sphere, refine="vdr").status_code == 200
         assert client.get(f"/floorplans/{large}").json()["status"] == "preparing"
 
 
@@ -362,17 +362,17 @@ def _cached_bytes(client: httpx.Client) -> float:
     return float(next(line for line in lines if line.startswith("lalaloc_grid_cache_bytes ")).split()[1])
 
 
-def test_replicas_see_changes_at_once(replicas: list[httpx.Client], panorama: bytes) -> None:
+def test_replicas_see_changes_at_once(replicas: list[httpx.Client], sphere: bytes) -> None:
     first, second = replicas
     created = first.post("/floorplans", json=FLAT).json()
     url = f"/floorplans/{created['id']}"
-    assert localise(second, created["id"], panorama, refine="none").json()["floorplan_revision"] == created["revision"]
+    assert localise(second, created["id"], sphere, refine="none").json()["floorplan_revision"] == created["revision"]
     replaced = second.put(url, json=_named("new")).json()
     assert first.get(url).json()["name"] == "new"
-    assert localise(first, created["id"], panorama, refine="none").json()["floorplan_revision"] == replaced["revision"]
+    assert localise(first, created["id"], sphere, refine="none").json()["floorplan_revision"] == replaced["revision"]
     wait_for(lambda: _cached_bytes(first) > 0 and _cached_bytes(second) > 0)
     assert first.delete(url).status_code == 204
     assert_problem(second.get(url), 404, "unknown-floorplan")
-    assert_problem(localise(second, created["id"], panorama), 404, "unknown-floorplan")
+    assert_problem(localise(second, created["id"], sphere), 404, "unknown-floorplan")
     # Both caches are empty.
     wait_for(lambda: _cached_bytes(first) == _cached_bytes(second) == 0, 10.0)

@@ -22,10 +22,10 @@ def _numbers(value: object) -> list[float]:
     return [value] if isinstance(value, float) else []
 
 
-def test_answers_are_rounded(client: httpx.Client, panorama: bytes) -> None:
+def test_answers_are_rounded(client: httpx.Client, sphere: bytes) -> None:
     third = [[0, 0], [4 / 3, 0], [4 / 3, 10 / 3], [0, 10 / 3]]
     plan_id = upload(client, {"ceiling_height_m": 2.5, "rooms": [{"name": "x", "polygon": third}]})
-    answers = [localise(client, plan_id, panorama), client.get(f"/floorplans/{plan_id}"), client.get("/floorplans")]
+    answers = [localise(client, plan_id, sphere), client.get(f"/floorplans/{plan_id}"), client.get("/floorplans")]
     documents = [json.loads(answer.text) for answer in answers]
     # The plan itself is unchanged.
     assert documents[1].pop("plan")["rooms"][0]["polygon"] == third

@@ -115,7 +115,7 @@ class Guarded:
             made = self.client.post("/venues", json={}, headers=bearer(self.key)).json()
             path = path.replace(f"{{{VENUE}}}", made["id"])
         picture = ("p.jpg", encode_picture(512, 256, "JPEG"), "image/jpeg")
-        form = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": picture}}
+        form = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"photo": picture}}
         if "{answer_id}" in path:
             kept = self.client.post("/localise", headers=bearer(self.key), **form).json()
             path = path.replace("{answer_id}", kept["answer_id"])
@@ -136,7 +136,7 @@ class Guarded:
         elif path in ("/localise", "/localise/batch"):
             body = form
         elif path == "/localise/sequence":
-            body = {"data": {PLAN: plan_id, "motion": "turn"}, "files": [("panorama", picture)] * 2}
+            body = {"data": {PLAN: plan_id, "motion": "turn"}, "files": [("photo", picture)] * 2}
         elif path.startswith("/venues"):
             body = {"json": {"name": "12 Mill Lane"}}
         elif method in ("POST", "PUT"):
@@ -523,7 +523,7 @@ def test_address_counters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.one_replica
 def test_known_keys_work_without_the_database(
-    start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
+    start_app: StartApp, postgres: PostgresServer, tmp_path: Path, sphere: bytes
 ) -> None:
     url = postgres.new_database()
     with start_app(tmp_path, api_keys=True, database_url=url, key_cache_s=0.1) as client:
@@ -531,12 +531,12 @@ def test_known_keys_work_without_the_database(
         key, new_key = make_key(store), make_key(store)
         client.headers.update(bearer(key))
         plan_id = upload(client)
-        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert localise(client, plan_id, sphere, refine="none").status_code == 200
         store.close()
         postgres.stop()
         try:
             sleep(0.2)
-            assert localise(client, plan_id, panorama, refine="none").status_code == 200
+            assert localise(client, plan_id, sphere, refine="none").status_code == 200
             assert client.get("/limits").status_code == 200
             unknown = client.get("/limits", headers=bearer(new_key))
             assert_problem(unknown, 503, "store-unavailable")

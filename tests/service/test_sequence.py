@@ -32,7 +32,7 @@ def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any
     data = {"floorplan_id": plan_id, "motion": "turn"} | {
         name: json.dumps(value) if isinstance(value, list) else str(value) for name, value in fields.items()
     }
-    files = [("panorama", ("p.jpg", picture, "image/jpeg")) for picture in pictures]
+    files = [("photo", ("p.jpg", picture, "image/jpeg")) for picture in pictures]
     return client.post("/localise/sequence", data=data, files=files)
 
 
@@ -43,7 +43,7 @@ def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **field
 
 
 @pytest.mark.parametrize("refine", ["none", "lpo"])
-def test_every_panorama_has_a_pose_in_the_plan(
+def test_every_sphere_has_a_pose_in_the_plan(
     client: httpx.Client, plan_id: str, pictures: list[bytes], refine: str
 ) -> None:
     answer = answer_to(client, plan_id, pictures, refine=refine, top_k=3)
@@ -102,19 +102,19 @@ def test_walk_is_refused_by_name(
     ],
 )
 def test_invalid_sequence_is_rejected(
-    client: httpx.Client, plan_id: str, panorama: bytes, count: int, fields: dict[str, Any], field: str, message: str
+    client: httpx.Client, plan_id: str, sphere: bytes, count: int, fields: dict[str, Any], field: str, message: str
 ) -> None:
-    problem = assert_problem(ask(client, plan_id, [panorama] * count, **fields), 422, "invalid-request")
+    problem = assert_problem(ask(client, plan_id, [sphere] * count, **fields), 422, "invalid-request")
     assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
 
 
-def test_invalid_panorama_is_rejected(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    assert_problem(ask(client, plan_id, [panorama, b"no picture"]), 422, "invalid-photograph")
-    assert_problem(ask(client, "f" * 32, [panorama] * 2), 404, "unknown-floorplan")
+def test_invalid_sphere_is_rejected(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
+    assert_problem(ask(client, plan_id, [sphere, b"no picture"]), 422, "invalid-photograph")
+    assert_problem(ask(client, "f" * 32, [sphere] * 2), 404, "unknown-floorplan")
 
 
-def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    problem = assert_problem(ask(client, plan_id, [panorama, bytes(370_000)]), 413, "upload-too-large")
+def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
+    problem = assert_problem(ask(client, plan_id, [sphere, bytes(370_000)]), 413, "upload-too-large")
     assert "LALALOC_MAX_SEQUENCE_BYTES" in problem["detail"]
     limits = client.get("/limits").json()
     assert (limits["max_sequence_photographs"], limits["max_sequence_bytes"]) == (30, 300_000)

@@ -42,12 +42,12 @@ def plan_id(client: httpx.Client) -> str:
     return upload(client)
 
 
-def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     session_id = begin(client, plan_id, camera_height_m=1.5)
     empty = client.get(f"/sessions/{session_id}").json()
     assert (empty["photographs"], empty["mode"], empty["pose"], empty["path"]) == (0, "searching", None, [])
-    first = send(client, session_id, panorama, number=1).json()
-    second = send(client, session_id, panorama, number=2, forward_m=0, turn_deg=0)
+    first = send(client, session_id, sphere, number=1).json()
+    second = send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
     assert second.status_code == 200, second.text
     answer = second.json()
     assert answer == client.get(f"/sessions/{session_id}").json()
@@ -62,17 +62,17 @@ def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, p
     assert answer["expires_at"] > first["expires_at"]
     assert client.delete(f"/sessions/{session_id}").status_code == 204
     assert_problem(client.get(f"/sessions/{session_id}"), 404, "unknown-session")
-    assert_problem(send(client, session_id, panorama), 404, "unknown-session")
+    assert_problem(send(client, session_id, sphere), 404, "unknown-session")
     assert_problem(client.delete(f"/sessions/{session_id}"), 404, "unknown-session")
 
 
-def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     session_id = begin(client, plan_id)
-    assert send(client, session_id, panorama, number=1).status_code == 200
-    problem = assert_problem(send(client, session_id, panorama, number=1), 409, "photograph-out-of-order")
+    assert send(client, session_id, sphere, number=1).status_code == 200
+    problem = assert_problem(send(client, session_id, sphere, number=1), 409, "photograph-out-of-order")
     assert "number is 1; the next photograph" in problem["detail"]
     assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
-    assert send(client, session_id, panorama, number=2).status_code == 200
+    assert send(client, session_id, sphere, number=2).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -112,25 +112,25 @@ def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, 
     ],
 )
 def test_impossible_motion_is_refused(
-    client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], slug: str, message: str
+    client: httpx.Client, plan_id: str, sphere: bytes, fields: dict[str, Any], slug: str, message: str
 ) -> None:
     session_id = begin(client, plan_id)
-    problem = assert_problem(send(client, session_id, panorama, **fields), 422, slug)
+    problem = assert_problem(send(client, session_id, sphere, **fields), 422, slug)
     assert message in json.dumps(problem)
     # The session is free and unchanged.
-    assert send(client, session_id, panorama, number=1).status_code == 200
+    assert send(client, session_id, sphere, number=1).status_code == 200
 
 
-def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     session_id = begin(client, plan_id)
     assert_problem(send(client, session_id, b"no picture"), 422, "invalid-photograph")
-    assert send(client, session_id, panorama, number=1).status_code == 200
+    assert send(client, session_id, sphere, number=1).status_code == 200
 
 
-def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     session_id = begin(client, plan_id)
     answers: list[httpx.Response] = []
-    threads = [threading.Thread(target=lambda: answers.append(send(client, session_id, panorama))) for _ in range(4)]
+    threads = [threading.Thread(target=lambda: answers.append(send(client, session_id, sphere))) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -159,33 +159,33 @@ def test_impossible_session_is_refused(client: httpx.Client, plan_id: str, field
     assert_problem(client.post("/sessions", json={"floorplan_id": plan_id} | fields), 422, slug)
 
 
-def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     session_id = begin(client, plan_id, rooms=["kitchen"])
-    assert send(client, session_id, panorama).json()["pose"]["room"] == "kitchen"
+    assert send(client, session_id, sphere).json()["pose"]["room"] == "kitchen"
 
 
-def test_replaced_plan_ends_its_sessions(client: httpx.Client, panorama: bytes) -> None:
+def test_replaced_plan_ends_its_sessions(client: httpx.Client, sphere: bytes) -> None:
     own = upload(client)
     session_id = begin(client, own)
     client.put(f"/floorplans/{own}", json=FLAT | {"name": "changed", "ceiling_height_m": 2.6}).raise_for_status()
-    assert_problem(send(client, session_id, panorama), 409, "session-outdated")
+    assert_problem(send(client, session_id, sphere), 409, "session-outdated")
     client.delete(f"/floorplans/{own}").raise_for_status()
     assert_problem(client.get(f"/sessions/{session_id}"), 404, "unknown-session")
 
 
-def test_session_survives_a_restart(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_session_survives_a_restart(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
-        before = send(client, session_id, panorama).json()
+        before = send(client, session_id, sphere).json()
     with start_app(tmp_path) as client:
         assert client.get(f"/sessions/{session_id}").json() == before
-        after = send(client, session_id, panorama, number=2, forward_m=0, turn_deg=0)
+        after = send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
         assert after.json()["photographs"] == 2, after.text
 
 
 @pytest.mark.slow
 def test_sessions_expire_and_are_limited(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path, session_ttl_s=1.0, max_sessions=2) as client:
         own = upload(client)
@@ -193,7 +193,7 @@ def test_sessions_expire_and_are_limited(
         assert_problem(client.post("/sessions", json={"floorplan_id": own}), 507, "too-many-sessions")
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"] > 0
         sleep(1.1)
-        assert_problem(send(client, first, panorama), 404, "unknown-session")
+        assert_problem(send(client, first, sphere), 404, "unknown-session")
         begin(client, own)
         store = Store(database_of(tmp_path))
         sleep(1.1)
@@ -238,7 +238,7 @@ UPPER = FLAT | {"name": "upper", "rooms": [STAIRS, {"name": "attic", "polygon": 
 @pytest.mark.parametrize("chosen", [False, True], ids=["all plans", "chosen plans"])
 @pytest.mark.one_replica
 def test_session_in_a_venue_names_the_plan(
-    client: httpx.Client, panorama: bytes, monkeypatch: pytest.MonkeyPatch, chosen: bool
+    client: httpx.Client, sphere: bytes, monkeypatch: pytest.MonkeyPatch, chosen: bool
 ) -> None:
     lower, upper = upload(client, FLAT | {"rooms": [*FLAT["rooms"], STAIRS]}), upload(client, UPPER)
     venue_id = venue_of(client, lower, upper)
@@ -249,7 +249,7 @@ def test_session_in_a_venue_names_the_plan(
     assert (empty["venue_id"], empty["floorplan_id"], empty["floorplan_revision"]) == (venue_id, None, None)
     for number in (1, 2, 3):
         motion = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
-        sent = send(client, session_id, panorama, number=number, **motion)
+        sent = send(client, session_id, sphere, number=number, **motion)
         assert sent.status_code == 200, sent.text
     answer = sent.json()
     levels = {lower: 0.0, upper: 1.0}
@@ -261,11 +261,11 @@ def test_session_in_a_venue_names_the_plan(
 
 
 @pytest.mark.parametrize("change", ["plan replaced", "plan deleted", "venue changed", "venue deleted"])
-def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, panorama: bytes, change: str) -> None:
+def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, sphere: bytes, change: str) -> None:
     plan_ids = [upload(client), upload(client, UPPER)]
     venue_id = venue_of(client, *plan_ids)
     session_id = begin_in(client, venue_id)
-    send(client, session_id, panorama).raise_for_status()
+    send(client, session_id, sphere).raise_for_status()
     stored = client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"]
     if change == "plan replaced":
         for plan_id in plan_ids:
@@ -276,10 +276,10 @@ def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, panorama: b
         client.patch(f"/venues/{venue_id}", json={"remove": [plan_ids[1]]}).raise_for_status()
     else:
         client.delete(f"/venues/{venue_id}").raise_for_status()
-        assert_problem(send(client, session_id, panorama), 404, "unknown-session")
+        assert_problem(send(client, session_id, sphere), 404, "unknown-session")
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"] < stored
         return
-    problem = assert_problem(send(client, session_id, panorama), 409, "session-outdated")
+    problem = assert_problem(send(client, session_id, sphere), 409, "session-outdated")
     assert venue_id in problem["detail"]
 
 
@@ -294,11 +294,11 @@ def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, plan_id:
 
 
 def test_session_of_an_earlier_version_goes_on(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
-        before = send(client, session_id, panorama).json()
+        before = send(client, session_id, sphere).json()
         store = Store(database_of(tmp_path))
         record = store.sessions.claim("default", session_id, None, "0" * 32)
         assert record.state is not None
@@ -308,7 +308,7 @@ def test_session_of_an_earlier_version_goes_on(
             del place["floorplan_id"], place["level"]
         store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
         store.close()
-        after = send(client, session_id, panorama, forward_m=0, turn_deg=0)
+        after = send(client, session_id, sphere, forward_m=0, turn_deg=0)
         assert after.status_code == 200, after.text
         # `finish` counted a photograph.
         assert after.json()["photographs"] == 3
@@ -328,13 +328,13 @@ def _first_version(state: bytes) -> bytes:
 
 
 @pytest.mark.slow
-def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
         stored, answers = [], []
         for number in range(1, 241):
             motion = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
-            answer = send(client, session_id, panorama, number=number, **motion)
+            answer = send(client, session_id, sphere, number=number, **motion)
             answers.append(len(answer.content))
             stored.append(client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"])
         assert [point["number"] for point in answer.json()["path"]] == list(range(41, 241))
@@ -344,10 +344,10 @@ def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_pat
         assert max(stored) < 200_000
 
 
-def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     session_id = begin(client, plan_id)
 
-    def keyed(key: str, picture: bytes = panorama, **fields: str) -> httpx.Response:
+    def keyed(key: str, picture: bytes = sphere, **fields: str) -> httpx.Response:
         url, files = f"/sessions/{session_id}/photographs", {"photo": ("p.jpg", picture, "image/jpeg")}
         return client.post(url, data=fields, files=files, headers={"Idempotency-Key": key})
 
@@ -367,7 +367,7 @@ def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: s
 
 @pytest.mark.one_replica
 def test_request_whose_answer_was_not_kept_moves_the_camera_once(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_arguments: object) -> None:
         raise StoreUnavailableError()
@@ -376,7 +376,7 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
         session_id = begin(client, upload(client))
 
         def photograph() -> httpx.Response:
-            files = {"photo": ("p.jpg", panorama, "image/jpeg")}
+            files = {"photo": ("p.jpg", sphere, "image/jpeg")}
             return client.post(f"/sessions/{session_id}/photographs", files=files, headers={"Idempotency-Key": "key"})
 
         with monkeypatch.context() as patch:
@@ -390,4 +390,4 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
         store.close()
         assert photograph().json() == first.json()
         assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
-        assert send(client, session_id, panorama).json()["photographs"] == 2
+        assert send(client, session_id, sphere).json()["photographs"] == 2

@@ -90,15 +90,15 @@ def _metric(client: httpx.Client, sample: str) -> float:
     return float(match[1]) if match else 0.0
 
 
-def test_query_has_one_log_line(client: httpx.Client, log: Log, panorama: bytes) -> None:
+def test_query_has_one_log_line(client: httpx.Client, log: Log, sphere: bytes) -> None:
     plan_id = upload(client)
-    response = localise(client, plan_id, panorama, refine="vdr")
+    response = localise(client, plan_id, sphere, refine="vdr")
     (line,) = log.of_request(response.headers["x-request-id"])
     assert line.keys() >= {"time", "level", "request_id", "trace_id", "span_id", "revision"}
     assert line["level"] == "info"
     assert (line["method"], line["route"], line["status"]) == ("POST", "/localise", 200)
     assert (line["plan"], line["stage"], line["gave_up"], line["rejection"]) == (plan_id, "vdr", False, None)
-    assert line["bytes_in"] > len(panorama)
+    assert line["bytes_in"] > len(sphere)
     assert set(line["stages_ms"]) == {"upload", "decode", "encode", "grid", "retrieve", "vdr"}
     assert 0.0 < sum(line["stages_ms"].values()) <= line["ms"] + 1.0
     assert line["stages_ms"]["encode"] == pytest.approx(response.json()["timings_ms"]["encode"], abs=0.1)
@@ -153,7 +153,7 @@ def test_disconnect_is_counted_and_logged(client: httpx.Client, log: Log) -> Non
     assert _metric(client, gone) == before + 1.0
 
 
-def test_log_has_no_keys_or_queries(client: httpx.Client, log: Log, panorama: bytes) -> None:
+def test_log_has_no_keys_or_queries(client: httpx.Client, log: Log, sphere: bytes) -> None:
     plan_id = upload(client)
     headers = {"Authorization": "Bearer very-secret", "Cookie": "very-secret"}
     for method, path in [
@@ -311,10 +311,10 @@ def test_unsampled_trace_is_not_exported() -> None:
 
 
 @pytest.mark.slow
-def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_collector_receives_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with collector() as (endpoint, received), start_app(tmp_path, otlp_endpoint=endpoint) as client:
         plan_id = upload(client, FLAT)
-        answered = localise(client, plan_id, panorama, refine="vdr").headers["traceparent"].split("-")
+        answered = localise(client, plan_id, sphere, refine="vdr").headers["traceparent"].split("-")
         # Spans are sent in batches; the test does not wait for the last batch.
         wait_for(lambda: any(span.name == "POST /localise" for span in received), 20.0)
     (request,) = [span for span in received if span.name == "POST /localise"]

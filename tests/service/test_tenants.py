@@ -259,7 +259,7 @@ def _usage(client: httpx.Client) -> dict[str, Any]:
     return client.get("/usage").json()["stored_bytes"]
 
 
-def test_full_tenant_is_refused_and_can_delete(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_full_tenant_is_refused_and_can_delete(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     padded = json.dumps(FLAT).encode() + b" " * MIB
     headers = {"content-type": "application/json"}
     with start_app(tmp_path, max_stored_bytes=4 * MIB, keep_answers_s=60.0) as client:
@@ -275,7 +275,7 @@ def test_full_tenant_is_refused_and_can_delete(start_app: StartApp, tmp_path: Pa
         assert sum(used["by_kind"].values()) == used["used"]
         put = client.put(f"/floorplans/{plans[0]}", content=padded, headers=headers)
         assert_problem(put, 507, "storage-quota")
-        assert localise(client, plans[0], panorama).status_code == 200
+        assert localise(client, plans[0], sphere).status_code == 200
         for plan_id in plans:
             assert client.delete(f"/floorplans/{plan_id}").status_code == 204
         left = _usage(client)

@@ -149,16 +149,16 @@ def test_plan_that_cannot_be_read_gets_no_place(tmp_path: Path) -> None:
 @pytest.mark.one_replica
 @pytest.mark.parametrize(("kind", "version"), CASES)
 def test_data_of_a_released_version_are_used(
-    version: str, script: str, url: str, start_app: StartApp, panorama: bytes, tmp_path: Path
+    version: str, script: str, url: str, start_app: StartApp, sphere: bytes, tmp_path: Path
 ) -> None:
     key = re.search(r"^-- key (\S+)$", script, re.MULTILINE)
     with start_app(tmp_path, database_url=url, api_keys=key is not None) as client:
         if key is not None:
             client.headers["Authorization"] = f"Bearer {key[1]}"
-        _assert_works(client, version, script, panorama)
+        _assert_works(client, version, script, sphere)
 
 
-def _assert_works(client: httpx.Client, version: str, script: str, panorama: bytes) -> None:
+def _assert_works(client: httpx.Client, version: str, script: str, sphere: bytes) -> None:
     [plan] = client.get("/floorplans").json()["floorplans"]
     assert plan["name"] == (f"Renamed in {version}" if parts(version) > (0, 1, 0) else f"Flat of {version}")
     address = f"/floorplans/{plan['id']}"
@@ -169,11 +169,11 @@ def _assert_works(client: httpx.Client, version: str, script: str, panorama: byt
         first = re.search(r"^INSERT INTO \"revisions\" VALUES\('(\w+)','\w+',1,", script, re.MULTILINE)
         assert first is not None
         assert client.get(f"{address}?revision={first[1]}").json()["name"] == f"Flat of {version}"
-    answer = localise(client, plan["id"], panorama, heading_deg=0)
+    answer = localise(client, plan["id"], sphere, heading_deg=0)
     assert answer.status_code == 200, answer.text
     if parts(version) >= (0, 3, 0):
         [venue] = client.get("/venues").json()["venues"]
-        answer = client.post("/localise", data={"venue_id": venue["id"], "heading_deg": 0}, files={"photo": panorama})
+        answer = client.post("/localise", data={"venue_id": venue["id"], "heading_deg": 0}, files={"photo": sphere})
         assert answer.json()["floorplan_id"] == plan["id"]
     if parts(version) >= (0, 8, 0):
         [album] = client.get("/albums").json()["albums"]

@@ -109,7 +109,7 @@ def test_body_without_a_length_stops_at_the_limit(
     start_app: StartApp, tmp_path: Path, path: str, media: str, name: str
 ) -> None:
     def endless() -> Iterator[bytes]:
-        begin = b'--x\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
+        begin = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="p"\r\n\r\n'
         yield begin if "multipart" in media else b"["
         for _ in range(100):
             yield b" " * 50_000

@@ -165,7 +165,7 @@ def test_other_changes_leave_the_rows_in_memory(replicas: list[Replica], monkeyp
 
 @pytest.mark.one_replica
 def test_first_queries_share_one_index(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
     built, build = [], PlanIndex.build
@@ -185,7 +185,7 @@ def test_first_queries_share_one_index(
     monkeypatch.setattr(venue_plans.VenuePlans, "needs_choice", chosen)
     with start_app(tmp_path, request_deadline_s=120.0) as client, ThreadPoolExecutor(4) as threads:
         venue_id = venue_of(client, *(upload(client, {**STUDIO, "name": f"{number}"}) for number in range(4)))
-        answers = threads.map(lambda _: ask(client, venue_id, panorama, refine="none"), range(4))
+        answers = threads.map(lambda _: ask(client, venue_id, sphere, refine="none"), range(4))
         assert [answer.status_code for answer in answers] == [200] * 4
     assert len(built) == 1
 
@@ -193,7 +193,7 @@ def test_first_queries_share_one_index(
 @pytest.mark.slow
 @pytest.mark.one_replica
 def test_index_is_kept_for_the_next_query_if_the_first_misses_its_deadline(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
     built, build, missed = [], PlanIndex.build, threading.Event()
@@ -216,17 +216,17 @@ def test_index_is_kept_for_the_next_query_if_the_first_misses_its_deadline(
         venue_id = venue_of(client, *(upload(client, {**STUDIO, "name": f"{number}"}) for number in range(4)))
         # The second one waits for the first one's index, and no longer than its own deadline.
         with ThreadPoolExecutor(2) as threads:
-            answers = list(threads.map(lambda _: ask(client, venue_id, panorama, refine="none"), range(2)))
+            answers = list(threads.map(lambda _: ask(client, venue_id, sphere, refine="none"), range(2)))
         assert [answer.status_code for answer in answers] == [504, 504]
         missed.set()
         assert kept.wait(60.0)
-        assert ask(client, venue_id, panorama, refine="none").status_code == 200
+        assert ask(client, venue_id, sphere, refine="none").status_code == 200
     assert len(built) == 1
 
 
 @pytest.mark.one_replica
 def test_queries_are_right_while_plans_change(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 3)
     with start_app(tmp_path, request_deadline_s=120.0) as client, ThreadPoolExecutor(2) as threads:
@@ -237,7 +237,7 @@ def test_queries_are_right_while_plans_change(
         def answers() -> list[httpx.Response]:
             found = []
             while not ended.is_set() or not found:
-                found.append(ask(client, venue_id, panorama, refine="none"))
+                found.append(ask(client, venue_id, sphere, refine="none"))
             return found
 
         running = [threads.submit(answers) for _ in range(2)]
@@ -254,10 +254,10 @@ def test_queries_are_right_while_plans_change(
         ended.set()
         for response in (response for future in running for response in future.result()):
             assert response.status_code == 200, response.text
-        updated = ask(client, venue_id, panorama, refine="none", top_k=10).json()
+        updated = ask(client, venue_id, sphere, refine="none", top_k=10).json()
     # A new process makes the index anew.
     with start_app(tmp_path, request_deadline_s=120.0) as client:
-        anew = ask(client, venue_id, panorama, refine="none", top_k=10).json()
+        anew = ask(client, venue_id, sphere, refine="none", top_k=10).json()
     assert {plan["floorplan_id"] for plan in updated["plans"]} == {plan["floorplan_id"] for plan in anew["plans"]}
     assert plan_ids[0] not in {plan["floorplan_id"] for plan in updated["plans"]}
     assert updated["confidence"] == pytest.approx(anew["confidence"], abs=1e-6)

@@ -52,9 +52,9 @@ def search(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_level_distinguishes_equal_storeys(
-    client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes, search: str, level: int
+    client: httpx.Client, venue_id: str, storeys: list[str], sphere: bytes, search: str, level: int
 ) -> None:
-    answer = answer_to(client, venue_id, panorama, level=level)
+    answer = answer_to(client, venue_id, sphere, level=level)
     if answer["floorplan_id"] == storeys[3]:
         # This small model cannot tell the flats apart.
         assert answer["warnings"] == [f"level is {level}, which the photograph contradicts: the answer is on level 3"]
@@ -63,32 +63,32 @@ def test_level_distinguishes_equal_storeys(
 
 
 def test_strict_level_excludes_other_levels(
-    client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes, search: str
+    client: httpx.Client, venue_id: str, storeys: list[str], sphere: bytes, search: str
 ) -> None:
-    answer = answer_to(client, venue_id, panorama, level=3, strict="true")
+    answer = answer_to(client, venue_id, sphere, level=3, strict="true")
     assert {candidate["floorplan_id"] for candidate in answer["candidates"]} == {storeys[3]}
     assert answer["level"] == 3.0
 
 
 def test_near_on_earth_applies_to_all_storeys(
-    client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes, search: str
+    client: httpx.Client, venue_id: str, storeys: list[str], sphere: bytes, search: str
 ) -> None:
     near = json.dumps(place(2.0, 1.5))
-    answer = answer_to(client, venue_id, panorama, near=near, radius_m=1.0, strict="true")
+    answer = answer_to(client, venue_id, sphere, near=near, radius_m=1.0, strict="true")
     assert {candidate["floorplan_id"] for candidate in answer["candidates"]} == set(storeys[:3])
     for candidate in answer["candidates"]:
         assert np.hypot(candidate["position"]["x_m"] - 2.0, candidate["position"]["y_m"] - 1.5) <= 1.0 + 1e-3
-    both = answer_to(client, venue_id, panorama, near=near, radius_m=1.0, strict="true", level=2)
+    both = answer_to(client, venue_id, sphere, near=near, radius_m=1.0, strict="true", level=2)
     assert {candidate["floorplan_id"] for candidate in both["candidates"]} == {storeys[2]}
-    east = answer_to(client, venue_id, panorama, near=json.dumps(place(103.0, 1.0)), radius_m=3.0, strict="true")
+    east = answer_to(client, venue_id, sphere, near=json.dumps(place(103.0, 1.0)), radius_m=3.0, strict="true")
     assert {candidate["floorplan_id"] for candidate in east["candidates"]} == {storeys[3]}
 
 
-def test_anchored_venue_accepts_points_in_its_frame(client: httpx.Client, panorama: bytes) -> None:
+def test_anchored_venue_accepts_points_in_its_frame(client: httpx.Client, sphere: bytes) -> None:
     own = upload(client, FLAT | {"anchor": place(0.0, -2.0), "north_deg": 0})
     venue_id = venue_of(client, upload(client), own, anchor=ANCHOR)
     fields = {"near": '{"x_m": 2, "y_m": 0.8}', "radius_m": 0.8, "strict": "true"}
-    answer = answer_to(client, venue_id, panorama, **fields)
+    answer = answer_to(client, venue_id, sphere, **fields)
     for candidate in answer["candidates"]:
         # The second plan's own anchor places its origin 2 m further south.
         y_m = 2.8 if candidate["floorplan_id"] == own else 0.8
@@ -97,20 +97,20 @@ def test_anchored_venue_accepts_points_in_its_frame(client: httpx.Client, panora
 
 
 def test_rooms_apply_to_all_plans_with_them(
-    client: httpx.Client, venue_id: str, storeys: list[str], panorama: bytes
+    client: httpx.Client, venue_id: str, storeys: list[str], sphere: bytes
 ) -> None:
-    answer = answer_to(client, venue_id, panorama, rooms="kitchen", strict="true")
+    answer = answer_to(client, venue_id, sphere, rooms="kitchen", strict="true")
     assert {candidate["room"] for candidate in answer["candidates"]} == {"kitchen"}
-    several = answer_to(client, venue_id, panorama, rooms='["kitchen", "studio"]', strict="true")
+    several = answer_to(client, venue_id, sphere, rooms='["kitchen", "studio"]', strict="true")
     assert {candidate["room"] for candidate in several["candidates"]} <= {"kitchen", "studio"}
 
 
-def test_plans_without_an_anchor_are_warned_about(client: httpx.Client, storeys: list[str], panorama: bytes) -> None:
+def test_plans_without_an_anchor_are_warned_about(client: httpx.Client, storeys: list[str], sphere: bytes) -> None:
     venue_id = venue_of(client, storeys[0], upload(client, STUDIO))
     fields = {"near": json.dumps(place(2.0, 1.5)), "radius_m": 5.0}
-    free = answer_to(client, venue_id, panorama, **fields)
+    free = answer_to(client, venue_id, sphere, **fields)
     assert "1 of the venue's 2 floor plans have no anchor and are not affected by near" in free["warnings"]
-    strict = answer_to(client, venue_id, panorama, strict="true", **fields)
+    strict = answer_to(client, venue_id, sphere, strict="true", **fields)
     assert (
         "1 of the venue's 2 floor plans have no anchor and were not searched, because near is strict"
         in strict["warnings"]
@@ -119,12 +119,12 @@ def test_plans_without_an_anchor_are_warned_about(client: httpx.Client, storeys:
 
 
 def test_room_search_in_some_plans_is_warned_about(
-    client: httpx.Client, venue_id: str, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    client: httpx.Client, venue_id: str, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
-    answer = answer_to(client, venue_id, panorama, rooms='["kitchen", "studio", "living room"]', level=0)
+    answer = answer_to(client, venue_id, sphere, rooms='["kitchen", "studio", "living room"]', level=0)
     assert "the hint rooms was applied to the 2 most probable of 4 floor plans" in answer["warnings"]
-    elsewhere = answer_to(client, venue_id, panorama, rooms="attic")
+    elsewhere = answer_to(client, venue_id, sphere, rooms="attic")
     assert "the hint rooms was applied to the 2 most probable of 4 floor plans" in elsewhere["warnings"]
 
 
@@ -139,13 +139,13 @@ def test_room_search_in_some_plans_is_warned_about(
     ],
 )
 def test_hints_outside_the_venue_are_rejected(
-    client: httpx.Client, venue_id: str, panorama: bytes, fields: dict[str, Any], detail: str
+    client: httpx.Client, venue_id: str, sphere: bytes, fields: dict[str, Any], detail: str
 ) -> None:
-    assert detail in assert_problem(ask(client, venue_id, panorama, **fields), 422, "invalid-hint")["detail"]
+    assert detail in assert_problem(ask(client, venue_id, sphere, **fields), 422, "invalid-hint")["detail"]
 
 
-def test_near_needs_an_anchor(client: httpx.Client, panorama: bytes) -> None:
-    response = ask(client, venue_of(client, upload(client)), panorama, near=json.dumps(place(0.0)), radius_m=10)
+def test_near_needs_an_anchor(client: httpx.Client, sphere: bytes) -> None:
+    response = ask(client, venue_of(client, upload(client)), sphere, near=json.dumps(place(0.0)), radius_m=10)
     assert (
         "neither the venue nor any of its floor plans has an anchor"
         in assert_problem(response, 422, "invalid-hint")["detail"]

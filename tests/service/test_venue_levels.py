@@ -109,7 +109,7 @@ def test_levels_become_a_venue(client: httpx.Client, make: Callable[[], bytes]) 
     assert client.delete(f"/venues/{venue['id']}").status_code == 204
 
 
-def test_levels_of_a_model_are_searched(client: httpx.Client, panorama: bytes) -> None:
+def test_levels_of_a_model_are_searched(client: httpx.Client, sphere: bytes) -> None:
     venue = send(client, ifc_house().content(), name="Haus", ceiling_height_m="2.5").json()
     entries = plans_of(client, venue["id"])
     assert [(entry["name"], entry["level"], entry["rooms"]) for entry in entries] == [
@@ -117,7 +117,7 @@ def test_levels_of_a_model_are_searched(client: httpx.Client, panorama: bytes) -
         ("Haus – Obergeschoss", 1.0, 1),
     ]
     query = {"venue_id": venue["id"], "refine": "none"}
-    answer = client.post("/localise", data=query, files={"panorama": ("p.jpg", panorama, "image/jpeg")}).json()
+    answer = client.post("/localise", data=query, files={"photo": ("p.jpg", sphere, "image/jpeg")}).json()
     assert answer["floorplan_id"] in {entry["floorplan_id"] for entry in entries}
 
 

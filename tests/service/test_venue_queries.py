@@ -33,7 +33,7 @@ def venue_of(client: httpx.Client, *plan_ids: str, **more: Any) -> str:
 
 def ask(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any) -> httpx.Response:
     data = {"venue_id": venue_id} | {name: str(value) for name, value in fields.items()}
-    return client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+    return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})
 
 
 def turned(plan: dict[str, Any]) -> dict[str, Any]:
@@ -80,7 +80,7 @@ def test_right_plan_is_found_among_several(
 
 def test_venue_of_one_plan_equals_the_plan(shipped: httpx.Client, home: str) -> None:
     picture = (EXAMPLES / "kitchen.jpg").read_bytes()
-    files = {"panorama": ("p.jpg", picture, "image/jpeg")}
+    files = {"photo": ("p.jpg", picture, "image/jpeg")}
     alone = shipped.post("/localise", data={"floorplan_id": home, "heading_deg": "250"}, files=files).json()
     found = ask(shipped, venue_of(shipped, home), picture, heading_deg=250).json()
     # Refinement can begin at another grid pose near the place.
@@ -145,7 +145,7 @@ def test_most_probable_plans_are_searched(
 
 @pytest.mark.parametrize("stored", ["NULL", "x'4c4c5032'"], ids=["nothing", "fewer poses"])
 def test_missing_prototypes_are_made(
-    start_app: StartApp, tmp_path: Path, database_of: Any, panorama: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
+    start_app: StartApp, tmp_path: Path, database_of: Any, sphere: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
 ) -> None:
     from service.storage import Store
 
@@ -158,14 +158,14 @@ def test_missing_prototypes_are_made(
             connection.exec_driver_sql(f"UPDATE latent_grids SET prototypes = {value}")
             grid_ids = connection.exec_driver_sql("SELECT id FROM latent_grids").scalars().all()
         assert store.grids.prototypes(grid_ids) == {}
-        assert ask(client, venue_id, panorama, refine="none").status_code == 200
+        assert ask(client, venue_id, sphere, refine="none").status_code == 200
         assert store.grids.prototypes(grid_ids).keys() == set(grid_ids)
         store.close()
 
 
 @pytest.mark.slow
 def test_replaced_plan_is_chosen_by_its_new_revision(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
     indexed = list[int]()
@@ -181,7 +181,7 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
         venue_id = venue_of(client, *plan_ids)
 
         def answer() -> dict[str, Any]:
-            response = ask(client, venue_id, panorama, refine="none")
+            response = ask(client, venue_id, sphere, refine="none")
             assert response.status_code == 200, response.text
             return response.json()
 
@@ -198,7 +198,7 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
     monkeypatch.setattr(StoredGrids, "prototypes", lambda *_: pytest.fail("read of the database"))
     # Again, from the prototype file.
     with start_app(tmp_path, request_deadline_s=60.0) as client:
-        response = ask(client, venue_id, panorama, refine="none")
+        response = ask(client, venue_id, sphere, refine="none")
         assert response.status_code == 200, response.text
         assert response.json()["floorplan_id"] == replaced["floorplan_id"]
 
@@ -223,16 +223,16 @@ BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
 
 @pytest.mark.parametrize(("fields", "field", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS.keys())
 def test_query_needs_exactly_one_of_plan_and_venue(
-    client: httpx.Client, panorama: bytes, fields: dict[str, str], field: str, message: str
+    client: httpx.Client, sphere: bytes, fields: dict[str, str], field: str, message: str
 ) -> None:
-    files = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    files = {"photo": ("p.jpg", sphere, "image/jpeg")}
     problem = assert_problem(client.post("/localise", data=fields, files=files), 422, "invalid-request")
     assert [fault["field"] for fault in problem["errors"]] == [field]
     assert message in problem["detail"]
 
 
-def test_sequence_needs_exactly_one_of_plan_and_venue(client: httpx.Client, panorama: bytes) -> None:
-    files = 2 * [("photo", ("p.jpg", panorama, "image/jpeg"))]
+def test_sequence_needs_exactly_one_of_plan_and_venue(client: httpx.Client, sphere: bytes) -> None:
+    files = 2 * [("photo", ("p.jpg", sphere, "image/jpeg"))]
     for fields, kind in (({}, "is missing"), ({"venue_id": "0" * 32, "floorplan_id": "0" * 32}, "not both")):
         response = client.post("/localise/sequence", data=fields | {"motion": "turn"}, files=files)
         problem = assert_problem(response, 422, "invalid-request")
@@ -241,25 +241,25 @@ def test_sequence_needs_exactly_one_of_plan_and_venue(client: httpx.Client, pano
     assert_problem(unknown, 404, "unknown-venue")
 
 
-def test_unsearchable_venue_is_an_error(client: httpx.Client, panorama: bytes) -> None:
-    assert_problem(ask(client, "0" * 32, panorama), 404, "unknown-venue")
-    assert_problem(ask(client, "no id", panorama), 404, "unknown-venue")
+def test_unsearchable_venue_is_an_error(client: httpx.Client, sphere: bytes) -> None:
+    assert_problem(ask(client, "0" * 32, sphere), 404, "unknown-venue")
+    assert_problem(ask(client, "no id", sphere), 404, "unknown-venue")
     assert (
-        "no floor plans" in assert_problem(ask(client, venue_of(client), panorama), 409, "venue-unsearchable")["detail"]
+        "no floor plans" in assert_problem(ask(client, venue_of(client), sphere), 409, "venue-unsearchable")["detail"]
     )
 
 
-def test_plans_with_too_low_ceilings_are_skipped(client: httpx.Client, plan: str, panorama: bytes) -> None:
+def test_plans_with_too_low_ceilings_are_skipped(client: httpx.Client, plan: str, sphere: bytes) -> None:
     low = upload(client, {**STUDIO, "ceiling_height_m": 2.0})
-    answer = ask(client, venue_of(client, plan, low), panorama, camera_height_m=2.1, refine="none").json()
+    answer = ask(client, venue_of(client, plan, low), sphere, camera_height_m=2.1, refine="none").json()
     assert {entry["floorplan_id"] for entry in answer["plans"]} == {plan}
     assert "ceilings below camera_height_m" in answer["warnings"][0]
-    assert_problem(ask(client, venue_of(client, low), panorama, camera_height_m=2.1), 422, "invalid-pose")
+    assert_problem(ask(client, venue_of(client, low), sphere, camera_height_m=2.1), 422, "invalid-pose")
 
 
 @pytest.mark.slow
 def test_plans_that_are_not_ready_are_warned_about(
-    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, embed = threading.Event(), builder.embed
 
@@ -271,20 +271,20 @@ def test_plans_that_are_not_ready_are_warned_about(
     with start_app(tmp_path, request_deadline_s=5.0) as client:
         wait_for(lambda: client.get("/readyz").status_code == 200)
         ready, hall = upload(client), upload(client, HALL, wait=False)
-        answer = ask(client, venue_of(client, ready, hall), panorama, refine="none")
+        answer = ask(client, venue_of(client, ready, hall), sphere, refine="none")
         assert answer.status_code == 200, answer.text
         assert answer.json()["floorplan_id"] == ready
         assert answer.json()["warnings"] == ["1 of the venue's 2 floor plans are preparing and were not searched"]
-        waiting = ask(client, venue_of(client, hall), panorama, refine="none")
+        waiting = ask(client, venue_of(client, hall), sphere, refine="none")
         problem = assert_problem(waiting, 503, "venue-not-ready")
         assert "none of the 1 floor plans" in problem["detail"]
         assert int(waiting.headers["retry-after"]) >= 1
         go_on.set()
 
 
-def test_deleted_plan_is_not_searched(client: httpx.Client, plan: str, panorama: bytes) -> None:
+def test_deleted_plan_is_not_searched(client: httpx.Client, plan: str, sphere: bytes) -> None:
     leaving = upload(client, STUDIO)
     venue_id = venue_of(client, plan, leaving)
-    assert len(ask(client, venue_id, panorama, refine="none").json()["plans"]) == 2
+    assert len(ask(client, venue_id, sphere, refine="none").json()["plans"]) == 2
     client.delete(f"/floorplans/{leaving}")
-    assert [entry["floorplan_id"] for entry in ask(client, venue_id, panorama, refine="none").json()["plans"]] == [plan]
+    assert [entry["floorplan_id"] for entry in ask(client, venue_id, sphere, refine="none").json()["plans"]] == [plan]

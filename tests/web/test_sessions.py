@@ -51,13 +51,13 @@ def test_photographs_one_after_the_other_are_followed(phone: Visit) -> None:
 
 @pytest.mark.slow
 def test_session_of_another_client_is_shown_live(desktop: Visit, plan_id: str) -> None:
-    panorama = (EXAMPLES / "kitchen.jpg").read_bytes()
+    sphere = (EXAMPLES / "kitchen.jpg").read_bytes()
     session_id = begin(desktop.client, plan_id)
-    send(desktop.client, session_id, panorama).raise_for_status()
+    send(desktop.client, session_id, sphere).raise_for_status()
     page = desktop.open(f"/#session={session_id}")
     expect(page.locator("#plan-name")).to_have_text("Followed flat")
     expect(page.locator("#session-pose")).to_contain_text("after 1 photograph")
-    send(desktop.client, session_id, panorama, forward_m=0, turn_deg=0).raise_for_status()
+    send(desktop.client, session_id, sphere, forward_m=0, turn_deg=0).raise_for_status()
     expect(page.locator("#session-pose")).to_contain_text("after 2 photographs")
     expect(page.locator("#plan .session .step")).to_have_count(2)
     # The session of another client goes on when this page stops to show it.

@@ -32,7 +32,7 @@ class Benchmark:
     and `stated` what is known of it. `settings` are those of method "lalaloc".
     """
 
-    kind: QueryKind = "panorama"
+    kind: QueryKind = "photograph"
     furniture: str = "full"
     heading_known: bool = True
     heldout: bool = False
@@ -45,9 +45,9 @@ class Benchmark:
 
 _BENCHMARKS = {
     "layout": Benchmark(kind="layout"),
-    "panorama_full": Benchmark(),
-    "panorama_empty": Benchmark(furniture="empty", minor=True),
-    "panorama_full_unknown_heading": Benchmark(heading_known=False),
+    "sphere_full": Benchmark(),
+    "sphere_empty": Benchmark(furniture="empty", minor=True),
+    "sphere_full_unknown_heading": Benchmark(heading_known=False),
     "heldout_full": Benchmark(heldout=True, minor=True),
     "heldout_full_unknown_heading": Benchmark(heldout=True, heading_known=False, minor=True),
     "heldout_empty": Benchmark(heldout=True, furniture="empty", minor=True),
@@ -120,7 +120,7 @@ def run_benchmark(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Pa
         generated=generated,
         views=None if benchmark.view_deg is None else {"field_deg": benchmark.view_deg, "stated": benchmark.stated},
         bundle=str(bundle.folder),
-        furniture=benchmark.furniture if benchmark.kind == "panorama" else None,
+        furniture=benchmark.furniture if benchmark.kind == "photograph" else None,
         heading_known=benchmark.heading_known,
     )
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:

@@ -23,7 +23,7 @@ _MAX_HOMES = 100
 
 
 def bench_azimuths(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure walls and openings in furnished test and out-of-distribution homes, 4 panoramas per home."""
+    """Measure walls and openings in furnished test and out-of-distribution homes, 4 spheres per home."""
     # Needs embree, from the extra `oracle`.
     from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
 
@@ -57,7 +57,7 @@ def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, 
 def _measure(
     encoders: PhotographEncoder, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]
 ) -> AzimuthMeasures:
-    """Compare the predictions from a panorama with the plan around the camera."""
+    """Compare the predictions from a sphere with the plan around the camera."""
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
     pose = (camera.position_m[None], heading, room, plan.geometry, len(log_m), camera.camera_height_m)

@@ -23,7 +23,7 @@ from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.foreign import without_openings
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.photograph.cameras import Perspective
 
@@ -39,11 +39,11 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
     home = home_of_area(100.0)
     shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
     materials = MaterialLibrary.create(np.random.default_rng(1), textures)
-    images = PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()
+    images = SphereRenderer(materials, height=512, width=1024).render(shots).numpy()
     pictures = [encode_jpeg(image) for image in images]
     with running_service(bundle.folder) as (client, process):
         plan_id, bare_id = _upload(client, home.plan), _upload(client, without_openings(home.plan))
-        report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
+        report: dict[str, Any] = {"requests": _REQUESTS, "sphere": "1024x512 JPEG"}
         heights = [{"camera_height_m": f"{shot.home.plan.camera_height_m}"} for shot in shots]
         headings = [{"heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
         rows = {

@@ -115,7 +115,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
                 camera_height_m=shots[0].camera_height_m,
                 photographs={},
             ),
-            kind="panorama",
+            kind="photograph",
             photograph=RenderedPhotograph(replace(shot, camera_height_m=shots[0].camera_height_m), renderers),
         )
         for index, shot in enumerate(shots)
@@ -139,19 +139,19 @@ def _mean_seconds(method: Method, questions: Sequence[Question]) -> float:
 
 
 _SCENES = 48
-_PANORAMA_HEIGHT = 256
+_SPHERE_HEIGHT = 256
 _QUERIES = 300
 
 
 def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
-    """Measure writing synthetic test scenes, reading their annotations, and localising 300 panoramas.
+    """Measure writing synthetic test scenes, reading their annotations, and localising 300 spheres.
 
     Each takes one process per core.
     """
     cores = os.cpu_count() or 1
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as scratch:
         root = Path(scratch) / "scenes"
-        settings = Synthesis(root=root, height=_PANORAMA_HEIGHT, textures=textures)
+        settings = Synthesis(root=root, height=_SPHERE_HEIGHT, textures=textures)
         begin = time.perf_counter()
         synthesise(settings, share_out(_SCENES, "test"), workers=cores)
         writing = time.perf_counter() - begin
@@ -178,12 +178,12 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
         begin = time.perf_counter()
         answered = len(run_evaluation(RunFolder(Path(scratch) / "run"), info))
         evaluating = time.perf_counter() - begin
-    panoramas = PICTURES_PER_ROOM * sum(cameras)
+    spheres = PICTURES_PER_ROOM * sum(cameras)
     return {
-        "panorama_height": _PANORAMA_HEIGHT,
+        "sphere_height": _SPHERE_HEIGHT,
         "scenes": len(names),
-        "panoramas_written": panoramas,
-        "panoramas_written_per_second": panoramas / writing,
+        "spheres_written": spheres,
+        "spheres_written_per_second": spheres / writing,
         "scenes_read_per_second": len(names) / reading,
         "queries": answered,
         "evaluation_seconds": evaluating,

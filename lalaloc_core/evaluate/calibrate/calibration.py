@@ -101,7 +101,7 @@ def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
     if not (config.keep_evidence and config.openings_weight is None and config.tail is None):
         bundle = store_matching_weights(bundle, with_heading_doubt(weights, known, searched), views=views)
     description = (
-        f"{len(known.own)} {'views' if views else 'panoramas'} of {config.homes} generated validation homes, all "
+        f"{len(known.own)} {'views' if views else 'spheres'} of {config.homes} generated validation homes, all "
         "furniture levels; confidence besides on the same disturbed, and on "
         f"{len(known.mismatched)} photographs of others or of no room"
     )

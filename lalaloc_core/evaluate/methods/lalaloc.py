@@ -98,7 +98,7 @@ class LaLaLoc:
             stage: dataclasses.asdict(values) for stage, values in found.signals.items()
         }
         # The confidence model is fitted on photographs and the default matching cost.
-        calibrated = question.kind == "panorama" and self._config.matching == MatchingConfig()
+        calibrated = question.kind == "photograph" and self._config.matching == MatchingConfig()
         confidence = found.confidence(self.encoders.manifest.confidence_for(view=query.is_view)) if calibrated else None
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
@@ -150,7 +150,7 @@ def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
 
 
 def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the photograph of a panorama query at the encoder's size; None for layout queries.
+    """Return the photograph of the query at the encoder's size; None for layout queries.
 
     Raises:
         DatasetError: the photograph cannot be read.
@@ -184,7 +184,7 @@ def encode(
 
 
 def found_pose(query: Query, candidate: Candidate) -> Pose:
-    """Return a candidate as a pose of the panorama."""
+    """Return a candidate as a pose of the sphere."""
     heading = photograph_heading(query, candidate)
     return Pose.at(candidate.position_m, candidate.room_index, heading, candidate.cost)
 

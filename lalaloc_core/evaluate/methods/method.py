@@ -16,8 +16,9 @@ from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph
 from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 
-# "layout": the query is the error-free layout of the true pose; "panorama": a photograph, or its depth for ICP.
-QueryKind = Literal["layout", "panorama"]
+# "layout": the query is the error-free layout of the true pose; "photograph": a photograph, or its depth for ICP.
+QueryKind = Literal["layout", "photograph"]
+EARLIER_KINDS = {"panorama": "photograph"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +52,7 @@ class Question:
         return profiles_at(self.plan, self.camera.position_m[None], room, np.zeros(1), columns)[0]
 
     def require_photograph(self) -> DatasetPhotograph:
-        """Return the photograph of a panorama query."""
+        """Return the photograph of the query."""
         if self.photograph is None:
             raise InvalidInputError(f"this {self.kind} query has no photograph; the method needs one")
         return self.photograph

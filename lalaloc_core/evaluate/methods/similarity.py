@@ -196,7 +196,7 @@ class DepthGrid(_Grid):
 
 
 class EdgeGrid(_Grid):
-    """2-D Chamfer distance (pixels) between the edges of layouts as panoramas, which wrap around horizontally."""
+    """2-D Chamfer distance (pixels) between the edges of layouts as spheres, which wrap around horizontally."""
 
     def __init__(
         self, plan: FloorPlan, poses: PoseSet, camera_height_m: float, *, rows: int = 64, columns: int = 128

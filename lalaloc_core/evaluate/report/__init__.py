@@ -1,7 +1,7 @@
 """Reports on evaluation runs: an HTML page, contact sheets of the worst queries, annotated photographs.
 
 Begin with `html.py`, the page. `worst.py` draws the worst queries, `photograph_report.py` evaluates photographs of real
-rooms; `pictures.py` draws plans and panoramas for all of them, `charts.py` draws the charts.
+rooms; `pictures.py` draws plans and spheres for all of them, `charts.py` draws the charts.
 """
 
 from lalaloc_core.evaluate.report.html import write_report

@@ -13,12 +13,12 @@ from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.report.pictures import (
-    PANORAMA_HEIGHT,
-    PANORAMA_WIDTH,
+    SPHERE_HEIGHT,
+    SPHERE_WIDTH,
     DrawnMap,
     EncodedPicture,
     draw_map,
-    draw_panorama,
+    draw_sphere,
 )
 from lalaloc_core.evaluate.report.reading import Run
 from lalaloc_core.evaluate.report.reopening import ReopenedRun
@@ -140,7 +140,7 @@ class _CardWriter:
             heading_error_deg=None if pose is None else float(self._heading_errors_deg[index]),
             confidence=prediction.confidence,
             pictures=(
-                *self._panorama(scene, camera, prediction),
+                *self._sphere(scene, camera, prediction),
                 *(
                     draw_map(scene.plan, drawn, prediction.truth, pose)
                     for drawn in _maps(question, self._encoders, self._left_out)
@@ -148,13 +148,13 @@ class _CardWriter:
             ),
         )
 
-    def _panorama(self, scene: Scene, camera: Camera, prediction: Prediction) -> list[EncodedPicture]:
+    def _sphere(self, scene: Scene, camera: Camera, prediction: Prediction) -> list[EncodedPicture]:
         try:
-            image = self._reopened.photograph(scene, camera).image(PANORAMA_HEIGHT, PANORAMA_WIDTH)
+            image = self._reopened.photograph(scene, camera).image(SPHERE_HEIGHT, SPHERE_WIDTH)
         except (LaLaLocError, OSError) as error:
-            self._left_out.append(f"A panorama is left out: {error}.")
+            self._left_out.append(f"A sphere is left out: {error}.")
             return []
-        return [draw_panorama(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.final_pose)]
+        return [draw_sphere(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.final_pose)]
 
 
 def _open_encoders(run: ReopenedRun, left_out: list[str]) -> PhotographEncoder | None:

@@ -1,4 +1,4 @@
-"""Pictures of queries: a panorama with layouts, a plan with maps of distances, and contact sheets of many."""
+"""Pictures of queries: a sphere with layouts, a plan with maps of distances, and contact sheets of many."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.sweep import profiles_at
 
-PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
+SPHERE_HEIGHT, SPHERE_WIDTH = 384, 768
 TRUE_COLOUR, FOUND_COLOUR, PREDICTED_COLOUR = TRUE, FOUND, "#ffd60a"
 _JPEG_QUALITY = 82
 # Pixels of a map: width, header, footer and margin.
@@ -60,10 +60,10 @@ class DrawnMap:
     distance: Float[np.ndarray, "n"]
 
 
-def draw_panorama(
+def draw_sphere(
     image: UInt8[np.ndarray, "h w 3"], plan: FloorPlan, camera_height_m: float, truth: Pose, found: Pose | None
 ) -> EncodedPicture:
-    """Draw a panorama with the floor and ceiling lines of the true and the found layout."""
+    """Draw a sphere with the floor and ceiling lines of the true and the found layout."""
     height, width, _ = image.shape
     # The true lines are wider and below, so that both are visible where they coincide.
     strokes = [
@@ -74,14 +74,14 @@ def draw_panorama(
     buffer = io.BytesIO()
     draw_strokes(image, strokes).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
     shown = "the true layout" if found is None else "the true and the found layout"
-    alt = f"Panorama with the outlines of {shown} drawn over it"
-    return EncodedPicture(name="panorama", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
+    alt = f"Sphere with the outlines of {shown} drawn over it"
+    return EncodedPicture(name="sphere", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
 
 
 def layout_lines(
     plan: FloorPlan, pose: Pose, camera_height_m: float, height: int, width: int
 ) -> list[Float[np.ndarray, "{width} 2"]]:
-    """Return the floor and ceiling lines of a pose's room, as pixels (x, y) of its panorama."""
+    """Return the floor and ceiling lines of a pose's room, as pixels (x, y) of its sphere."""
     position_m, heading = pose.position_m[None], np.array([pose.heading])
     profile = profiles_at(plan, position_m, np.array([pose.room_index]), heading, width)[0]
     over_floor, under_ceiling = camera_height_m, float(plan.ceiling_heights_m[pose.room_index]) - camera_height_m

@@ -72,6 +72,6 @@ class ReopenedRun:
             grid_step_m=info.grid_step_m,
             camera=camera,
             kind=info.kind,
-            photograph=self.photograph(scene, camera) if info.kind == "panorama" else None,
+            photograph=self.photograph(scene, camera) if info.kind == "photograph" else None,
             heading_known=info.heading_known,
         )

@@ -1,6 +1,6 @@
 """The worst queries of a run: contact sheets, and statistics of their common features.
 
-FOLDER/worst-01.png ...   panoramas with the true, the found and the predicted layout, the worst first
+FOLDER/worst-01.png ...   spheres with the true, the found and the predicted layout, the worst first
 FOLDER/worst.json         common features, and every query
 """
 

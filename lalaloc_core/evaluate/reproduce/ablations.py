@@ -59,7 +59,7 @@ _SMALL = TrainConfig(
 )
 _BASES: dict[Budget, TrainConfig] = {
     "small": _SMALL,
-    # The paper's queries have a known heading, so panoramas are not turned.
+    # The paper's queries have a known heading, so spheres are not turned.
     "full": dataclasses.replace(PRESETS["paper"], turns="none"),
 }
 

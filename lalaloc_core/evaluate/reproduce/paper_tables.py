@@ -16,7 +16,7 @@ from lalaloc_core.evaluate.runs.predictions import MethodName
 _ACCURACY = ("median_cm", "within_1cm", "within_5cm", "within_10cm", "within_1m")
 _RECALL = ("layout_recall", "pose_recall")
 _RETRIEVAL = (*_RECALL, "median_cm")
-_LAYOUT, _PANORAMA = "Layout", "Panorama"
+_LAYOUT, _PHOTOGRAPH = "Layout", "Photograph"
 _TIMES: tuple[Column, ...] = ("seconds:retrieve", "seconds:vdr", "seconds:lpo", "seconds")
 _ORACLE, _ICP_DEPTH = "Oracle (nearest layout by Chamfer)", "2D ICP on furnished depth"
 _PAPER, _OURS = "LaLaLoc `paper`", "LaLaLoc, shipped model"
@@ -30,7 +30,7 @@ def _paper(columns: Sequence[Column], *figures: float | None) -> dict[Column, fl
     return {column: figure for column, figure in zip(columns, figures, strict=True) if figure is not None}
 
 
-def _lalaloc(model: str, kind: QueryKind = "panorama", **query: Any) -> RowQuery:
+def _lalaloc(model: str, kind: QueryKind = "photograph", **query: Any) -> RowQuery:
     return RowQuery(method="lalaloc", model=model, kind=kind, **query)
 
 
@@ -54,11 +54,11 @@ def _localisation() -> Table:
         _row(_LAYOUT, "VDR + decode, shipped model", decode_layout),
         _row(_LAYOUT, _PAPER, _lalaloc("paper", "layout"), columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
         _row(_LAYOUT, _OURS, _lalaloc(SHIPPED, "layout")),
-        _row(_PANORAMA, _ICP_DEPTH, _ICP, columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
-        _row(_PANORAMA, _HORIZON_NET, explicit, columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
-        _row(_PANORAMA, "VDR + decode, shipped model", decode),
-        _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
-        _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
+        _row(_PHOTOGRAPH, _ICP_DEPTH, _ICP, columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
+        _row(_PHOTOGRAPH, _HORIZON_NET, explicit, columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
+        _row(_PHOTOGRAPH, "VDR + decode, shipped model", decode),
+        _row(_PHOTOGRAPH, _PAPER, _lalaloc("paper"), columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
+        _row(_PHOTOGRAPH, _OURS, _lalaloc(SHIPPED)),
     )
     return _table("localisation", "Localisation with a floor plan prior", "tab:localisation", columns, *rows)
 
@@ -70,9 +70,9 @@ def _coarse_grid() -> Table:
         _row(_LAYOUT, "2D ICP", _ICP_LAYOUT, columns, 0.7, 0.769, 0.994, 0.996),
         _row(_LAYOUT, _PAPER, _lalaloc("paper", "layout"), columns, 0.5, 0.561, 0.705, 0.843),
         _row(_LAYOUT, _OURS, _lalaloc(SHIPPED, "layout")),
-        _row(_PANORAMA, _ICP_DEPTH, _ICP, columns, 21.7, 0.073, 0.347, 0.694),
-        _row(_PANORAMA, _PAPER, _lalaloc("paper"), columns, 11.5, 0.026, 0.461, 0.795),
-        _row(_PANORAMA, _OURS, _lalaloc(SHIPPED)),
+        _row(_PHOTOGRAPH, _ICP_DEPTH, _ICP, columns, 21.7, 0.073, 0.347, 0.694),
+        _row(_PHOTOGRAPH, _PAPER, _lalaloc("paper"), columns, 11.5, 0.026, 0.461, 0.795),
+        _row(_PHOTOGRAPH, _OURS, _lalaloc(SHIPPED)),
     )
     coarse = [replace(row, query=replace(row.query, grid_step_m=1.0)) for row in rows]
     return _table("coarse-grid", "Localisation on a 1 m grid", "tab:1m_refinement", columns, *coarse)
@@ -199,8 +199,8 @@ TABLES: tuple[Table, ...] = (
         "tab:e2e",
         _trained(_LAYOUT, "End-to-end", "end-to-end", "layout", 0.811, 0.804, 20.9),
         _trained(_LAYOUT, "Two-stage *", "paper", "layout", 0.893, 0.876, 19.9),
-        _trained(_PANORAMA, "End-to-end", "end-to-end", "panorama", 0.244, 0.237, 62.7),
-        _trained(_PANORAMA, "Two-stage *", "paper", "panorama", 0.707, 0.705, 21.7),
+        _trained(_PHOTOGRAPH, "End-to-end", "end-to-end", "photograph", 0.244, 0.237, 62.7),
+        _trained(_PHOTOGRAPH, "Two-stage *", "paper", "photograph", 0.707, 0.705, 21.7),
     ),
     _ablation(
         "layout-losses",
@@ -224,10 +224,10 @@ TABLES: tuple[Table, ...] = (
         "Losses of the image branch",
         "tab:rgblearning",
         _ORACLE_ON_VALIDATION,
-        _trained(_PANORAMA, "L2 *", "paper", "panorama", 0.707, 0.705, 21.7),
-        _trained(_PANORAMA, "log-ratio′", "image-log-ratio", "panorama", 0.596, 0.569, 25.1),
-        _trained(_PANORAMA, "L2 + log-ratio′", "image-l2-log-ratio", "panorama", 0.607, 0.599, 24.6),
-        _trained(_PANORAMA, "L2 + distilled log-ratio", "image-l2-kd", "panorama", 0.589, 0.569, 25.0),
+        _trained(_PHOTOGRAPH, "L2 *", "paper", "photograph", 0.707, 0.705, 21.7),
+        _trained(_PHOTOGRAPH, "log-ratio′", "image-log-ratio", "photograph", 0.596, 0.569, 25.1),
+        _trained(_PHOTOGRAPH, "L2 + log-ratio′", "image-l2-log-ratio", "photograph", 0.607, 0.599, 24.6),
+        _trained(_PHOTOGRAPH, "L2 + distilled log-ratio", "image-l2-kd", "photograph", 0.589, 0.569, 25.0),
     ),
     replace(
         _table(

@@ -57,7 +57,7 @@ class RowQuery:
     """
 
     method: MethodName = "lalaloc"
-    kind: QueryKind = "panorama"
+    kind: QueryKind = "photograph"
     model: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     grid_step_m: float = 0.5

@@ -94,7 +94,7 @@ class TableMaker:
         timed = table.form == "times"
         bundle = None if query.model is None else bundles[query.model]
         dataset = open_dataset(self.data)
-        appearance = choose_appearance(dataset, query.furniture, None) if query.kind == "panorama" else None
+        appearance = choose_appearance(dataset, query.furniture, None) if query.kind == "photograph" else None
         limit = self.limit or (_SMALL_LIMIT if self.budget == "small" else None)
         info = RunInfo(
             label=" ".join(filter(None, (query.method, query.model, query.kind, query.furniture))),

@@ -177,7 +177,7 @@ class _SceneEvaluator:
         """Localise one query."""
         info, scene = self._info, self._scene
         photograph = None
-        if info.kind == "panorama":
+        if info.kind == "photograph":
             photograph = scene.photograph(camera, Appearance(info.furniture, info.lighting))
         question = Question(
             plan=scene.plan,

@@ -113,7 +113,7 @@ def read_views(
 def read_azimuths(
     encoders: PhotographEncoder, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
 ) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
-    """Predict walls and openings of a panorama in its own frame.
+    """Predict walls and openings of a sphere in its own frame.
 
     Returns:
         the log of the predicted wall profile (m), the log of its scale, and `ReadPhotograph.class_scores`.

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, RunError
-from lalaloc_core.evaluate.methods.method import Pose, PredictedCandidate, QueryKind
+from lalaloc_core.evaluate.methods.method import EARLIER_KINDS, Pose, PredictedCandidate, QueryKind
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.dataset import Split
 
@@ -102,7 +102,7 @@ class RunInfo:
     dataset: str
     split: Split
     method: MethodName = "lalaloc"
-    kind: QueryKind = "panorama"
+    kind: QueryKind = "photograph"
     settings: dict[str, Any] = field(default_factory=dict)
     data: str | None = None
     data_format: str | None = None
@@ -131,7 +131,9 @@ class RunFolder:
         """Return the description of the run."""
         path = self.path / RUN_FILE
         try:
-            return build_config(RunInfo, json.loads(path.read_text(encoding="utf-8")), path=RUN_FILE)
+            raw = json.loads(path.read_text(encoding="utf-8"))
+            kind = raw.get("kind", "photograph")
+            return build_config(RunInfo, raw | {"kind": EARLIER_KINDS.get(kind, kind)}, path=RUN_FILE)
         except OSError as error:
             raise RunError(f"no evaluation run at '{self.path}': {error.strerror} ({RUN_FILE})") from error
         except (ValueError, ConfigError) as error:

@@ -1,7 +1,7 @@
 """Annotated photographs of real rooms whose place in a building is unknown.
 
     ROOT/<name>.json   outline of the room around the camera, in camera heights, and its openings
-    ROOT/<name>.jpg    the panorama, named in the annotation
+    ROOT/<name>.jpg    the sphere, named in the annotation
 
 docs/reference/datasets.md describes the format. A photograph does not change when room and camera height are scaled
 together, so lengths are converted for a camera `CAMERA_HEIGHT_M` above the floor.

@@ -32,7 +32,7 @@ class Appearance:
 
 @runtime_checkable
 class DatasetPhotograph(Protocol):
-    """Panorama that is read on demand."""
+    """Sphere that is read on demand."""
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size."""

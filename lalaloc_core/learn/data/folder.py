@@ -1,8 +1,8 @@
-"""A user's own data: plans in the native format, panoramas, and a table of their poses.
+"""A user's own data: plans in the native format, photographs, and a table of their poses.
 
     ROOT/<scene>/plan.json      floor plan (docs/reference/plan-format.md)
-    ROOT/<scene>/poses.csv      panorama,x_m,y_m,heading_deg,camera_height_m
-    ROOT/<scene>/...            panoramas, named in poses.csv by their path below the scene's folder
+    ROOT/<scene>/poses.csv      photograph,x_m,y_m,heading_deg,camera_height_m
+    ROOT/<scene>/...            photographs, named in poses.csv by their path below the scene's folder
     ROOT/splits.csv             scene,split; without it every scene is a test scene
 
 The column `camera_height_m` and its cells are optional; the default is the plan's camera height.
@@ -32,8 +32,9 @@ PLAN_FILE = "plan.json"
 POSES_FILE = "poses.csv"
 SPLITS_FILE = "splits.csv"
 
-_REQUIRED = ("panorama", "x_m", "y_m", "heading_deg")
+_REQUIRED = ("photograph", "x_m", "y_m", "heading_deg")
 _OPTIONAL = ("camera_height_m",)
+_EARLIER_COLUMNS = {"panorama": "photograph"}
 # Larger coordinates indicate another unit.
 _MAX_COORDINATE_M = 100_000.0
 
@@ -66,7 +67,7 @@ class OwnData:
             with collect_error(problems):
                 camera = _camera(row, plan, folder)
                 if camera.name in cameras:
-                    raise row.error("panorama", "it is a duplicate of an earlier line")
+                    raise row.error("photograph", "it is a duplicate of an earlier line")
                 cameras[camera.name] = camera
         return Scene(name=name, plan=plan, cameras=tuple(cameras.values()))
 
@@ -113,18 +114,18 @@ class _Row:
         return value
 
     def error(self, column: str, reason: str) -> DatasetError:
-        """Create an error with the line, column and value, and the panorama if the table has one."""
+        """Create an error with the line, column and value, and the photograph if the table has one."""
         shown = f"line {self.line}, column '{column}' is '{self.cells[column][:80]}': {reason}"
-        return DatasetError(shown, scene=self.scene, room=self.cells.get("panorama") or None, path=self.path)
+        return DatasetError(shown, scene=self.scene, room=self.cells.get("photograph") or None, path=self.path)
 
 
 def _camera(row: _Row, plan: FloorPlan, folder: Path) -> Camera:
-    panorama = row.cells["panorama"]
-    path = path_below(folder, panorama)
+    photograph = row.cells["photograph"]
+    path = path_below(folder, photograph)
     if path is None:
-        raise row.error("panorama", "it must be a path below the scene's folder")
+        raise row.error("photograph", "it must be a path below the scene's folder")
     if not path.is_file():
-        raise row.error("panorama", "the file does not exist")
+        raise row.error("photograph", "the file does not exist")
     x_m = row.number("x_m", -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
     y_m = row.number("y_m", -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
     heading_deg = row.number("heading_deg", -360.0, 360.0)
@@ -138,14 +139,14 @@ def _camera(row: _Row, plan: FloorPlan, folder: Path) -> Camera:
         raise row.error("x_m", f"({x_m:g}, {y_m:g}) m is in no room; the nearest is '{nearest}', {away_m:.3g} m away")
     fault = pose_fault(plan, room_index, position_m, height_m)
     if fault is not None:
-        raise row.error("camera_height_m" if row.cells.get("camera_height_m") else "panorama", fault)
+        raise row.error("camera_height_m" if row.cells.get("camera_height_m") else "photograph", fault)
     return Camera(
-        name=panorama,
+        name=photograph,
         position_m=position_m,
         room_index=room_index,
         heading=heading_from_degrees(heading_deg),
         camera_height_m=height_m,
-        photographs={Appearance(): FilePhotograph(path=path, scene=row.scene or "", room=panorama)},
+        photographs={Appearance(): FilePhotograph(path=path, scene=row.scene or "", room=photograph)},
     )
 
 
@@ -169,7 +170,7 @@ def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *,
         raise DatasetError(f"not UTF-8 text: {error}", scene=scene, path=path) from error
     lines = csv.reader(text.splitlines(), strict=True)
     try:
-        header = [cell.strip() for cell in next(lines, [])]
+        header = [_EARLIER_COLUMNS.get(cell.strip(), cell.strip()) for cell in next(lines, [])]
         wrong = [name for name in header if name not in (*required, *optional)]
         missing = [name for name in required if name not in header]
         if wrong or missing or len(set(header)) < len(header):

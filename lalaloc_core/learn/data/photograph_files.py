@@ -18,12 +18,12 @@ _MM_PER_M = 1000.0
 
 @dataclass(frozen=True, kw_only=True)
 class FilePhotograph:
-    """Panorama in a file.
+    """Sphere in a file.
 
     Attributes:
         scene, room: place of the photograph, for errors.
         depth_path: 16-bit PNG with millimetres along each pixel's ray, 0 without a reading; None for no depth.
-        size: required (height, width) of both files; None accepts any whole panorama.
+        size: required (height, width) of both files; None accepts any whole sphere.
     """
 
     path: Path
@@ -47,7 +47,7 @@ class FilePhotograph:
         """Return RGB pixels at the given size.
 
         Raises:
-            DatasetError: the file is missing, damaged, not a panorama, or not of the data set's size.
+            DatasetError: the file is missing, damaged, not a sphere, or not of the data set's size.
         """
         content = self.content()
         limits = PhotographLimits() if self.size is None else PhotographLimits(min_height=self.size[0])

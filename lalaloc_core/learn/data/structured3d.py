@@ -1,10 +1,10 @@
-"""Structured3D (Zheng et al. 2020), the paper's data set: 3,500 synthetic homes with photorealistic panoramas.
+"""Structured3D (Zheng et al. 2020), the paper's data set: 3,500 synthetic homes with photorealistic spheres.
 
     ROOT/scene_00000/annotation_3d.json
     ROOT/scene_00000/2D_rendering/<room>/panorama/camera_xyz.txt
     ROOT/scene_00000/2D_rendering/<room>/panorama/{empty,simple,full}/rgb_{cold,raw,warm}light.png, depth.png
 
-The centre column of every panorama looks along the world's +y, so all headings are 0.
+The centre column of every sphere looks along the world's +y, so all headings are 0.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def scene_numbers(split: Split) -> tuple[int, ...]:
 ANNOTATION_FILE = "annotation_3d.json"
 RENDERING_FOLDER = "2D_rendering"
 SYNTHETIC_FILE = "synthetic.json"
-# (height, width) of the data set's own panoramas.
-PANORAMA_SIZE = (512, 1024)
+# (height, width) of the data set's own spheres.
+SPHERE_SIZE = (512, 1024)
 FURNITURE = ("full", "simple", "empty")
 LIGHTING = ("warm", "raw", "cold")
 
@@ -102,7 +102,7 @@ class Structured3D:
             raise DatasetError(str(error), path=path) from error
         if found.height < 1 or found.width != 2 * found.height:
             raise DatasetError(
-                f"panoramas of {found.width} x {found.height}; they must be twice as wide as high", path=path
+                f"spheres of {found.width} x {found.height}; they must be twice as wide as high", path=path
             )
         return found
 
@@ -112,9 +112,9 @@ class Structured3D:
         return "Structured3D" if self.synthetic is None else f"synthetic scenes (seed {self.synthetic.seed})"
 
     @property
-    def panorama_size(self) -> tuple[int, int]:
-        """Required (height, width) of every panorama."""
-        return PANORAMA_SIZE if self.synthetic is None else (self.synthetic.height, self.synthetic.width)
+    def sphere_size(self) -> tuple[int, int]:
+        """Required (height, width) of every sphere."""
+        return SPHERE_SIZE if self.synthetic is None else (self.synthetic.height, self.synthetic.width)
 
     @property
     def appearances(self) -> Sequence[Appearance]:
@@ -172,7 +172,7 @@ class Structured3D:
                 file = f"rgb_{lighting}light.png"
                 if file in files:
                     found[Appearance(furniture, lighting)] = FilePhotograph(
-                        path=level / file, scene=scene, room=room, depth_path=depth_path, size=self.panorama_size
+                        path=level / file, scene=scene, room=room, depth_path=depth_path, size=self.sphere_size
                     )
         return found
 

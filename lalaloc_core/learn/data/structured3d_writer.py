@@ -19,7 +19,7 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan, Room
-from lalaloc_core.learn.data.structured3d import ANNOTATION_FILE, PANORAMA_SIZE
+from lalaloc_core.learn.data.structured3d import ANNOTATION_FILE, SPHERE_SIZE
 from lalaloc_core.learn.synth.homes.openings import Opening
 
 _MM_PER_M = 1000.0
@@ -87,21 +87,21 @@ def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, 
     return drawing.document()
 
 
-def write_camera(panorama: Path, room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> None:
-    """Write the camera position of a room's panoramas, and the pixels of the room's corners."""
+def write_camera(sphere: Path, room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> None:
+    """Write the camera position of a room's spheres, and the pixels of the room's corners."""
     x_mm, y_mm, z_mm = (_MM_PER_M * float(value) for value in (*position_m, camera_height_m))
-    (panorama / "camera_xyz.txt").write_text(f"{x_mm!r} {y_mm!r} {z_mm!r}\n", encoding="ascii")
+    (sphere / "camera_xyz.txt").write_text(f"{x_mm!r} {y_mm!r} {z_mm!r}\n", encoding="ascii")
     lines = [f"{x:.3f} {y:.3f}\n" for x, y in layout_pixels(room, position_m, camera_height_m).tolist()]
-    (panorama / "layout.txt").write_text("".join(lines), encoding="ascii")
+    (sphere / "layout.txt").write_text("".join(lines), encoding="ascii")
 
 
 def layout_pixels(room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> Float[np.ndarray, "n 2"]:
-    """Return the pixels (x, y) of a room's visible corners in a panorama of `PANORAMA_SIZE` with heading 0.
+    """Return the pixels (x, y) of a room's visible corners in a sphere of `SPHERE_SIZE` with heading 0.
 
     Returns:
         Ceiling and floor corners alternating, from left to right.
     """
-    height, width = PANORAMA_SIZE
+    height, width = SPHERE_SIZE
     # Corners lie on the outline, so a ray to a corner may leave the room by rounding.
     shape = room.shape.buffer(1e-6)
     rays = shapely.linestrings(np.stack([np.broadcast_to(position_m, room.polygon_m.shape), room.polygon_m], axis=1))
@@ -115,7 +115,7 @@ def layout_pixels(room: Room, position_m: Float[np.ndarray, "2"], camera_height_
 
 
 def write_picture(path: Path, pixels: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a panorama as PNG."""
+    """Write a sphere as PNG."""
     Image.fromarray(pixels).save(path, compress_level=_PNG_COMPRESSION)
 
 

@@ -6,7 +6,7 @@
 
 A scene is one floor of a home, "0000/floor_01". ZInD's frame is mirrored: a point (x, y) appears at the image azimuth
 atan2(-x, y). Negating x gives the plan frame and reverses rotations, so ZInD's counter-clockwise `rotation` of a
-panorama equals its heading. Rings in a layout's `internal` list, inner walls and chimneys, are holes of its room.
+sphere equals its heading. Rings in a layout's `internal` list, inner walls and chimneys, are holes of its room.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class Zind:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Panorama:
-    """Panorama of a floor: its room and name in the file, and its record."""
+class _Sphere:
+    """Sphere of a floor: its room and name in the file, and its record."""
 
     complete_room: str
     name: str
@@ -110,19 +110,19 @@ class _FloorReader:
         if not is_number(scale) or not scale > 0.0:
             raise self._error(f"scale_meters_per_coordinate is {scale!r}; it must be a number above 0")
         self._scale_m = float(scale)
-        self._panoramas = list(self._walk(merger[floor]))
+        self._spheres = list(self._walk(merger[floor]))
 
     def scene(self, problems: list[DatasetError] | None) -> Scene:
         outlines: dict[str, RoomOutline] = {}
         openings: list[DrawnOpening] = []
         faults: list[str] = []
-        for panorama in self._panoramas:
-            if panorama.complete_room not in outlines and panorama.data.get("is_primary") is True:
-                layout = panorama.data.get("layout_complete")
+        for sphere in self._spheres:
+            if sphere.complete_room not in outlines and sphere.data.get("is_primary") is True:
+                layout = sphere.data.get("layout_complete")
                 # A small room that was photographed from outside can lack a layout.
                 if layout is not None:
-                    outlines[panorama.complete_room] = self._outline(panorama, layout, faults)
-                    openings += self._openings(panorama, layout, faults)
+                    outlines[sphere.complete_room] = self._outline(sphere, layout, faults)
+                    openings += self._openings(sphere, layout, faults)
         plan = assemble_plan(
             self._scene,
             list(outlines.values()),
@@ -135,73 +135,73 @@ class _FloorReader:
         places = {room.name: index for index, room in enumerate(plan.rooms)}
         rooms = {room: places[outline.name] for room, outline in outlines.items() if outline.name in places}
         cameras = []
-        for panorama in self._panoramas:
+        for sphere in self._spheres:
             with collect_error(problems):
-                cameras.append(self._camera(panorama, plan, rooms.get(panorama.complete_room)))
+                cameras.append(self._camera(sphere, plan, rooms.get(sphere.complete_room)))
         return Scene(name=self._scene, plan=plan, cameras=tuple(cameras))
 
-    def _walk(self, floor: dict[str, Any]) -> Iterator[_Panorama]:
+    def _walk(self, floor: dict[str, Any]) -> Iterator[_Sphere]:
         for complete_room, partial_rooms in sorted(floor.items()):
-            for partial_room, panoramas in sorted(self._object(partial_rooms, complete_room).items()):
-                for pano, data in sorted(self._object(panoramas, partial_room).items()):
+            for partial_room, spheres in sorted(self._object(partial_rooms, complete_room).items()):
+                for pano, data in sorted(self._object(spheres, partial_room).items()):
                     name = f"{partial_room}_{pano}"
-                    yield _Panorama(complete_room=complete_room, name=name, data=self._object(data, name))
+                    yield _Sphere(complete_room=complete_room, name=name, data=self._object(data, name))
 
-    def _outline(self, panorama: _Panorama, layout: Any, faults: list[str]) -> RoomOutline:
+    def _outline(self, sphere: _Sphere, layout: Any, faults: list[str]) -> RoomOutline:
         vertices = layout.get("vertices") if isinstance(layout, dict) else None
         if not isinstance(vertices, list) or len(vertices) < 3:
-            raise self._error("layout_complete has no list 'vertices' of at least three points", panorama.name)
-        polygon = self._ring(vertices, "", panorama)
-        transform = self._transform(panorama)
-        ceiling = self._number(panorama.data, "ceiling_height", panorama)
-        label = str(panorama.data.get("label", "")).strip()
+            raise self._error("layout_complete has no list 'vertices' of at least three points", sphere.name)
+        polygon = self._ring(vertices, "", sphere)
+        transform = self._transform(sphere)
+        ceiling = self._number(sphere.data, "ceiling_height", sphere)
+        label = str(sphere.data.get("label", "")).strip()
         return RoomOutline(
-            name=f"{label} {panorama.complete_room}".strip(),
+            name=f"{label} {sphere.complete_room}".strip(),
             polygon_m=transform.to_plan_m(polygon),
-            holes_m=tuple(map(transform.to_plan_m, self._holes(panorama, layout, faults))),
+            holes_m=tuple(map(transform.to_plan_m, self._holes(sphere, layout, faults))),
             ceiling_height_m=ceiling * transform.unit_m,
             type=room_type_from_label(label),
         )
 
     def _holes(
-        self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]
+        self, sphere: _Sphere, layout: Mapping[str, Any], faults: list[str]
     ) -> Iterator[Float[np.ndarray, "n 2"]]:
         """Yield the rings of inner walls of a layout."""
         rings = layout.get("internal", [])
         if not isinstance(rings, list):
-            faults.append(f"{panorama.name}: 'internal' is left out; it is not a list of rings")
+            faults.append(f"{sphere.name}: 'internal' is left out; it is not a list of rings")
             return
         for number, ring in enumerate(rings):
             if not isinstance(ring, list) or len(ring) < 3:
-                faults.append(f"{panorama.name}: ring {number} of 'internal' is left out; it has no three points")
+                faults.append(f"{sphere.name}: ring {number} of 'internal' is left out; it has no three points")
                 continue
             try:
-                yield self._ring(ring, f"ring {number} of 'internal', ", panorama)
+                yield self._ring(ring, f"ring {number} of 'internal', ", sphere)
             except DatasetError as error:
-                faults.append(f"{panorama.name}: ring {number} of 'internal' is left out; {error.reason}")
+                faults.append(f"{sphere.name}: ring {number} of 'internal' is left out; {error.reason}")
 
-    def _ring(self, vertices: list[Any], where: str, panorama: _Panorama) -> Float[np.ndarray, "n 2"]:
-        return np.array([self._pair(vertex, f"{where}vertex {k}", panorama) for k, vertex in enumerate(vertices)])
+    def _ring(self, vertices: list[Any], where: str, sphere: _Sphere) -> Float[np.ndarray, "n 2"]:
+        return np.array([self._pair(vertex, f"{where}vertex {k}", sphere) for k, vertex in enumerate(vertices)])
 
-    def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
+    def _openings(self, sphere: _Sphere, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
         """Yield the doors, passages and windows of a layout.
 
         Each is a triple: start, end, and the heights of sill and head above the camera.
         """
-        transform = self._transform(panorama)
-        camera = self._number(panorama.data, "camera_height", panorama)
+        transform = self._transform(sphere)
+        camera = self._number(sphere.data, "camera_height", sphere)
         for key, kind in _OPENING_LISTS.items():
             flat = layout.get(key, [])
             if not isinstance(flat, list) or len(flat) % 3:
-                faults.append(f"{panorama.name}: '{key}' is left out; it is not a list of triples")
+                faults.append(f"{sphere.name}: '{key}' is left out; it is not a list of triples")
                 continue
             for number in range(0, len(flat), 3):
                 try:
                     start, end, heights = (
-                        self._pair(flat[number + k], f"{key} {number // 3}", panorama) for k in range(3)
+                        self._pair(flat[number + k], f"{key} {number // 3}", sphere) for k in range(3)
                     )
                 except DatasetError as error:
-                    faults.append(f"{panorama.name}: an entry of '{key}' is left out; {error.reason}")
+                    faults.append(f"{sphere.name}: an entry of '{key}' is left out; {error.reason}")
                     continue
                 yield DrawnOpening(
                     kind=kind,
@@ -210,27 +210,26 @@ class _FloorReader:
                     head_m=(camera + heights[1]) * transform.unit_m,
                 )
 
-    def _camera(self, panorama: _Panorama, plan: FloorPlan, room_index: int | None) -> Camera:
+    def _camera(self, sphere: _Sphere, plan: FloorPlan, room_index: int | None) -> Camera:
         if room_index is None:
             raise self._error(
-                f"the room '{panorama.complete_room}' has no usable layout_complete in a primary panorama",
-                panorama.name,
+                f"the room '{sphere.complete_room}' has no usable layout_complete in a primary sphere", sphere.name
             )
-        transform = self._transform(panorama)
+        transform = self._transform(sphere)
         position_m = transform.to_plan_m(np.zeros((1, 2)))[0]
-        height_m = self._number(panorama.data, "camera_height", panorama) * transform.unit_m
+        height_m = self._number(sphere.data, "camera_height", sphere) * transform.unit_m
         fault = pose_fault(plan, room_index, position_m, height_m)
-        if fault is None and panorama.data.get("is_inside") is False:
-            fault = f"the panorama was taken outside its room '{plan.rooms[room_index].name}' (is_inside is false)"
+        if fault is None and sphere.data.get("is_inside") is False:
+            fault = f"the sphere was taken outside its room '{plan.rooms[room_index].name}' (is_inside is false)"
         if fault is not None:
-            raise self._error(fault, panorama.name)
-        image_path = panorama.data.get("image_path")
+            raise self._error(fault, sphere.name)
+        image_path = sphere.data.get("image_path")
         path = path_below(self._folder, image_path) if isinstance(image_path, str) else None
         if path is None:
-            raise self._error(f"image_path is {image_path!r}; it must be a path below the home's folder", panorama.name)
-        photograph = FilePhotograph(path=path, scene=self._scene, room=panorama.name)
+            raise self._error(f"image_path is {image_path!r}; it must be a path below the home's folder", sphere.name)
+        photograph = FilePhotograph(path=path, scene=self._scene, room=sphere.name)
         return Camera(
-            name=panorama.name,
+            name=sphere.name,
             position_m=position_m,
             room_index=room_index,
             heading=transform.heading,
@@ -238,27 +237,27 @@ class _FloorReader:
             photographs={Appearance(): photograph},
         )
 
-    def _transform(self, panorama: _Panorama) -> _Transform:
-        found = panorama.data.get("floor_plan_transformation")
+    def _transform(self, sphere: _Sphere) -> _Transform:
+        found = sphere.data.get("floor_plan_transformation")
         if not isinstance(found, dict):
-            raise self._error("has no object 'floor_plan_transformation'", panorama.name)
+            raise self._error("has no object 'floor_plan_transformation'", sphere.name)
         return _Transform(
-            translation=np.array(self._pair(found.get("translation"), "translation", panorama)),
-            rotation_deg=self._number(found, "rotation", panorama, positive=False),
-            scale=self._number(found, "scale", panorama),
+            translation=np.array(self._pair(found.get("translation"), "translation", sphere)),
+            rotation_deg=self._number(found, "rotation", sphere, positive=False),
+            scale=self._number(found, "scale", sphere),
             scale_m=self._scale_m,
         )
 
-    def _number(self, data: Mapping[str, Any], key: str, panorama: _Panorama, *, positive: bool = True) -> float:
+    def _number(self, data: Mapping[str, Any], key: str, sphere: _Sphere, *, positive: bool = True) -> float:
         value = data.get(key)
         if not is_number(value) or (positive and not value > 0.0):
             limit = "a number above 0" if positive else "a number"
-            raise self._error(f"{key} is {value!r}; it must be {limit}", panorama.name)
+            raise self._error(f"{key} is {value!r}; it must be {limit}", sphere.name)
         return float(value)
 
-    def _pair(self, value: Any, key: str, panorama: _Panorama) -> tuple[float, float]:
+    def _pair(self, value: Any, key: str, sphere: _Sphere) -> tuple[float, float]:
         if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)):
-            raise self._error(f"{key} is {str(value)[:80]}; it must be two numbers", panorama.name)
+            raise self._error(f"{key} is {str(value)[:80]}; it must be two numbers", sphere.name)
         return float(value[0]), float(value[1])
 
     def _object(self, value: Any, key: str) -> dict[str, Any]:
@@ -266,13 +265,13 @@ class _FloorReader:
             raise self._error(f"'{key}' must be an object, not {type(value).__name__}")
         return value
 
-    def _error(self, reason: str, panorama: str | None = None) -> DatasetError:
-        return DatasetError(reason, scene=self._scene, room=panorama, path=self._path)
+    def _error(self, reason: str, sphere: str | None = None) -> DatasetError:
+        return DatasetError(reason, scene=self._scene, room=sphere, path=self._path)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Transform:
-    """Transform from a panorama's frame, in camera heights, to the floor's frame and the plan frame.
+    """Transform from a sphere's frame, in camera heights, to the floor's frame and the plan frame.
 
     Attributes:
         translation: position of the camera in floor coordinates.
@@ -288,16 +287,16 @@ class _Transform:
 
     @property
     def unit_m(self) -> float:
-        """Metres per unit of the panorama's own frame."""
+        """Metres per unit of the sphere's own frame."""
         return self.scale * self.scale_m
 
     @property
     def heading(self) -> float:
-        """Azimuth of the panorama's centre column in the plan frame, radians."""
+        """Azimuth of the sphere's centre column in the plan frame, radians."""
         return heading_from_degrees(self.rotation_deg)
 
     def to_plan_m(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Convert points of the panorama's frame to the plan frame."""
+        """Convert points of the sphere's frame to the plan frame."""
         angle = math.radians(self.rotation_deg)
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         floor = self.scale * points @ turn.T + self.translation

@@ -1,7 +1,7 @@
 """Export of trained encoders to a model bundle: ONNX for the service, safetensors for LPO and further training.
 
 Weights are first rounded to half precision (storage only; arithmetic stays single), then exported. The exported files
-are compared with torch on random layouts and panoramas.
+are compared with torch on random layouts and spheres.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from lalaloc_core.learn.training.warm_start import (
     find_checkpoint,
     load_trained_decoder,
     load_trained_layout_encoder,
-    panorama_count,
+    sphere_count,
     training_totals,
 )
 from lalaloc_core.nets import ImageEncoder, load_layout_encoder
@@ -60,7 +60,7 @@ def export_run(
     if image is not None:
         check_same_networks("layout", image.config, layout.config, str(teacher))
         image_encoder = _image_encoder(image)
-        training[image.stage] = {**_summary(image, folder, last=last), "panoramas": panorama_count(image)}
+        training[image.stage] = {**_summary(image, folder, last=last), "spheres": sphere_count(image)}
     return export_bundle(
         out,
         (image or layout).config,
@@ -111,7 +111,7 @@ def export_into(
             view_encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
             made = add_view_encoder(made, config, view_encoder, summary)
         else:
-            summary["panoramas"] = panorama_count(checkpoint)
+            summary["spheres"] = sphere_count(checkpoint)
             made = replace_image_encoder(made, config, _image_encoder(checkpoint), summary)
     return made
 

@@ -2,7 +2,7 @@
 
 Begin with `run.py`, which trains a stage. `layout_stage.py`, `image_stage.py` and `view_stage.py` define the networks
 and losses of each stage, `end_to_end.py` those of the first two at once; `loop.py` is their training loop. Data flows
-from `sources.py` (scenes) through `batch_streams.py` (rows) and `batches.py` (worker processes); panoramas are rendered
+from `sources.py` (scenes) through `batch_streams.py` (rows) and `batches.py` (worker processes); spheres are rendered
 by the workers or on the training device (`deferred.py`). `config.py` has the settings and `presets.py` their presets.
 """
 

@@ -1,6 +1,6 @@
 """Endless streams of training batches, built in worker processes while the network trains.
 
-A replay buffer uses panoramas several times, because rendering one costs as much as a training step on it.
+A replay buffer uses spheres several times, because rendering one costs as much as a training step on it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lalaloc_core.learn.training.batches import Batch, LoadFailure, Stream, draw
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
-from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
+from lalaloc_core.learn.training.sources import Group, Source, SphereSample
 from lalaloc_core.render.profile import render_layout
 from lalaloc_core.render.sweep import profiles_at
 
@@ -116,12 +116,12 @@ class LayoutBatches(Stream):
 
 
 @dataclass
-class PanoramaBatches(Stream):
-    """Stage 2: stream of panoramas with their layouts, rotated and mirrored together.
+class SphereBatches(Stream):
+    """Stage 2: stream of spheres with their layouts, rotated and mirrored together.
 
     Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) with the configured
     error, and `ceiling_height_m` (b). Batches with neighbours hold `neighbour_profile_m` (b, n, columns) and
-    `neighbour_ceiling_height_m` (b, n), rotated and mirrored like their panorama. With architecture `trunk` there are
+    `neighbour_ceiling_height_m` (b, n), rotated and mirrored like their sphere. With architecture `trunk` there are
     `opening_kind` (b, columns) and `room_type` (b): codes of `conventions`, or `UNKNOWN`. Sources with deferred
     rendering yield `DeferredBatch` instead. Views, a part of the horizon, are mirrored only.
     """
@@ -134,8 +134,8 @@ class PanoramaBatches(Stream):
 
     def __iter__(self) -> Iterator[Batch | DeferredBatch | LoadFailure]:
         stage, (_, workers) = self.config.image, worker_share()
-        replay: ReplayBuffer[PanoramaSample] = ReplayBuffer(stage.uses_per_panorama, stage.replay_panoramas // workers)
-        batcher = DeferredBatcher(stage.uses_per_panorama)
+        replay: ReplayBuffer[SphereSample] = ReplayBuffer(stage.uses_per_sphere, stage.replay_spheres // workers)
+        batcher = DeferredBatcher(stage.uses_per_sphere)
 
         def rendered(visit: int) -> list[Row] | None:
             drawn = self._draw(visit, replay)
@@ -159,9 +159,7 @@ class PanoramaBatches(Stream):
             return _batches(deferred, batcher.pack, self.source, stage.batch, self.first)
         return _batches(rendered, stack_rows, self.source, stage.batch, self.first)
 
-    def _draw(
-        self, visit: int, replay: ReplayBuffer[PanoramaSample]
-    ) -> list[tuple[PanoramaSample, Rotation, Row | None]]:
+    def _draw(self, visit: int, replay: ReplayBuffer[SphereSample]) -> list[tuple[SphereSample, Rotation, Row | None]]:
         """Draw the samples of a visit, their rotations and the rest of their rows; a row without neighbours is None."""
         rng = self.source.rng(visit)
         drawn = []
@@ -175,7 +173,7 @@ class PanoramaBatches(Stream):
                 drawn.append((sample, turn, self._row(sample, turn, rng)))
         return drawn
 
-    def _row(self, sample: PanoramaSample, turn: Rotation, rng: np.random.Generator) -> Row | None:
+    def _row(self, sample: SphereSample, turn: Rotation, rng: np.random.Generator) -> Row | None:
         position, room = sample.position_m[None], np.array([sample.room_index])
         if self.neighbours:
             group = sample.group(self.config.layout.triplets, rng)
@@ -197,7 +195,7 @@ class PanoramaBatches(Stream):
             row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
         return row
 
-    def _classes(self, sample: PanoramaSample, turn: Rotation) -> Row:
+    def _classes(self, sample: SphereSample, turn: Rotation) -> Row:
         room = sample.plan.rooms[sample.room_index]
         kind = opening_kinds(
             sample.plan,

@@ -102,17 +102,17 @@ class ImageStageConfig:
 
     Attributes:
         minutes: wall-clock budget; replaces `steps` as the length of the schedule.
-        shots_per_home: panoramas drawn from one home.
-        by_room_share: share of the panoramas drawn uniformly over rooms instead of over the floor area, so that small
+        shots_per_home: spheres drawn from one home.
+        by_room_share: share of the spheres drawn uniformly over rooms instead of over the floor area, so that small
             rooms occur often enough.
-        supersample: rays per pixel along (rows, columns) of generated panoramas; may change when a run resumes.
-        uses_per_panorama: number of times a panorama is used, each time with a new rotation and mirroring.
-        replay_panoramas: panoramas waiting for their next use, over all workers; more of them separate repeated uses.
+        supersample: rays per pixel along (rows, columns) of generated spheres; may change when a run resumes.
+        uses_per_sphere: number of times a sphere is used, each time with a new rotation and mirroring.
+        replay_spheres: spheres waiting for their next use, over all workers; more of them separate repeated uses.
         photometric: strength, 0 to 1, of random changes of exposure, contrast and colours.
         camera_height_error_m: standard deviation of the error of the camera heights given to the networks. Targets are
             the true walls at the given height, because the pose grid of a query is embedded at that height too.
         l2_weight: weight of the latent distance, the paper's choice; 0 turns it off.
-        log_ratio_weight: weight of the log-ratio loss with the panorama as anchor and layouts as neighbours, drawn as
+        log_ratio_weight: weight of the log-ratio loss with the sphere as anchor and layouts as neighbours, drawn as
             in stage 1.
         kd_weight: weight of the same loss with the layout encoder's distances in place of the Chamfer distances.
         ring_weight: weight of ring feature distillation (architectures `ring` and `trunk`).
@@ -141,8 +141,8 @@ class ImageStageConfig:
     shots_per_home: int = 4
     by_room_share: float = 0.25
     supersample: tuple[int, int] = (1, 1)
-    uses_per_panorama: int = 1
-    replay_panoramas: int = 4096
+    uses_per_sphere: int = 1
+    replay_spheres: int = 4096
     photometric: float = 0.0
     camera_height_error_m: float = 0.0
     l2_weight: float = 1.0
@@ -172,7 +172,7 @@ class TrainConfig:
 
     Attributes:
         architecture: `ring`, `trunk`, or the networks of the `paper`.
-        turns: headings of training layouts and panoramas: "any" and "quarters" (multiples of 90°) with random
+        turns: headings of training layouts and spheres: "any" and "quarters" (multiples of 90°) with random
             mirroring, or "none", heading 0 only, which suffices for queries with known heading.
         ring, trunk, paper: sizes of the networks; an architecture ignores the sizes of others.
         view: sizes of the encoder of views, which architecture `trunk` can have besides.
@@ -214,7 +214,7 @@ class TrainConfig:
             len(rays) == 2 and all(1 <= count <= _MAX_RAYS for count in rays),
             f"it must be two numbers from 1 to {_MAX_RAYS}",
         )
-        for name in ("uses_per_panorama", "replay_panoramas", "photographs_per_batch"):
+        for name in ("uses_per_sphere", "replay_spheres", "photographs_per_batch"):
             _check(f"image.{name}", getattr(image, name), getattr(image, name) >= 1, "the minimum is 1")
         is_possible = self.has_ring or not image.hidden_share
         _check("image.hidden_share", image.hidden_share, is_possible, "architecture 'paper' supports 0 only")
@@ -245,6 +245,8 @@ class TrainConfig:
         Raises:
             ConfigError: an unknown key or a value of the wrong type; names its path.
         """
+        if isinstance(image := raw.get("image"), dict):
+            raw = raw | {"image": {_EARLIER_NAMES.get(name, name): value for name, value in image.items()}}
         return build_config(cls, raw, path="config")
 
     def with_settings(self, settings: dict[str, Any]) -> TrainConfig:
@@ -293,6 +295,9 @@ class TrainConfig:
     def image_size(self) -> tuple[int, int]:
         """(height, width) that the image encoder expects."""
         return self.image_sizes.image_height, self.image_sizes.image_width
+
+
+_EARLIER_NAMES = {"uses_per_panorama": "uses_per_sphere", "replay_panoramas": "replay_spheres"}
 
 
 def _check(name: str, value: Any, is_valid: bool, limit: str) -> None:

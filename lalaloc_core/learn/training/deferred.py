@@ -1,8 +1,8 @@
 """Deferred rendering: worker processes send scenes instead of pixels, and the training device renders them.
 
 A worker builds homes and scenes in Python and decides for every row of a batch which scene it shows, its rotation and
-its mirroring. The device renders each scene at its first use, caches the panorama until its last use, and rotates whole
-batches at once. A scene has about 15 kB, its panorama six times as much.
+its mirroring. The device renders each scene at its first use, caches the sphere until its last use, and rotates whole
+batches at once. A scene has about 15 kB, its sphere six times as much.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.render_scene import RenderScene
 from lalaloc_core.learn.training.batches import Batch, stack_rows
 from lalaloc_core.learn.training.rotation import Rotation
@@ -33,7 +33,7 @@ class DeferredScene:
 
 @dataclass(frozen=True, eq=False)
 class DeferredRow:
-    """A row of a batch: the panorama to render, its rotation, and the other values."""
+    """A row of a batch: the sphere to render, its rotation, and the other values."""
 
     deferred: DeferredScene
     turn: Rotation
@@ -46,8 +46,8 @@ class DeferredBatch:
 
     Attributes:
         rest: the batch without `image`.
-        shift: columns by which each panorama is rolled to the right.
-        mirrored: panoramas mirrored after that.
+        shift: columns by which each sphere is rolled to the right.
+        mirrored: spheres mirrored after that.
         scenes: scenes used for the first time, by number.
         evicted: numbers of scenes that no later batch uses.
     """
@@ -101,7 +101,7 @@ class DeferredBatcher:
 class DeferredRenderer:
     """Renderer of batches without pixels, on its own device."""
 
-    def __init__(self, renderer: PanoramaRenderer) -> None:
+    def __init__(self, renderer: SphereRenderer) -> None:
         self._renderer = renderer
         self._images: dict[int, Tensor] = {}
 
@@ -126,7 +126,7 @@ class DeferredRenderer:
 def rotate_images(
     images: UInt8[Tensor, "b h w 3"], shift: Int[Tensor, "b"], mirrored: Bool[Tensor, "b"]
 ) -> UInt8[Tensor, "b h w 3"]:
-    """Roll each panorama by `shift` columns to the right, then mirror it if asked, like `Rotation.picture`."""
+    """Roll each sphere by `shift` columns to the right, then mirror it if asked, like `Rotation.picture`."""
     width = images.shape[2]
     column = torch.arange(width, device=images.device)
     source = torch.where(mirrored.to(images.device)[:, None], width - 1 - column, column)

@@ -17,7 +17,7 @@ from lalaloc_core.learn.training.stages import (
     build_decoder,
     build_image_encoder,
     build_layout_encoder,
-    panorama_batches,
+    sphere_batches,
 )
 
 
@@ -46,8 +46,8 @@ class EndToEndStage(TrainingStage[ImageStageConfig]):
             self.modules["decoder"] = decoder
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
-        """Yield panorama batches with neighbours."""
-        return panorama_batches(
+        """Yield sphere batches with neighbours."""
+        return sphere_batches(
             self.config,
             self.source,
             neighbours=True,

@@ -20,9 +20,9 @@ from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
     TrainingStage,
     build_image_encoder,
-    panorama_batches,
     photograph_loss,
     sample_styles,
+    sphere_batches,
 )
 from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
@@ -36,7 +36,7 @@ _HIDDEN_GREY = 127
 
 
 class ImageStage(TrainingStage[ImageStageConfig]):
-    """Stage 2: train the image encoder to map a panorama to the latent of its bare layout; the teacher is frozen."""
+    """Stage 2: train the image encoder to map a sphere to the latent of its bare layout; the teacher is frozen."""
 
     name = "image"
 
@@ -51,9 +51,9 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         self._first_step = 0
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
-        """Yield panorama batches."""
+        """Yield sphere batches."""
         self._first_step, self._generators = first_step, {}
-        return panorama_batches(
+        return sphere_batches(
             self.config,
             self.source,
             neighbours=bool(self.settings.log_ratio_weight or self.settings.kd_weight),
@@ -95,7 +95,7 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         return terms
 
     def _encode(self, batch: Batch, seen: Bool[Tensor, "b s"]) -> tuple[ImageFeatures, dict[str, Tensor]]:
-        """Return the features of a batch's panoramas, and the loss of the photographs encoded with them."""
+        """Return the features of a batch's spheres, and the loss of the photographs encoded with them."""
         settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
         if self.photographs is None or not (settings.photograph_weight or settings.photograph_profile_weight):
             return self.encoder(self._hide(self._augment(image), seen), height), {}
@@ -176,7 +176,7 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         return self._generators[device]
 
     def _distance_losses(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Return the losses on the latent distances between a panorama and its neighbours' layouts."""
+        """Return the losses on the latent distances between a sphere and its neighbours' layouts."""
         settings, layout = self.settings, self.config.layout
         groups = anchors_with_neighbours(batch)
         with torch.no_grad():

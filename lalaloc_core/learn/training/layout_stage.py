@@ -83,7 +83,7 @@ def embed(encoder: nn.Module, groups: Batch) -> Float[Tensor, "a n d"]:
 
 
 def anchors_with_neighbours(batch: Batch) -> Batch:
-    """Convert a batch of panoramas with neighbours to stage 1's form: each panorama's own layout first."""
+    """Convert a batch of spheres with neighbours to stage 1's form: each sphere's own layout first."""
     profile, ceiling = batch["neighbour_profile_m"], batch["neighbour_ceiling_height_m"]
     ceiling = torch.cat([batch["ceiling_height_m"][:, None], ceiling], dim=1)
     return {

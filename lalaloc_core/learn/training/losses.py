@@ -24,8 +24,8 @@ def log_ratio(
     """Return the log-ratio loss (equation 1), averaged over anchors and pairs of neighbours.
 
     `(log D_i / D_j - log R_i / R_j)²` for each anchor and pair (i, j) of its neighbours. Between layouts, D is the
-    distance of latents and R the Chamfer distance. The variants for panoramas (section A.1.5) measure D from the
-    panorama's latent; R is the Chamfer distance (log-ratio') or the distance of the teacher's latents (knowledge
+    distance of latents and R the Chamfer distance. The variants for spheres (section A.1.5) measure D from the
+    sphere's latent; R is the Chamfer distance (log-ratio') or the distance of the teacher's latents (knowledge
     distillation). The first `positives` columns are the positives; `all_pairs` uses every pair of neighbours instead of
     each positive with each negative (the paper).
     """

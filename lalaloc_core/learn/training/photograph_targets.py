@@ -21,7 +21,7 @@ from lalaloc_core.errors import ConfigError, DatasetError, InvalidPhotographErro
 from lalaloc_core.learn.data.annotated import annotation_files
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
 from lalaloc_core.learn.training.photograph_batches import Photographs
-from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, load_segmenter, read_walls_and_openings
+from lalaloc_core.learn.training.segmenter import SPHERE_ROWS, load_segmenter, read_walls_and_openings
 from lalaloc_core.learn.training.warm_start import bundle_weights
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.photograph.spheres import read_sphere
@@ -31,9 +31,9 @@ _TURNS = 8
 
 
 def load_photographs(folders: Sequence[Path], teachers: Sequence[Path], height: int, width: int) -> Photographs:
-    """Read the panoramas (`*.jpg`, `*.jpeg`, `*.png`) of folders with their targets.
+    """Read the spheres (`*.jpg`, `*.jpeg`, `*.png`) of folders with their targets.
 
-    Panoramas with an annotation beside them use that; the others need teachers: a TensorFlow Lite segmenter, a bundle
+    Spheres with an annotation beside them use that; the others need teachers: a TensorFlow Lite segmenter, a bundle
     whose encoder of spheres reads them, or both. With both the walls and passages are the encoder's, and doors and
     windows the mean of the two.
     """
@@ -73,7 +73,7 @@ def _taught(paths: Sequence[Path], teachers: Sequence[Path], height: int, width:
     targets = []
     for path in segmenters:
         segment = load_segmenter(path)
-        large = _read(paths, PANORAMA_ROWS, 2 * PANORAMA_ROWS)
+        large = _read(paths, SPHERE_ROWS, 2 * SPHERE_ROWS)
         readings = [read_walls_and_openings(picture.numpy(), segment, width) for picture in large]
         openings = torch.from_numpy(np.stack([reading.openings for reading in readings]))
         openings = torch.cat([openings, torch.full_like(openings[..., :1], torch.nan)], dim=2)

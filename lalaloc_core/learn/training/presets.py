@@ -76,7 +76,7 @@ _TINY = TrainConfig(
     image=ImageStageConfig(steps=12, batch=8, ring_weight=1.0, profile_weight=0.5, ema_decay=0.9),
 )
 
-# The paper counts epochs over Structured3D, whose training split has about 18,000 panoramas.
+# The paper counts epochs over Structured3D, whose training split has about 18,000 spheres.
 PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(
         name="paper",
@@ -108,8 +108,8 @@ PRESETS: dict[str, TrainConfig] = {
             photometric=1.0,
             optics=1.0,
             supersample=(2, 2),
-            uses_per_panorama=4,
-            replay_panoramas=1024,
+            uses_per_sphere=4,
+            replay_spheres=1024,
             pretrained=True,
             ring_weight=0.5,
             profile_weight=1.0,

@@ -1,4 +1,4 @@
-"""Exact rotation and mirroring: panoramas by whole pixels, layouts by the remaining heading."""
+"""Exact rotation and mirroring: spheres by whole pixels, layouts by the remaining heading."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _QUARTER = TWO_PI / 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Rotation:
-    """Rotation and mirroring of a panorama.
+    """Rotation and mirroring of a sphere.
 
     Attributes:
         shift: pixels by which its columns move to the right.
@@ -27,7 +27,7 @@ class Rotation:
     mirrored: bool
 
     def picture(self, image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w 3"]:
-        """Rotate and mirror a panorama."""
+        """Rotate and mirror a sphere."""
         turned = np.roll(image, self.shift, axis=1)
         return turned[:, ::-1] if self.mirrored else turned
 
@@ -37,7 +37,7 @@ class Rotation:
 
 
 def sample_rotation(turns: Turns, heading: float, width: int, rng: np.random.Generator) -> Rotation:
-    """Draw the rotation of a panorama of `width` columns whose centre column looks along `heading` (radians)."""
+    """Draw the rotation of a sphere of `width` columns whose centre column looks along `heading` (radians)."""
     pixel = TWO_PI / width
     shift = int(rng.integers(width)) if turns == "any" else round((heading - _target(turns, rng)) / pixel)
     mirrored = turns != "none" and bool(rng.random() < 0.5)

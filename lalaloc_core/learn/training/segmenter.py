@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import ConfigError
 
-# Height (pixels) of its panoramas, and height and width of its views.
-PANORAMA_ROWS = 512
+# Height (pixels) of its spheres, and height and width of its views.
+SPHERE_ROWS = 512
 _VIEWS = 8
 _FIELD_OF_VIEW_DEG = 95.0
 # Class numbers.
@@ -43,7 +43,7 @@ Segment = Callable[[UInt8[np.ndarray, "h w 3"]], Int[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, eq=False)
 class SegmenterReading:
-    """Predictions of a panorama by column.
+    """Predictions of a sphere by column.
 
     `openings` are probabilities of door and window. `log_distance` is that of the wall in camera heights; NaN where it
     is not visible.
@@ -53,10 +53,10 @@ class SegmenterReading:
     log_distance: Float[np.ndarray, "w"]
 
 
-def read_walls_and_openings(panorama: UInt8[np.ndarray, "h w 3"], segment: Segment, width: int) -> SegmenterReading:
-    """Predict the walls and openings of a panorama in `width` columns."""
+def read_walls_and_openings(sphere: UInt8[np.ndarray, "h w 3"], segment: Segment, width: int) -> SegmenterReading:
+    """Predict the walls and openings of a sphere in `width` columns."""
     elevation_deg = np.arange(-_REACH_DEG, _REACH_DEG, _STEP_DEG) + 0.5 * _STEP_DEG
-    classes = _class_map(panorama, segment, np.radians(elevation_deg), width)
+    classes = _class_map(sphere, segment, np.radians(elevation_deg), width)
     return SegmenterReading(_openings(classes, elevation_deg), _walls(classes, elevation_deg))
 
 
@@ -104,22 +104,22 @@ def _line_distance(surface: Bool[np.ndarray, "r w"], wall: Bool[np.ndarray, "r w
 
 
 def _class_map(
-    panorama: UInt8[np.ndarray, "h w 3"], segment: Segment, elevation: Float[np.ndarray, "r"], width: int
+    sphere: UInt8[np.ndarray, "h w 3"], segment: Segment, elevation: Float[np.ndarray, "r"], width: int
 ) -> Int[np.ndarray, "r {width}"]:
     """Return the class of every direction, from the view whose centre is nearest in azimuth."""
-    rows, columns = panorama.shape[:2]
+    rows, columns = sphere.shape[:2]
     azimuth = ((np.arange(width) + 0.5) / width - 0.5) * TWO_PI
     nearest = np.round(azimuth / (TWO_PI / _VIEWS)).astype(int)
     kind = np.zeros((len(elevation), width), dtype=np.int64)
     for view in np.unique(nearest):
         centre, chosen = view * TWO_PI / _VIEWS, nearest == view
-        size, focal = PANORAMA_ROWS, 0.5 * PANORAMA_ROWS / math.tan(math.radians(_FIELD_OF_VIEW_DEG / 2.0))
+        size, focal = SPHERE_ROWS, 0.5 * SPHERE_ROWS / math.tan(math.radians(_FIELD_OF_VIEW_DEG / 2.0))
         pixel = np.arange(size) + 0.5 - 0.5 * size
         pixel_azimuth = centre + np.arctan2(pixel, focal)[None, :]
         pixel_elevation = np.arctan2(-pixel[:, None], np.hypot(pixel, focal)[None, :])
         column = np.floor((pixel_azimuth / TWO_PI + 0.5) * columns).astype(int) % columns
         row = np.clip(np.floor((0.5 - pixel_elevation / math.pi) * rows).astype(int), 0, rows - 1)
-        classes = segment(panorama[row, np.broadcast_to(column, row.shape)])
+        classes = segment(sphere[row, np.broadcast_to(column, row.shape)])
         relative = azimuth[chosen] - centre
         x = np.floor(np.tan(relative) * focal + 0.5 * size).astype(int)
         y = np.floor(-np.tan(elevation)[:, None] / np.cos(relative) * focal + 0.5 * size).astype(int)
@@ -141,12 +141,12 @@ def load_segmenter(path: Path) -> Segment:
         raise ConfigError(f"teacher '{path}' cannot be run: {error}") from error
     (model_input,), (model_output,) = interpreter.get_input_details(), interpreter.get_output_details()
     shape, dtype = tuple(model_input["shape"]), np.dtype(model_input["dtype"])
-    if shape != (1, PANORAMA_ROWS, PANORAMA_ROWS, 3) or dtype != np.uint8:
+    if shape != (1, SPHERE_ROWS, SPHERE_ROWS, 3) or dtype != np.uint8:
         raise ConfigError(f"teacher '{path}' takes {shape} {dtype}; (1, 512, 512, 3) uint8 is required")
 
     def segment(picture: np.ndarray) -> np.ndarray:
         interpreter.set_tensor(model_input["index"], np.ascontiguousarray(picture[None]))
         interpreter.invoke()
-        return interpreter.get_tensor(model_output["index"]).reshape(PANORAMA_ROWS, PANORAMA_ROWS)
+        return interpreter.get_tensor(model_output["index"]).reshape(SPHERE_ROWS, SPHERE_ROWS)
 
     return segment

@@ -22,7 +22,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, Shot, sample_shots
@@ -33,13 +33,13 @@ from lalaloc_core.render.sampling import PoseSet, TripletSampling, sample_neighb
 # Minimum distance (m) of a camera below the ceiling of a neighbour's room.
 _HEADROOM_M = 0.1
 _MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
-# Camera heights of panoramas, including unusually low and high ones.
+# Camera heights of spheres, including unusually low and high ones.
 _CAMERA_HEIGHTS_M = (0.5, 2.2)
-# Share of generated panoramas on thresholds, beside walls, in corridors and closets.
+# Share of generated spheres on thresholds, beside walls, in corridors and closets.
 _HARD_SHARE = 0.25
-# Share of generated panoramas at night.
+# Share of generated spheres at night.
 _NIGHT_SHARE = 0.12
-# Share of generated panoramas with uneven ceilings, and with kitchens and closets as in real homes.
+# Share of generated spheres with uneven ceilings, and with kitchens and closets as in real homes.
 _FITTED_SHARE = 0.4
 _SCENES_CACHED = 256
 _PICTURE_BYTES_CACHED = 1 << 28
@@ -58,8 +58,8 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PanoramaSample:
-    """A panorama and its pose; `image` is (h, w, 3) RGB bytes, or a scene to be rendered later."""
+class SphereSample:
+    """A sphere and its pose; `image` is (h, w, 3) RGB bytes, or a scene to be rendered later."""
 
     plan: FloorPlan
     position_m: Float[np.ndarray, "2"]
@@ -77,7 +77,7 @@ class PanoramaSample:
 class GeneratedSource:
     """Source of generated homes: a new one for every visit, with anchors and cameras anywhere on the floor.
 
-    With `textures` None all materials are procedural. `deferred` panoramas are scenes, to be rendered by `renderer` in
+    With `textures` None all materials are procedural. `deferred` spheres are scenes, to be rendered by `renderer` in
     another process. `window` is the part of the sphere that samples show, None for all of it.
     """
 
@@ -124,8 +124,8 @@ class GeneratedSource:
             )
         return groups
 
-    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
-        """Return stage 2's panoramas, `height` x `width`; empty if the scene cannot be used."""
+    def samples(self, visit: int, height: int, width: int) -> list[SphereSample]:
+        """Return stage 2's spheres, `height` x `width`; empty if the scene cannot be used."""
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(
@@ -150,8 +150,8 @@ class GeneratedSource:
             images = list(renderer.render_scenes(scenes).numpy())
         return [_sample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
 
-    def renderer(self, device: torch.device, height: int, width: int) -> PanoramaRenderer:
-        """Create the renderer of deferred panoramas; its pixels are those of `samples`."""
+    def renderer(self, device: torch.device, height: int, width: int) -> SphereRenderer:
+        """Create the renderer of deferred spheres; its pixels are those of `samples`."""
         return self._renderers_on(device).renderer(height, width, self.config.image.supersample, self.window)
 
     def _renderers_on(self, device: torch.device | str) -> RendererCache:
@@ -168,7 +168,7 @@ def _picture_key(
 class SceneSource:
     """Source of a data set's training scenes in shuffled epochs; each visit draws some of a scene's cameras.
 
-    Anchors of stage 1 are the poses of the panoramas; stage 2 draws the appearance for each visit (paper, section 5).
+    Anchors of stage 1 are the poses of the spheres; stage 2 draws the appearance for each visit (paper, section 5).
     `skip_bad` skips files that cannot be used, and appends their errors to `problems`.
     """
 
@@ -213,8 +213,8 @@ class SceneSource:
                     break
         return groups
 
-    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
-        """Return stage 2's panoramas, `height` x `width`."""
+    def samples(self, visit: int, height: int, width: int) -> list[SphereSample]:
+        """Return stage 2's spheres, `height` x `width`."""
         rng = np.random.default_rng([7, self.config.seed, visit])
         scene = self._scene(visit)
         if scene is None:
@@ -269,8 +269,8 @@ class SceneSource:
 Source = GeneratedSource | SceneSource
 
 
-def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | DeferredScene) -> PanoramaSample:
-    return PanoramaSample(
+def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | DeferredScene) -> SphereSample:
+    return SphereSample(
         plan=plan,
         position_m=camera.position_m,
         room_index=camera.room_index,
@@ -281,7 +281,7 @@ def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | Deferred
 
 
 def _group_around(
-    anchor: Camera | PanoramaSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
+    anchor: Camera | SphereSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
 ) -> Group | None:
     pose = PoseSet(np.asarray(anchor.position_m)[None], np.array([anchor.room_index]))
     near = sample_neighbours(plan, pose, sampling, rng, anchor.camera_height_m + _HEADROOM_M)

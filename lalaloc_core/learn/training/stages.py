@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.batch_streams import PanoramaBatches
+from lalaloc_core.learn.training.batch_streams import SphereBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
@@ -38,7 +38,7 @@ class TrainingStage(ABC, Generic[StageConfigT]):
         settings: budget, optimiser and weights of the losses.
         modules: trained networks by name.
         teacher: frozen network used by the losses; the loop moves it to the training device.
-        photographs: unlabelled photographs, in addition to the source's panoramas.
+        photographs: unlabelled photographs, in addition to the source's spheres.
     """
 
     name: ClassVar[str]
@@ -87,7 +87,7 @@ def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
     return LayoutDecoder(config.latent_size) if config.layout.decode_weight else None
 
 
-def panorama_batches(
+def sphere_batches(
     config: TrainConfig,
     source: Source,
     *,
@@ -97,13 +97,13 @@ def panorama_batches(
     neighbours: bool = False,
     views: bool = False,
 ) -> Iterator[Batch]:
-    """Yield panorama batches from a step on, with homes or parts of the epoch that earlier steps have not used.
+    """Yield sphere batches from a step on, with homes or parts of the epoch that earlier steps have not used.
 
     Rows hold the layouts of neighbouring poses if `neighbours` is set; `views` are parts of the horizon; `device`
-    renders deferred panoramas.
+    renders deferred spheres.
     """
     first_visit = first_step * (config.image.batch // config.image.shots_per_home + 1)
-    batches = load_batches(PanoramaBatches(config, source, neighbours, first_visit, views), workers)
+    batches = load_batches(SphereBatches(config, source, neighbours, first_visit, views), workers)
     if isinstance(source, GeneratedSource) and source.deferred:
         sizes = config.view if views else config.image_sizes
         renderer = source.renderer(device, sizes.image_height, sizes.image_width)

@@ -32,11 +32,11 @@ class TrainingData:
     Attributes:
         dataset: data set; None draws homes with the generator, without touching disk.
         textures: folder of material pictures for the generator; None makes all materials procedural.
-        deferred: render the generator's panoramas on the training device instead of in the workers.
+        deferred: render the generator's spheres on the training device instead of in the workers.
         validation_scenes: maximum number of validation scenes, spread evenly over the split.
         heldout: out-of-distribution scenes; image validation reports their validation split too, but no choice depends
             on it.
-        photographs: folders of panoramas for the image stages, see `training.photograph_targets`.
+        photographs: folders of spheres for the image stages, see `training.photograph_targets`.
         teachers: segmenter and bundle that predict the walls and openings of those without annotation.
     """
 
@@ -96,9 +96,9 @@ class TrainingData:
         device: torch.device,
         folder: Path | None = None,
     ) -> Validate:
-        """Create the validation with panorama queries, in the data set's usual appearance.
+        """Create the validation with sphere queries, in the data set's usual appearance.
 
-        Without a `layout_encoder` the one being trained is used; `folder` caches rendered panoramas.
+        Without a `layout_encoder` the one being trained is used; `folder` caches rendered spheres.
         """
         usual = None if self.dataset is None else self.dataset.appearances[0]
         problems: list[DatasetError] | None = [] if self.skip_bad else None

@@ -73,7 +73,7 @@ class LayoutValidation:
 
 
 class ImageValidation:
-    """Panorama queries, one per camera in its usual appearance: accuracy of the nearest grid pose.
+    """Sphere queries, one per camera in its usual appearance: accuracy of the nearest grid pose.
 
     The nearest pose is found by latent, and for networks with a wall profile also by that profile: the mean |Δ log
     distance|, each clipped at `_MAX_LOG_ERROR`, to the layouts of the grid. Metrics cover all queries and each

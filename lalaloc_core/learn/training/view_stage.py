@@ -12,14 +12,14 @@ from torch.nn import functional
 
 from lalaloc_core.learn.synth.augmentation.framing import framed
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
-from lalaloc_core.learn.synth.rendering.panorama import Window
+from lalaloc_core.learn.synth.rendering.sphere_renderer import Window
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, panorama_batches, photograph_loss, sample_styles
+from lalaloc_core.learn.training.stages import TrainingStage, photograph_loss, sample_styles, sphere_batches
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
 
@@ -52,7 +52,7 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         device = next(self.encoder.parameters()).device
         seed = int(np.random.default_rng([10, self.config.seed, first_step]).integers(1 << 62))
         self._generator = torch.Generator(device).manual_seed(seed)
-        return panorama_batches(
+        return sphere_batches(
             self.config, self.source, first_step=first_step, workers=workers, device=device, views=True
         )
 

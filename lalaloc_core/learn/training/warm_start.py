@@ -48,7 +48,7 @@ class WarmStart:
     """Trained weights of one stage.
 
     Attributes:
-        origin: description for checkpoints and manifests, with the total minutes and panoramas spent so far.
+        origin: description for checkpoints and manifests, with the total minutes and spheres spent so far.
     """
 
     checkpoint: Checkpoint
@@ -111,28 +111,35 @@ def _run_weights(folder: Path, stage: str) -> WarmStart:
 
 
 def training_totals(checkpoint: Checkpoint) -> dict[str, float]:
-    """Return the minutes, and for images the panoramas, spent on the weights of a stage, ancestors included."""
-    before = checkpoint.begun_from
+    """Return the minutes, and for images the spheres, spent on the weights of a stage, ancestors included."""
+    before = _with_new_names(checkpoint.begun_from)
     minutes = checkpoint.seconds / 60.0 + before.get("minutes_in_all", 0.0)
     totals: dict[str, float] = {"minutes_in_all": round(minutes, 1)}
     if checkpoint.stage != "layout":
-        totals["panoramas_in_all"] = panorama_count(checkpoint) + before.get("panoramas_in_all", 0)
+        totals["spheres_in_all"] = sphere_count(checkpoint) + before.get("spheres_in_all", 0)
     return totals
 
 
-def panorama_count(checkpoint: Checkpoint) -> int:
-    """Return the number of distinct panoramas used by a stage."""
+def sphere_count(checkpoint: Checkpoint) -> int:
+    """Return the number of distinct spheres used by a stage."""
     image = checkpoint.config.image
-    return checkpoint.step * image.batch // image.uses_per_panorama
+    return checkpoint.step * image.batch // image.uses_per_sphere
 
 
 def _manifest_totals(spent: dict[str, Any]) -> dict[str, float]:
     """Return a stage's totals from its manifest entry, ancestors included."""
-    totals = {}
-    for name in ("minutes", "panoramas"):
+    totals, spent = {}, _with_new_names(spent)
+    for name in ("minutes", "spheres"):
         in_all = spent.get(f"{name}_in_all", spent.get(name))
         totals |= {} if in_all is None else {f"{name}_in_all": in_all}
     return totals
+
+
+def _with_new_names(spent: dict[str, Any]) -> dict[str, Any]:
+    return {_EARLIER_KEYS.get(name, name): value for name, value in spent.items()}
+
+
+_EARLIER_KEYS = {"panoramas": "spheres", "panoramas_in_all": "spheres_in_all"}
 
 
 def halved_weights(network: bytes) -> dict[str, Tensor]:

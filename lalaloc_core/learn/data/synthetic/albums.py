@@ -17,7 +17,7 @@ from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RendererCache, split_renderer_cache
 from lalaloc_core.learn.data.views import cut_view, tilt_by_hand
 from lalaloc_core.learn.synth.homes.plans import Home, home_of
-from lalaloc_core.learn.synth.rendering.panorama import Window
+from lalaloc_core.learn.synth.rendering.sphere_renderer import Window
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, POSE_MARGIN_M, Shot
 from lalaloc_core.photograph.cameras import Perspective
 

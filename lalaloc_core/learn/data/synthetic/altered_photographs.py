@@ -63,7 +63,7 @@ class DisturbedPhotograph(WithoutDepth):
 
 # One of this many photographs shows no room, one is upside down, and in every second home one is cropped.
 _EVERY = 4
-# Rows and columns of a panorama in the view of an ordinary camera.
+# Rows and columns of a sphere in the view of an ordinary camera.
 _CROP = slice(0.3, 0.7), slice(0.25, 0.5)
 
 
@@ -104,7 +104,7 @@ def _mismatched(camera: Camera, other: Camera, k: int, home: int) -> dict[Appear
 
 @dataclass(frozen=True, eq=False)
 class UpsideDown:
-    """DatasetPhotograph of a camera mounted upside down: the panorama rotated by half a turn."""
+    """DatasetPhotograph of a camera mounted upside down: the sphere rotated by half a turn."""
 
     photograph: DatasetPhotograph
 
@@ -119,7 +119,7 @@ class UpsideDown:
 
 @dataclass(frozen=True, eq=False)
 class Cropped(WithoutDepth):
-    """View of an ordinary camera, stretched to the size of a panorama."""
+    """View of an ordinary camera, stretched to the size of a sphere."""
 
     photograph: DatasetPhotograph
 

@@ -16,7 +16,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, HomeScenes, Scene, Split
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Window
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
@@ -99,15 +99,15 @@ class RendererCache:
     def __init__(self, materials: MaterialLibrary, device: torch.device | str = "cpu") -> None:
         self.materials = materials
         self._device = device
-        self._renderers: dict[tuple[int, int, tuple[int, int], Window | None], PanoramaRenderer] = {}
+        self._renderers: dict[tuple[int, int, tuple[int, int], Window | None], SphereRenderer] = {}
 
     def renderer(
         self, height: int, width: int, supersample: tuple[int, int] = (1, 1), window: Window | None = None
-    ) -> PanoramaRenderer:
+    ) -> SphereRenderer:
         """Return the renderer of a picture size with `supersample` rays per pixel along (rows, columns)."""
         key = height, width, supersample, window
         if key not in self._renderers:
-            self._renderers[key] = PanoramaRenderer(
+            self._renderers[key] = SphereRenderer(
                 self.materials, height=height, width=width, device=self._device, supersample=supersample, window=window
             )
         return self._renderers[key]

@@ -16,7 +16,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.data.synthetic.hand_held import Instant, exposed
 from lalaloc_core.learn.data.views import cut_view, tilt_by_hand
-from lalaloc_core.learn.synth.rendering.panorama import Window
+from lalaloc_core.learn.synth.rendering.sphere_renderer import Window
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot
 from lalaloc_core.photograph.cameras import Perspective
 

@@ -49,7 +49,7 @@ from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_ren
 from lalaloc_core.learn.dataset_names import SPLITS, Split
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
 from lalaloc_core.learn.synth.homes.plans import home_of
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.lighting import MOODS
 from lalaloc_core.learn.synth.scene.materials import CATEGORIES
 from lalaloc_core.learn.synth.scene.shots import Shot, stage_rooms
@@ -63,7 +63,7 @@ _SCENE = re.compile(r"scene_\d+")
 class Synthesis:
     """Settings of generated scenes on disk.
 
-    Panoramas are twice as wide as their `height`, which is even. With `textures` None all materials are procedural.
+    Spheres are twice as wide as their `height`, which is even. With `textures` None all materials are procedural.
     """
 
     root: Path
@@ -129,10 +129,10 @@ def synthesise(settings: Synthesis, numbers: dict[Split, tuple[int, ...]], *, wo
         closing(_write_serially(missing) if workers == 1 else _write_in_processes(workers, missing)) as finished,
         tqdm(total=len(wanted), initial=len(wanted) - len(missing), desc="synth", unit="scene") as bar,
     ):
-        panoramas = 0
+        spheres = 0
         for count in finished:
-            panoramas += count
-            bar.set_postfix_str(f"{panoramas / bar.format_dict['elapsed']:.1f} panoramas/s", refresh=False)
+            spheres += count
+            bar.set_postfix_str(f"{spheres / bar.format_dict['elapsed']:.1f} spheres/s", refresh=False)
             bar.update()
     return len(missing)
 
@@ -158,7 +158,7 @@ class _Job:
 def _write_scene(job: _Job, stop: Event | None = None) -> int:
     """Render and write one scene; a failure leaves no files.
 
-    `stop` is checked between rooms; when set, the scene is abandoned. The result is the number of panoramas written.
+    `stop` is checked between rooms; when set, the scene is abandoned. The result is the number of spheres written.
     """
     settings, split = job.settings, SPLIT_NUMBERS[job.split]
     home, rng = home_of(split, settings.seed, job.number)
@@ -181,7 +181,7 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
     return PICTURES_PER_ROOM * len(shots)
 
 
-def _write_room(folder: Path, shot: Shot, renderer: PanoramaRenderer) -> None:
+def _write_room(folder: Path, shot: Shot, renderer: SphereRenderer) -> None:
     folder.mkdir(parents=True)
     write_camera(folder, shot.home.plan.rooms[shot.room_index], shot.position_m, shot.camera_height_m)
     for furniture in FURNITURE_LEVELS:
@@ -223,7 +223,7 @@ def _write_errors(path: Path) -> Iterator[None]:
 
 
 def _write_serially(jobs: Sequence[_Job]) -> Generator[int]:
-    """Write scenes in this process and yield their numbers of panoramas."""
+    """Write scenes in this process and yield their numbers of spheres."""
     threads = torch.get_num_threads()
     # As in worker processes, because the number of threads changes the last bit of sums.
     torch.set_num_threads(1)
@@ -234,7 +234,7 @@ def _write_serially(jobs: Sequence[_Job]) -> Generator[int]:
 
 
 def _write_in_processes(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
-    """Write scenes in worker processes and yield their numbers of panoramas in order."""
+    """Write scenes in worker processes and yield their numbers of spheres in order."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))

@@ -17,7 +17,7 @@ _JPEG_SHARE = 0.25
 
 
 def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
-    """Change exposure, colour and noise of panoramas at random.
+    """Change exposure, colour and noise of spheres at random.
 
     `strength` 0 changes nothing, 1 changes the exposure by about a third. The generator is on the pictures' device.
     """
@@ -38,7 +38,7 @@ def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.
 
 
 def optics(image: Float[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
-    """Apply random effects of lens, film or file to panoramas.
+    """Apply random effects of lens, film or file to spheres.
 
     Blur, vignetting of two lenses and a brightness step between them, clipped highlights, lifted shadows, pale or
     strong colours, JPEG; each for a share of the pictures. `strength` 0 changes nothing, 1 changes most pictures. The

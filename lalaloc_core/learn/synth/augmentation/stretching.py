@@ -1,4 +1,4 @@
-"""Panoramas of rooms stretched along two horizontal axes: "pano stretch" of HorizonNet (Sun et al., CVPR 2019)."""
+"""Spheres of rooms stretched along two horizontal axes: "pano stretch" of HorizonNet (Sun et al., CVPR 2019)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def stretched(
     log_distance: Float[Tensor, "n w"],
     factors: Float[Tensor, "n 2"],
 ) -> tuple[UInt8[Tensor, "n h w 3"], Float[Tensor, "n w k"], Float[Tensor, "n w"]]:
-    """Stretch panoramas and their labels per column about the camera.
+    """Stretch spheres and their labels per column about the camera.
 
     `openings` and `log_distance` are labels per column; `factors` are (a, b), across and along the direction of the
     central column.
@@ -31,7 +31,7 @@ def stretched(
 
 
 def stretched_images(images: UInt8[Tensor, "n h w 3"], factors: Float[Tensor, "n 2"]) -> UInt8[Tensor, "n h w 3"]:
-    """Stretch panoramas only, as `stretched`."""
+    """Stretch spheres only, as `stretched`."""
     height, width = images.shape[1:3]
     column, reach = _seen_at(width, factors)
     tangent = torch.tan((0.5 - (torch.arange(height) + 0.5) / height) * math.pi)

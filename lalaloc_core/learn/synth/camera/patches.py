@@ -1,4 +1,4 @@
-"""Patches over the poles of a panorama: discs, logos, a mirrored ball, tripod legs, the photographer."""
+"""Patches over the poles of a sphere: discs, logos, a mirrored ball, tripod legs, the photographer."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Rendering of scenes as panoramas: a batched ray caster in torch, and shading.
+"""Rendering of scenes as spheres: a batched ray caster in torch, and shading.
 
-Begin with `panorama.py`, the panorama renderer. `cast.py` and `prisms.py` cast rays against walls and furniture,
+Begin with `sphere_renderer.py`, the sphere renderer. `cast.py` and `prisms.py` cast rays against walls and furniture,
 `shading.py` shades the hits and draws the view through windows.
 """
 
-from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer

@@ -1,4 +1,4 @@
-"""Ray casting of panoramas against batches of scenes, column by column.
+"""Ray casting of spheres against batches of scenes, column by column.
 
 All tensors are laid out (b, c, h): batch, azimuth column, image row. The rays of a column lie in one vertical plane, so
 walls and prisms are intersected once per column in 2-D, and a row only compares heights.

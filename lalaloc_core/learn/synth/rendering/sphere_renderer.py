@@ -1,4 +1,4 @@
-"""Photographs of procedural homes: the panorama renderer."""
+"""Photographs of procedural homes: the sphere renderer."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Window:
     top: float
 
 
-class PanoramaRenderer:
-    """Renders shots as equirectangular panoramas of one size on one device.
+class SphereRenderer:
+    """Renders shots as equirectangular spheres of one size on one device.
 
     `supersample` is the number of rays per pixel along a column and along a row, or one number for both. Photographs
     average over their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too. `window` is the part
@@ -67,7 +67,7 @@ class PanoramaRenderer:
         window: Window | None = None,
     ) -> None:
         if window is None and height % 2:
-            raise InvalidInputError(f"a panorama of {height} rows has a row on the horizon; the height must be even")
+            raise InvalidInputError(f"a sphere of {height} rows has a row on the horizon; the height must be even")
         self._materials = materials
         self._device = torch.device(device)
         self._atlas = Atlas(materials, self._device)
@@ -130,7 +130,7 @@ class PanoramaRenderer:
 
     @torch.no_grad()
     def depth_m(self, shots: Sequence[Shot]) -> Float[Tensor, "b h w"]:
-        """Return the range (m) along each pixel's ray, furniture included; at least as large as a panorama."""
+        """Return the range (m) along each pixel's ray, furniture included; at least as large as a sphere."""
         return self._range_m(self.hits(shots))
 
     def _photograph(self, batch: SceneBatch, hits: Hits, direction: Float[Tensor, "b c 2"]) -> UInt8[Tensor, "b h w 3"]:
@@ -182,11 +182,11 @@ def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBa
 
 
 def contact_sheet(path: Path, rng: np.random.Generator, textures: Path | None = None, *, height: int = 256) -> None:
-    """Write a sheet of 16 panoramas of 16 homes, from empty to full.
+    """Write a sheet of 16 spheres of 16 homes, from empty to full.
 
-    `textures` is a folder of material pictures, and `height` that of one panorama in pixels.
+    `textures` is a folder of material pictures, and `height` that of one sphere in pixels.
     """
-    renderer = PanoramaRenderer(MaterialLibrary.create(rng, textures), height=height, width=2 * height, supersample=2)
+    renderer = SphereRenderer(MaterialLibrary.create(rng, textures), height=height, width=2 * height, supersample=2)
     levels: list[FurnitureLevel] = ["empty", "simple", "full", "full"] * _SHEET_ROWS
     shots = [sample_shots(generate_home(rng), 1, rng, level)[0] for level in levels]
     pictures = renderer.render(shots).numpy()
