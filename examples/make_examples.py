@@ -18,8 +18,9 @@ from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.homes import Home, Opening, OpeningKind
-from lalaloc_core.learn.synth.rendering.sphere_renderer import Shot, SphereRenderer
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.spheres import level
 

@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.neighbours import markdown as markdown_of_neighbours
 from lalaloc_core.conditions import CONDITIONS, parts_of
 from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
-from lalaloc_core.evaluate.reproduce.result import TableResult, markdown
+from lalaloc_core.evaluate.reproduce.table import TableResult, markdown
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"
@@ -24,7 +24,6 @@ _ACCURACY_ROWS = {
     "sphere_empty": "unfurnished, known heading",
     "heldout_full": "out-of-distribution, furnished, known heading",
     "heldout_full_unknown_heading": "out-of-distribution, furnished, unknown heading",
-    "heldout_empty": "out-of-distribution, unfurnished, known heading",
     "layout": "true layout as query, known heading",
 }
 _PHOTOGRAPHS = {"sphere": "sphere", "phone": "80°", "three_phone": "three of 80°"}

@@ -64,8 +64,6 @@ LAYERS = {
     "lalaloc_core.learn.synth.augmentation": 4,
     "lalaloc_core.learn.synth.scene": 4,
     "lalaloc_core.learn.synth.rendering": 10,
-    # Independent of synth; neither imports the other.
-    "lalaloc_core.learn.heldout": 3,
     "lalaloc_core.learn.data": 10,
     "lalaloc_core.learn.data.synthetic": 11,
     "lalaloc_core.learn.training": 12,
@@ -92,7 +90,6 @@ QUERY_SIDE = ("bundle", "floorplan", "importers", "photograph", "render", "nets"
 FORBIDDEN = {
     **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
     "lalaloc_core.learn": ("lalaloc_core.evaluate",),
-    "lalaloc_core.learn.heldout": ("lalaloc_core.learn.synth",),
     "service": ("lalaloc_core.learn", "lalaloc_core.evaluate", "lalaloc_core.cli"),
 }
 # Layers of the service, above the layers of the core, lowest first.

@@ -21,7 +21,7 @@ import torch
 
 from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle, write_manifest
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.layout_network import LayoutDecoder
 
 COMMITTED = Path(__file__).parent / "tiny.zip"
 _ROOT = Path(__file__).parents[1]

@@ -14,7 +14,7 @@ from lalaloc_core.cli.lab import Command, check_range
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.files import default_bundle
-from lalaloc_core.learn.dataset_names import Split
+from lalaloc_core.learn.dataset_names import HELDOUT_HOMES, Split
 
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4
@@ -32,7 +32,7 @@ class Evaluate:
         kind: kind of query.
         data: data set (default: generated homes).
         dataset: format of the data set (default: detected from its files).
-        generator: generator of homes: the one used in training, or out-of-distribution homes.
+        generator: generator of homes: the one used in training, or sixty out-of-distribution homes.
         homes: number of generated homes, 4 queries each.
         seed: random seed of generated homes.
         textures: folder of material pictures for generated homes (default: procedural materials).
@@ -97,7 +97,7 @@ class Report:
     Attributes:
         runs: folders of runs.
         out: page to write.
-        pictures: folder to write the page's pictures to as well.
+        pictures: folder to write the page's charts to as well.
     """
 
     runs: tuple[Path, ...]
@@ -304,24 +304,20 @@ def _calibrate(arguments: Calibrate) -> None:
 
 def _generated_homes(arguments: Evaluate) -> dict[str, Any]:
     """Return the arguments of the chosen generator as plain data."""
-    generated = _generated(arguments, arguments.furniture or "full")
     if arguments.generator == "synth":
-        return generated
-    if arguments.textures is not None:
-        raise InvalidInputError("--textures is for --generator synth; 'heldout' has materials of its own")
-    if arguments.split == "train":
-        raise InvalidInputError("--generator heldout has no split 'train'; choose --split validation or test")
-    return {"generator": arguments.generator} | {name: generated[name] for name in ("homes", "seed", "furniture")}
-
-
-def _generated(arguments: Evaluate, furniture: str | None) -> dict[str, Any]:
-    """Return arguments of `GeneratedScenes` as plain data."""
-    return {
-        "homes": arguments.homes,
-        "seed": arguments.seed,
-        "furniture": furniture,
-        "textures": None if arguments.textures is None else str(arguments.textures),
-    }
+        return {
+            "homes": arguments.homes,
+            "seed": arguments.seed,
+            "furniture": arguments.furniture or "full",
+            "textures": None if arguments.textures is None else str(arguments.textures),
+        }
+    if arguments.textures is not None or arguments.seed != 0 or arguments.furniture not in (None, "full"):
+        raise InvalidInputError(
+            "--textures, --seed and --furniture are for --generator synth; homes of 'heldout' are furnished and fixed"
+        )
+    if arguments.split != "test":
+        raise InvalidInputError(f"--generator heldout has no split '{arguments.split}'; choose --split test")
+    return {"generator": arguments.generator, "homes": min(arguments.homes, HELDOUT_HOMES)}
 
 
 COMMANDS = {

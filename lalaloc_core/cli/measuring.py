@@ -117,11 +117,11 @@ def _bench(arguments: Bench) -> None:
     check_range(arguments, 1, "homes", "queries")
     if arguments.profile:
         from lalaloc_core.bundle import Bundle
-        from lalaloc_core.evaluate.bench.query_profile import profile_table
+        from lalaloc_core.evaluate.bench.speed import profile_table
 
         print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
         return
-    from lalaloc_core.evaluate.bench.benchmarks import run_bench
+    from lalaloc_core.evaluate.bench.bench_groups import run_bench
 
     groups = arguments.only or _GROUPS
     report = run_bench(
@@ -138,7 +138,7 @@ def _photographs(arguments: Photographs) -> None:
     check_range(arguments, 0, "workers", "galleries")
     if arguments.galleries > GALLERIES:
         raise ConfigError(f"galleries is {arguments.galleries}; the limit is {GALLERIES}")
-    from lalaloc_core.evaluate.report.photograph_report import SHEET_FILE, evaluate_photographs
+    from lalaloc_core.evaluate.report.photograph_report import evaluate_photographs
 
     results = evaluate_photographs(
         arguments.data,
@@ -150,7 +150,6 @@ def _photographs(arguments: Photographs) -> None:
         command=shlex.join(["lalaloc", *sys.argv[1:]]),
     )
     print(results.markdown())
-    print(f"pictures: {arguments.out / SHEET_FILE}")
 
 
 def _reproduce(arguments: Reproduce) -> None:
@@ -174,7 +173,7 @@ def _reproduce(arguments: Reproduce) -> None:
             "--data is missing; give the folder of Structured3D or the output of `lalaloc lab synth`"
         )
 
-    from lalaloc_core.evaluate.reproduce.result import markdown
+    from lalaloc_core.evaluate.reproduce.table import markdown
     from lalaloc_core.evaluate.reproduce.table_maker import TableMaker
 
     table_maker = TableMaker(

@@ -1,4 +1,4 @@
-"""`lalaloc lab synth` and `lalaloc lab contact-sheet`."""
+"""`lalaloc lab synth`."""
 
 from __future__ import annotations
 
@@ -34,21 +34,6 @@ class Synth:
     workers: int = 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class ContactSheet:
-    """Write a picture with examples of synthetic spheres.
-
-    Attributes:
-        out: picture to write.
-        seed: random seed of generated homes.
-        textures: folder of material pictures for generated homes (default: procedural materials).
-    """
-
-    out: Path = Path("contact_sheet.jpg")
-    seed: int = 0
-    textures: Path | None = None
-
-
 def _synth(arguments: Synth) -> None:
     from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
 
@@ -63,12 +48,4 @@ def _synth(arguments: Synth) -> None:
     print(f"{arguments.out}: {counts}; {written} of them new")
 
 
-def _contact_sheet(arguments: ContactSheet) -> None:
-    import numpy as np
-
-    from lalaloc_core.learn.synth.rendering.sphere_renderer import contact_sheet
-
-    contact_sheet(arguments.out, np.random.default_rng(arguments.seed), arguments.textures)
-
-
-COMMANDS = {"synth": Command(Synth, _synth, "out"), "contact-sheet": Command(ContactSheet, _contact_sheet, "out")}
+COMMANDS = {"synth": Command(Synth, _synth, "out")}

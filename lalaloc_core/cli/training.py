@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 # Four spheres each; rendering one takes a third of a second, and validation uses all of them every few minutes.
 _VALIDATION_HOMES = 50
-# Ratio of validation homes to out-of-distribution homes, which take longer to render.
-_PER_HELDOUT_HOME = 3
 # Parameters of glibc (malloc.h): size from which blocks are mapped, and free memory that is kept.
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
@@ -125,7 +123,6 @@ def _train(arguments: Train) -> None:
     import torch
 
     from lalaloc_core.learn.data.dataset_detection import open_dataset
-    from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
     from lalaloc_core.learn.training.run import train_stage
     from lalaloc_core.learn.training.training_data import TrainingData
 
@@ -137,14 +134,12 @@ def _train(arguments: Train) -> None:
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
         _keep_freed_memory()
     render = arguments.render or ("workers" if device.type == "cpu" else "device")
-    heldout_homes = max(arguments.validation_homes // _PER_HELDOUT_HOME, 1)
     data = TrainingData(
         dataset=None if arguments.data is None else open_dataset(arguments.data),
         skip_bad=arguments.skip_bad,
         textures=arguments.textures,
         deferred=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
-        heldout=None if arguments.data is not None else HeldoutScenes(homes=heldout_homes),
         photographs=arguments.photographs,
         teachers=arguments.teacher,
     )

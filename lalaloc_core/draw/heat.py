@@ -5,7 +5,6 @@ Darker is more probable or closer. Scales are logarithmic, as in the paper's fig
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -83,15 +82,6 @@ class HeatMap:
     shade: Float[np.ndarray, "n"]
     title: str
     ticks: tuple[tuple[float, str], ...]
-
-
-def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> HeatMap:
-    """Return a map of distances; the smallest is the darkest."""
-    low = max(float(distance.min()), 1e-3)
-    high = max(float(distance.max()), 1.001 * low)
-    shade = 1.0 - np.log(np.maximum(distance, low) / low) / math.log(high / low)
-    ticks = tuple((1.0 - share, f"{low * (high / low) ** share:.2g}") for share in (0.0, 1 / 3, 2 / 3, 1.0))
-    return HeatMap(cells, shade, title, ticks)
 
 
 def posterior_map(plan: FloorPlan, places: ProbabilityMap, step_m: float) -> HeatMap:

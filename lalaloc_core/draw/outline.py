@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image
+from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, unit_rays, wrap_angle
-from lalaloc_core.draw.canvas import INK, ON_PHOTOGRAPH, Box, Number, document, image, path, pixels, png, words
+from lalaloc_core.draw.canvas import INK, ON_PHOTOGRAPH, Box, Number, image, path, words
 from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.render.profile import nearest_walls
@@ -192,13 +191,6 @@ class Stroke:
     colour: str
     width: float
     edge_width: float
-
-
-def draw_strokes(photograph: UInt8[np.ndarray, "h w 3"], strokes: Sequence[Stroke]) -> Image.Image:
-    """Draw lines over a photograph, the last ones on top."""
-    height, width, _ = photograph.shape
-    whole = image(png(photograph), "png", (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')
-    return pixels(document(width, height, "", [whole, *(_stroke(stroke) for stroke in strokes)]))
 
 
 def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:

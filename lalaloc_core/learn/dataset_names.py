@@ -1,4 +1,4 @@
-"""Splits, formats and galleries of data sets; importing it loads no data set, so the command line can list them."""
+"""Splits, formats and sizes of data sets; importing it loads no data set, so the command line can list them."""
 
 from __future__ import annotations
 
@@ -13,5 +13,7 @@ DATASET_FORMATS = {
     "own": "own data",
     "annotated": "annotated photographs",
 }
+# Out-of-distribution homes.
+HELDOUT_HOMES = 60
 # Galleries of every annotated photograph.
 GALLERIES = 3

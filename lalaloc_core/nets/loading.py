@@ -10,8 +10,7 @@ from torch import nn
 from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError
-from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.layout_network import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.layout_network import LayoutDecoder, RingConfig, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperLayoutEncoder
 
 LayoutNetwork = RingLayoutEncoder | PaperLayoutEncoder

@@ -7,8 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lalaloc_core.nets.horizon_attention import HorizonAttention
-from lalaloc_core.nets.image_features import ImageFeatures, WallModes
+from lalaloc_core.nets.image_features import HorizonAttention, ImageFeatures, WallModes
 from lalaloc_core.nets.layout_network import RingConfig, pad_around
 
 IMAGE_MEAN = (0.5, 0.5, 0.5)

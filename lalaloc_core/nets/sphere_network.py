@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.nets.horizon_attention import HorizonAttention
-from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, WallModes
+from lalaloc_core.nets.image_features import HorizonAttention, ImageFeatures, StructureFeatures, WallModes
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, StyleMixing, Trunk, TrunkConfig
 

@@ -44,7 +44,7 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.nets import load_decoder
-from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.layout_network import LayoutDecoder
 from tests.core.test_training import small_paper
 from tests.strategies import crooked_flat, present, scene_of
 

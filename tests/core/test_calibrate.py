@@ -23,8 +23,13 @@ from lalaloc_core.bundle import (
     write_manifest,
 )
 from lalaloc_core.errors import BundleError, InvalidInputError
-from lalaloc_core.evaluate.calibrate.calibration import store_cohort, store_confidence
-from lalaloc_core.evaluate.calibrate.opening_appearance import fit_appearance, mixtures, redrawn
+from lalaloc_core.evaluate.calibrate.calibration import (
+    fit_appearance,
+    mixtures,
+    redrawn,
+    store_cohort,
+    store_confidence,
+)
 from lalaloc_core.evaluate.calibrate.parameter_fits import (
     Answers,
     cross_validate,

@@ -14,8 +14,8 @@ from PIL import Image
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.draw import canvas, rasterise
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
-from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
-from lalaloc_core.draw.outline import Stroke, draw_strokes, layout_outline, wall_line
+from lalaloc_core.draw.heat import Cells, HeatMap, heat_image, posterior_map
+from lalaloc_core.draw.outline import layout_outline, wall_line
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import ProbabilityMap
@@ -157,15 +157,6 @@ def test_equal_probabilities_have_equal_shades() -> None:
     assert np.median(heat.shade) > 0.9
 
 
-def test_smallest_distance_is_darkest() -> None:
-    cells = Cells.cover(PLAN, 0.2)
-    distance_m = 0.1 + np.linalg.norm(cells.poses.position_m - MIDDLE, axis=1)
-    heat = distance_map(cells, distance_m, "distance (m)")
-    assert heat.shade.argmax() == distance_m.argmin()
-    assert (heat.shade.min(), heat.shade.max()) == pytest.approx((0.0, 1.0))
-    assert distance_map(cells, np.ones(len(cells.poses)), "all alike").shade == pytest.approx(1.0)
-
-
 def colours(heat: HeatMap) -> np.ndarray:
     size = Cells.cover(PLAN, 0.05).room.shape
     drawn = (
@@ -184,15 +175,6 @@ def test_heat_map_colours_floors_only() -> None:
     inside = PLAN.room_index_at(np.stack([x_m, y_m], axis=1)) >= 0
     opaque = shown[..., 3].ravel() > 127
     assert (opaque == inside).mean() > 0.98
-
-
-def test_strokes_change_only_their_pixels() -> None:
-    photograph = np.full((64, 128, 3), 200, np.uint8)
-    line = np.array([[10.0, 32.0], [118.0, 32.0]])
-    drawn = np.asarray(draw_strokes(photograph, [Stroke([line], "#ff0000", 2.0, 4.0)]))
-    assert drawn.shape == photograph.shape
-    assert (drawn[:28] == 200).all()
-    np.testing.assert_array_equal(drawn[32, 64], [255, 0, 0])
 
 
 @pytest.mark.parametrize("picture", ["both", "plan", "photograph"])

@@ -15,13 +15,12 @@ from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import InvalidInputError, RunError
-from lalaloc_core.evaluate.bench.azimuths import azimuth_figures
+from lalaloc_core.evaluate.bench.accuracy import azimuth_figures
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m, score
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
-from lalaloc_core.learn.synth.scene.facts import facts_of
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph, facts_of
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from tests.core.questions import run_info
 from tests.strategies import present

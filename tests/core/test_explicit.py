@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError, InvalidInputError
-from lalaloc_core.evaluate.methods.decode import VdrDecode
-from lalaloc_core.evaluate.methods.explicit import ExplicitLayout, depth_aligner
+from lalaloc_core.evaluate.methods.explicit import ExplicitLayout, VdrDecode, depth_aligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import DepthGrid, Layout
@@ -28,7 +27,7 @@ from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.refine import LpoConfig, RefinementJob
 from lalaloc_core.localise.refine.latent_refiner import PoseOptimiser
 from lalaloc_core.localise.search.pipeline import LocaliseConfig
-from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
+from lalaloc_core.nets.layout_network import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.core.questions import CAMERA_M, BareRoom, paint, question_at
 from tests.core.test_headings import COLUMNS, RING

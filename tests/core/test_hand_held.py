@@ -17,8 +17,15 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.calibrate.turn_confidence import TurnSettings, calibrate_turns
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
-from lalaloc_core.learn.data.synthetic.hand_held import FILM_S, Instant, encode_film, exposed, turn_by_hand
-from lalaloc_core.learn.data.synthetic.turned import Phone, film_of_turn
+from lalaloc_core.learn.data.synthetic.turned import (
+    FILM_S,
+    Instant,
+    Phone,
+    encode_film,
+    exposed,
+    film_of_turn,
+    turn_by_hand,
+)
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.local_model import LocalModel

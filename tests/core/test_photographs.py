@@ -12,12 +12,15 @@ import torch
 from PIL import Image
 
 from lalaloc_core.errors import ConfigError, DatasetError
-from lalaloc_core.learn.synth.augmentation.photometric import _blurred, _lenses, optics
-from lalaloc_core.learn.synth.augmentation.stretching import stretched
-from lalaloc_core.learn.training.photograph_batches import Photographs
-from lalaloc_core.learn.training.photograph_targets import load_photographs, read_by_encoder
+from lalaloc_core.learn.synth.augmentation import _blurred, _vignetting, optics, stretched
+from lalaloc_core.learn.training.batches import Photographs
+from lalaloc_core.learn.training.photograph_targets import (
+    _class_map,
+    load_photographs,
+    read_by_encoder,
+    read_walls_and_openings,
+)
 from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.segmenter import _class_map, read_walls_and_openings
 from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from tests.painted import painted_surfaces, wall_distance_m
@@ -228,9 +231,9 @@ class TestOptics:
 
     def test_lens_seams_are_darker(self) -> None:
         seam = torch.tensor([0.5, 2.0])
-        assert torch.equal(_lenses(64, torch.zeros(2), torch.zeros(2), seam), torch.ones(2, 1, 64, 1))
-        gain = _lenses(64, torch.full((2,), 0.3), torch.zeros(2), seam)
+        assert torch.equal(_vignetting(64, torch.zeros(2), torch.zeros(2), seam), torch.ones(2, 1, 64, 1))
+        gain = _vignetting(64, torch.full((2,), 0.3), torch.zeros(2), seam)
         assert gain.amin() == pytest.approx(0.7, abs=0.01)
         assert gain.amax() == pytest.approx(1.0, abs=0.01)
-        stepped = _lenses(64, torch.zeros(2), torch.full((2,), 0.1), seam)
+        stepped = _vignetting(64, torch.zeros(2), torch.full((2,), 0.1), seam)
         assert sorted({round(value, 3) for value in stepped.flatten().tolist()}) == [0.9, 1.1]

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, room_type_from_label
-from lalaloc_core.learn.heldout.homes import HomeKey, home_of
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.sampling import pose_grid, random_poses
 from tests.strategies import plan_document, rectangle, seeds
@@ -316,17 +315,6 @@ def test_synthetic_home_plan_has_its_openings(seed: int) -> None:
     assert plan.warnings == ()
     assert plan.opening_kinds == frozenset(OPENING_CLASSES[1:])
     assert all(room.type != "unknown" for room in plan.rooms)
-
-
-@pytest.mark.parametrize("index", range(6))
-def test_heldout_home_plan_has_its_openings(index: int) -> None:
-    home = home_of(HomeKey(0, 3, index))
-    plan = home.plan.plan
-    expected = [(o.wall.room, o.wall.edge, o.behind.room if o.behind else -1) for o in home.openings]
-    expected += [(o.behind.room, o.behind.edge, o.wall.room) for o in home.openings if o.behind]
-    assert sorted((f.room, f.wall, f.behind) for f in plan.opening_faces) == sorted(expected)
-    assert plan.warnings == ()
-    assert [room.type for room in plan.rooms] == [room_type_from_label(kind) for kind in home.plan.kinds]
 
 
 class TestJson:

@@ -17,8 +17,16 @@ from lalaloc_core.errors import CheckpointError, ConfigError, RunError
 from lalaloc_core.evaluate.reproduce import ablations
 from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, Budget, train_ablation
 from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
-from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, markdown
-from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
+from lalaloc_core.evaluate.reproduce.table import (
+    COLUMN_TITLES,
+    PAPER_SETTING,
+    SHIPPED,
+    Figure,
+    RowQuery,
+    RowResult,
+    TableResult,
+    markdown,
+)
 from lalaloc_core.evaluate.runs.factories import build_method
 from lalaloc_core.evaluate.runs.score import Scores, StageScores
 from lalaloc_core.floorplan import FloorPlan

@@ -10,27 +10,26 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image, ImageColor
 
 from lalaloc_core.cli import main
-from lalaloc_core.draw.canvas import FOUND, TRUE
 from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluate.methods.method import Pose
-from lalaloc_core.evaluate.report.pictures import PER_SHEET, Thumbnail, draw_sheet
-from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, choose_worst, predicted_profile_m, summarise, write_worst
+from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, summarise, write_worst
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
-from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, SCORES_FILE, Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import (
+    Outcome,
+    choose_worst,
     expected_calibration_error,
     heading_errors_deg,
+    is_symmetric,
+    outcomes,
     position_errors_m,
     reliability_bins,
     score,
     score_run,
+    symmetric_by_chance,
 )
-from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
-from lalaloc_core.render.profile import wall_profile
 from tests.core.questions import prediction_of, run_info
 from tests.strategies import plan_of, present, rectangle
 
@@ -299,18 +298,6 @@ class TestSummary:
         assert summary["lost_after_first_stage"] == 1
 
 
-class TestPredictedWalls:
-    @pytest.mark.parametrize("heading", [0.0, 0.7, 4.0])
-    def test_predicted_profile_is_in_photograph_frame(self, heading: float) -> None:
-        here, walls = np.array([[1.0, 1.0]]), PLAN.walls_m[[0]]
-        columns = 512
-        turned = np.log(wall_profile(here, np.zeros(1), walls, columns))
-        profile = PredictedProfile(turned, np.zeros_like(turned))
-        query = Query(np.ones((1, 1)), np.array([heading]), 0.0, True, CameraHeight(1.5), profile)
-        expected = wall_profile(here, np.array([heading]), walls, 128)[0]
-        np.testing.assert_allclose(predicted_profile_m(query, 128), expected, rtol=0.02)
-
-
 @pytest.fixture(scope="module")
 def layout_run(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run of layout queries of two generated homes, one of them made wrong."""
@@ -326,8 +313,8 @@ def layout_run(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder.path
 
 
-class TestPages:
-    def test_sheets_and_summary_match_the_run(self, layout_run: Path, tmp_path: Path) -> None:
+class TestWorst:
+    def test_list_and_summary_match_the_run(self, layout_run: Path, tmp_path: Path) -> None:
         summary = write_worst(layout_run, tmp_path, 3)
         content = json.loads((tmp_path / SUMMARY_FILE).read_text(encoding="utf-8"))
         predictions = RunFolder(layout_run).read_predictions()
@@ -343,12 +330,6 @@ class TestPages:
             assert abs(query["distance_bias"]) < 1e-3
             assert query["found_cost"] is None or query["found_cost"] > query["true_cost"]
         assert summary["true_pose_fits"] == {"compared": 2, "better_than_found": 2}
-        assert summary["pages"] == ["worst-01.png"]
-        with Image.open(tmp_path / "worst-01.png") as page:
-            pixels = np.asarray(page.convert("RGB"), dtype=float).reshape(-1, 3)
-        # Lines are smoothed, so a pixel rarely has exactly the colour of a layout.
-        for colour in (ImageColor.getrgb(TRUE), ImageColor.getrgb(FOUND)):
-            assert np.abs(pixels - colour).max(axis=1).min() < 48.0
 
     def test_command_prints_common_features(
         self, layout_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -362,15 +343,9 @@ class TestPages:
         run.append([replace(query, camera="gone") for query in RunFolder(layout_run).read_predictions()[:1]])
         summary = write_worst(run.path, tmp_path / "out", 1)
         assert "camera 'gone' is missing" in summary["left_out"][0]
-        assert summary["pages"] == []
 
     def test_run_without_predictions_is_refused(self, layout_run: Path, tmp_path: Path) -> None:
         run = RunFolder(tmp_path)
         run.write_info(RunFolder(layout_run).read_info())
         with pytest.raises(RunError, match="has no predictions"):
             write_worst(tmp_path, tmp_path / "out", 1)
-
-    def test_sheet_grows_by_rows(self) -> None:
-        thumbnail = Thumbnail(Image.new("RGB", (384, 192)), ["a word " * 40])
-        heights = [draw_sheet("t", {"#ff0000": "red"}, [thumbnail] * count).height for count in (1, 4, 5, PER_SHEET)]
-        assert heights[0] == heights[1] < heights[2] < heights[3]

@@ -17,8 +17,8 @@ from PIL import Image
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.assembly import OpenRingError, chain_rings, largest_simple_part, signed_area
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
-from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, largest_simple_part, signed_area
 from lalaloc_core.learn.data.structured3d import ERRATA, EXCLUDED_BY_PAPER, OFFICIAL, Structured3D, scene_numbers
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
 from lalaloc_core.render.profile import layout_depth, wall_profile

@@ -15,14 +15,20 @@ from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
-from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
+from lalaloc_core.learn.data.synthetic.generated import facts_of
+from lalaloc_core.learn.synth.furniture.furnish import (
+    CAMERA_CLEARANCE_M,
+    FURNITURE_LEVELS,
+    ROOM_PIECES,
+    furnish,
+    rectangle,
+)
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, Home, generate_home
 from lalaloc_core.learn.synth.homes.plans import home_of as home_of_split
-from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, contact_sheet, sample_shots
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.build import build_scene
-from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.render.profile import layout_depth, wall_profile
 from tests.strategies import seeds
 
@@ -317,10 +323,3 @@ def test_textures_folder_without_pictures_is_refused(tmp_path: Path) -> None:
 def test_odd_height_is_refused(materials: MaterialLibrary) -> None:
     with pytest.raises(InvalidInputError, match="even"):
         SphereRenderer(materials, height=63, width=128)
-
-
-def test_contact_sheet_shows_sixteen_spheres(tmp_path: Path) -> None:
-    path = tmp_path / "sheet.png"
-    contact_sheet(path, np.random.default_rng(0), height=16)
-    with Image.open(path) as sheet:
-        assert sheet.size == (4 * 32, 4 * 16)

@@ -16,21 +16,25 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.synth.camera.develop import lens_gain, tilt
-from lalaloc_core.learn.synth.camera.exposure import Exposure, sample_exposure, sample_staged_exposure
-from lalaloc_core.learn.synth.camera.jpeg import compress
-from lalaloc_core.learn.synth.camera.patches import cover_poles
+from lalaloc_core.learn.data.synthetic.generated import Fact, facts_of
+from lalaloc_core.learn.synth.camera import (
+    Exposure,
+    compress,
+    cover_poles,
+    lens_gain,
+    sample_exposure,
+    sample_staged_exposure,
+    tilt,
+)
 from lalaloc_core.learn.synth.furniture.furnish import furnish, rectangle, wall_frame
 from lalaloc_core.learn.synth.homes.plans import TRAIN, generate_home, home_of
 from lalaloc_core.learn.synth.records import Column, Joined, Records
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
-from lalaloc_core.learn.synth.scene.build import build_scene
-from lalaloc_core.learn.synth.scene.ceilings import ceiling_boxes
+from lalaloc_core.learn.synth.scene.build import Reflection, build_scene
 from lalaloc_core.learn.synth.scene.doors import boards, hang_leaves
-from lalaloc_core.learn.synth.scene.facts import Fact, facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.learn.synth.scene.mirrors import Reflection
 from lalaloc_core.learn.synth.scene.render_scene import Sun
+from lalaloc_core.learn.synth.scene.shells import ceiling_boxes
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot, sample_shots, stage_rooms
 from tests.strategies import seeds
 

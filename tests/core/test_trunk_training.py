@@ -18,16 +18,15 @@ from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.export.run_export import export_into, export_run
 from lalaloc_core.learn.training import losses, run
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, SphereBatches, opening_kinds
+from lalaloc_core.learn.training.batches import Photographs
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
-from lalaloc_core.learn.training.end_to_end import EndToEndStage
 from lalaloc_core.learn.training.image_stage import ImageStage
+from lalaloc_core.learn.training.layout_stage import EndToEndStage
 from lalaloc_core.learn.training.loop import run_stage
-from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
@@ -489,10 +488,8 @@ class TestBest:
 
 
 class TestValidation:
-    def test_image_validation_reports_heldout_and_levels(self, tmp_path: Path) -> None:
-        data = TrainingData(
-            validation_scenes=3, heldout=GeneratedScenes(homes=2, shots_per_home=2, seed=5, furniture=None)
-        )
+    def test_image_validation_reports_levels(self, tmp_path: Path) -> None:
+        data = TrainingData(validation_scenes=3)
         teacher = build_layout_encoder(RING)
         stage = ImageStage(RING, GeneratedSource(RING), teacher)
 
@@ -502,10 +499,10 @@ class TestValidation:
 
         found = scores()
         names = {f"{by}{measure}" for by in ("", "profile_") for measure in ("within_1m", "median_cm")} | {"nll"}
-        assert {f"{prefix}_{name}" for prefix in ("val", "heldout") for name in names} <= set(found)
+        assert {f"val_{name}" for name in names} <= set(found)
         assert {"val_profile_within_1m_full", "val_median_cm_full"} <= set(found)
         assert all(np.isfinite(value) for value in found.values())
-        assert {path.name for path in tmp_path.iterdir()} == {"validation.npz", "heldout.npz"}
+        assert {path.name for path in tmp_path.iterdir()} == {"validation.npz"}
         # The second validation reads the pictures from the files.
         before = [path.stat().st_mtime_ns for path in sorted(tmp_path.iterdir())]
         assert scores() == found

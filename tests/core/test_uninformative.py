@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from lalaloc_core.evaluate.bench.uninformative import blank_azimuth, landscape
+from lalaloc_core.evaluate.bench.accuracy import blank_azimuth, landscape
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
 

@@ -17,10 +17,11 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
 from lalaloc_core.learn.export.run_export import export_into
-from lalaloc_core.learn.synth.augmentation.framing import framed, seen_by
+from lalaloc_core.learn.synth.augmentation import framed, seen_by
 from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
-from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window, sample_shots
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.presets import PRESETS

@@ -1,6 +1,4 @@
 """Benchmarks behind the figures of docs/results.md: `lalaloc bench`.
 
-Begin with `benchmarks.py`, which runs the groups of benchmarks.
+Begin with `bench_groups.py`, which runs them by name.
 """
-
-from lalaloc_core.evaluate.bench.benchmarks import run_bench

@@ -1,7 +1,8 @@
-"""Accuracy of the shipped model on homes that training never draws: by task, matching cost, term and camera height."""
+"""Accuracy and confidence of the shipped model on homes that training never draws."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import tempfile
 from collections.abc import Mapping
@@ -10,116 +11,153 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.conditions import CONDITIONS
+from lalaloc_core.conventions import OPENING_CLASSES, WALL_CODE, wrap_angle
+from lalaloc_core.evaluate.bench.measured import Setting
+from lalaloc_core.evaluate.calibrate.measured_errors import outcomes_of, predicted_shares
 from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
+from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import StageScores, score
-from lalaloc_core.learn.data.views import Stated
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Camera, Dataset, Scene
+from lalaloc_core.learn.data.folder import HeldoutScenes
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.views import Stated, cut_view, encode_jpeg
+from lalaloc_core.learn.dataset_names import HELDOUT_HOMES
+from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
+from lalaloc_core.localise.belief import CONFIDENT
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.localisability.predicted_localisability import errors_of
+from lalaloc_core.localise.match import layouts_at
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.photograph import StatedCamera
+from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.render.profile import render_layout
+from lalaloc_core.render.sampling import PoseSet
 
-# Limits for minor figures, and for the comparison of matching costs, which repeats its queries six times.
-_MAX_MINOR_HOMES = 100
-_MAX_EVIDENCE_HOMES = 50
+# Limits for minor figures, for those that repeat their queries six times, and for spots that are localised six times.
+_MINOR_HOMES, _REPEATED_HOMES, _SPOT_HOMES = 100, 50, 65
+_RESAMPLES = 2000
+_HEADINGS = {"known_heading": True, "unknown_heading": False}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark:
-    """Queries for the model.
+    """Queries for the model, 4 in each of at most `max_homes` homes.
 
-    `heldout` homes are out-of-distribution ones; `copies` makes plans of four copies of a home that differ in their
-    doors; a `minor` benchmark needs fewer homes. `view_deg` is the field of view of the photographs, None for spheres,
-    and `stated` what is known of it. `settings` are those of method "lalaloc".
+    `generator` is that of the homes: "copies" are plans of four copies of a home that differ in their doors, "heldout"
+    the out-of-distribution homes. `view_deg` is the field of view of the photographs, None for spheres, and `stated`
+    what is known of it. `settings` are those of method "lalaloc".
     """
 
     kind: QueryKind = "photograph"
     furniture: str = "full"
     heading_known: bool = True
-    heldout: bool = False
-    copies: bool = False
+    generator: str = "synth"
     view_deg: float | None = None
     stated: Stated = "field"
     settings: Mapping[str, Any] = field(default_factory=dict)
-    minor: bool = False
+    max_homes: int = 10_000
 
 
-_BENCHMARKS = {
-    "layout": Benchmark(kind="layout"),
-    "sphere_full": Benchmark(),
-    "sphere_empty": Benchmark(furniture="empty", minor=True),
-    "sphere_full_unknown_heading": Benchmark(heading_known=False),
-    "heldout_full": Benchmark(heldout=True, minor=True),
-    "heldout_full_unknown_heading": Benchmark(heldout=True, heading_known=False, minor=True),
-    "heldout_empty": Benchmark(heldout=True, furniture="empty", minor=True),
-}
-
-_VIEW_BENCHMARKS = {
-    "view_60_unknown_heading": Benchmark(view_deg=60.0, heading_known=False, minor=True),
-    "view_80_unknown_heading": Benchmark(view_deg=80.0, heading_known=False, minor=True),
-    "view_80_known_tilt": Benchmark(view_deg=80.0, heading_known=False, stated="tilt", minor=True),
-    "view_80_unknown_field": Benchmark(view_deg=80.0, heading_known=False, stated="nothing", minor=True),
-    "view_80_heading_within_10_deg": Benchmark(view_deg=80.0, settings={"heading_error_deg": 10.0}, minor=True),
-    "view_106_unknown_heading": Benchmark(view_deg=106.0, heading_known=False, minor=True),
-    "heldout_view_80_unknown_heading": Benchmark(view_deg=80.0, heading_known=False, heldout=True, minor=True),
-    "heldout_view_106_unknown_heading": Benchmark(view_deg=106.0, heading_known=False, heldout=True, minor=True),
-}
+def _view(view_deg: float, *, heading_known: bool = False, **changes: Any) -> Benchmark:
+    return Benchmark(view_deg=view_deg, heading_known=heading_known, max_homes=_MINOR_HOMES, **changes)
 
 
-_HEADINGS = {"known_heading": True, "unknown_heading": False}
-
-
-def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure accuracy in generated test homes, 4 queries each; in at most 100 unfurnished and heldout ones."""
-    return _figures(bundle, _BENCHMARKS, homes, textures)
-
-
-def bench_views(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure accuracy of views in at most 100 furnished test and out-of-distribution homes, 4 queries each."""
-    return _figures(bundle, _VIEW_BENCHMARKS, homes, textures)
-
-
-def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure accuracy with the latent, the predicted wall profile, or both in the matching cost."""
-    homes = min(homes, _MAX_EVIDENCE_HOMES)
+def _by_heading(settings: Mapping[str, Mapping[str, Any]], **changes: Any) -> dict[str, dict[str, Benchmark]]:
+    """Return benchmarks by row of settings and heading. Terms that a plan or a model lacks have no effect."""
     return {
-        heading: _figures(
-            bundle,
-            {
-                term: Benchmark(settings={"evidence": term}, heading_known=known)
-                for term in ("latent", "profile", "both")
-            },
-            homes,
-            textures,
-        )
+        name: {heading: Benchmark(settings=row, heading_known=known, **changes) for heading, known in _HEADINGS.items()}
+        for name, row in settings.items()
+    }
+
+
+_TERMS: Mapping[str, Mapping[str, Any]] = {
+    "all": {},
+    "without_openings": {"openings": False},
+    "without_see_through": {"see_through": False},
+    "without_ceiling": {"ceiling": False},
+    "without_room_type": {"room_type": False},
+    "walls_alone": {"openings": False, "see_through": False, "ceiling": False, "room_type": False},
+}
+# Benchmarks, or groups of them, by group and row.
+GROUPS: Mapping[str, Mapping[str, Any]] = {
+    "accuracy": {
+        "layout": Benchmark(kind="layout"),
+        "sphere_full": Benchmark(),
+        "sphere_empty": Benchmark(furniture="empty", max_homes=_MINOR_HOMES),
+        "sphere_full_unknown_heading": Benchmark(heading_known=False),
+        "heldout_full": Benchmark(generator="heldout"),
+        "heldout_full_unknown_heading": Benchmark(generator="heldout", heading_known=False),
+    },
+    "views": {
+        "view_60_unknown_heading": _view(60.0),
+        "view_80_unknown_heading": _view(80.0),
+        "view_80_known_tilt": _view(80.0, stated="tilt"),
+        "view_80_unknown_field": _view(80.0, stated="nothing"),
+        "view_80_heading_within_10_deg": _view(80.0, heading_known=True, settings={"heading_error_deg": 10.0}),
+        "view_106_unknown_heading": _view(106.0),
+        "heldout_view_80_unknown_heading": _view(80.0, generator="heldout"),
+        "heldout_view_106_unknown_heading": _view(106.0, generator="heldout"),
+    },
+    "evidence": {
+        heading: {
+            term: Benchmark(settings={"evidence": term}, heading_known=known, max_homes=_REPEATED_HOMES)
+            for term in ("latent", "profile", "both")
+        }
         for heading, known in _HEADINGS.items()
-    }
+    },
+    "terms": {"test": _by_heading(_TERMS), "heldout": _by_heading(_TERMS, generator="heldout")},
+    "heights": {
+        "test": _by_heading(
+            {
+                "right": {},
+                "20_cm_too_high": {"camera_height_error_m": 0.2},
+                "20_cm_too_low": {"camera_height_error_m": -0.2},
+                "unknown": {"camera_height": "unknown"},
+            }
+        )
+    },
+    "copies": {
+        "test": _by_heading(
+            {name: _TERMS[name] for name in ("all", "without_openings")}, generator="copies", max_homes=_MINOR_HOMES
+        )
+    },
+}
 
 
-def _figures(bundle: Bundle, benchmarks: Mapping[str, Benchmark], homes: int, textures: Path | None) -> dict[str, Any]:
+def measure(rows: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
+    """Return the figures of benchmarks, nested as they are."""
     return {
-        name: summarise(run_benchmark(bundle, benchmark, homes, textures)) for name, benchmark in benchmarks.items()
+        name: summarise(run_benchmark(setting, row)) if isinstance(row, Benchmark) else measure(row, setting)
+        for name, row in rows.items()
     }
 
 
-def run_benchmark(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
-    """Return the predictions of a benchmark, 4 queries in each home."""
-    homes = min(homes, _MAX_MINOR_HOMES) if benchmark.minor else homes
-    generated: dict[str, Any] = {"homes": homes, "furniture": benchmark.furniture}
-    if benchmark.heldout:
-        generated["generator"] = "heldout"
+def run_benchmark(setting: Setting, benchmark: Benchmark) -> list[Prediction]:
+    """Return the predictions of a benchmark."""
+    heldout = benchmark.generator == "heldout"
+    homes = min(setting.homes, benchmark.max_homes)
+    if heldout:
+        generated = {"generator": "heldout", "homes": min(homes, HELDOUT_HOMES)}
     else:
-        generated["textures"] = None if textures is None else str(textures)
-    if benchmark.copies:
-        generated["generator"] = "copies"
+        textures = None if setting.textures is None else str(setting.textures)
+        generated = {"homes": homes, "furniture": benchmark.furniture, "textures": textures}
+        if benchmark.generator == "copies":
+            generated["generator"] = "copies"
     info = RunInfo(
         label=f"{benchmark.kind}, {benchmark.furniture}",
         kind=benchmark.kind,
-        dataset="out-of-distribution homes" if benchmark.heldout else "generated homes",
+        dataset="out-of-distribution homes" if heldout else "generated homes",
         split="test",
         settings=dict(benchmark.settings),
         generated=generated,
         views=None if benchmark.view_deg is None else {"field_deg": benchmark.view_deg, "stated": benchmark.stated},
-        bundle=str(bundle.folder),
+        bundle=str(setting.bundle.folder),
         furniture=benchmark.furniture if benchmark.kind == "photograph" else None,
         heading_known=benchmark.heading_known,
     )
@@ -141,7 +179,7 @@ def summarise(predictions: list[Prediction]) -> dict[str, Any]:
         **figures(scores.final),
         "within_1m_interval": [interval.low, interval.high],
         "within_1m_30deg": scores.final.within_1m_30deg.value,
-        "among_5": float(np.mean([is_among(prediction, 5) for prediction in predictions])),
+        "among_5": float(np.mean([_is_among(prediction, 5) for prediction in predictions])),
         "retrieval": figures(scores.stages["retrieval"]),
         "correct_room": scores.final.correct_room.value,
         "heading_within_2deg": scores.final.heading_within_2deg.value,
@@ -150,66 +188,165 @@ def summarise(predictions: list[Prediction]) -> dict[str, Any]:
     }
 
 
-def is_among(prediction: Prediction, count: int) -> bool:
+def _is_among(prediction: Prediction, count: int) -> bool:
     """Return whether one of the first candidates is within 1 m of the truth."""
     truth = prediction.truth
     poses = [candidate.pose for candidate in prediction.candidates[:count]]
     return any(math.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < 1.0 for pose in poses)
 
 
-# Settings of method "lalaloc" by row. Terms that a plan or a model lacks have no effect.
-TERMS: Mapping[str, Mapping[str, Any]] = {
-    "all": {},
-    "without_openings": {"openings": False},
-    "without_see_through": {"see_through": False},
-    "without_ceiling": {"ceiling": False},
-    "without_room_type": {"room_type": False},
-    "walls_alone": {"openings": False, "see_through": False, "ceiling": False, "room_type": False},
-}
-HEIGHTS: Mapping[str, Mapping[str, Any]] = {
-    "right": {},
-    "20_cm_too_high": {"camera_height_error_m": 0.2},
-    "20_cm_too_low": {"camera_height_error_m": -0.2},
-    "unknown": {"camera_height": "unknown"},
-}
+def bench_azimuths(setting: Setting) -> dict[str, Any]:
+    """Measure walls and openings in furnished test and out-of-distribution homes, 4 spheres per home."""
+    encoders = PhotographEncoder(setting.bundle, threads=1)
+    homes = min(setting.homes, _MINOR_HOMES)
+    heldout = HeldoutScenes(homes=min(homes, HELDOUT_HOMES))
+    datasets = {"test": GeneratedScenes(homes=homes, textures=setting.textures), "heldout": heldout}
+    return {family: azimuth_figures(encoders, dataset) for family, dataset in datasets.items()}
 
 
-def bench_terms(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure accuracy with and without each term of the matching cost, in test and out-of-distribution homes."""
-    return {
-        family: _rows(bundle, TERMS, homes, textures, heldout=heldout)
-        for family, heldout in (("test", False), ("heldout", True))
+def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, Any]:
+    """Return the `AzimuthSummary` of a test split, and its `confusion`: shares by true and predicted class."""
+    scenes = map(dataset.load, dataset.scenes("test"))
+    measures = [_measured(encoders, scene, camera) for scene in scenes for camera in scene.cameras]
+    confusions = [measure.confusion for measure in measures if measure.confusion is not None]
+    confusion = None
+    if confusions:
+        counts = np.sum(confusions, axis=0)
+        shares = (counts / counts.sum(axis=1, keepdims=True).clip(1)).tolist()
+        confusion = {
+            true: dict(zip(OPENING_CLASSES, row, strict=True))
+            for true, row in zip(OPENING_CLASSES, shares, strict=True)
+        }
+    return {**dataclasses.asdict(summarise_azimuths(measures, OPENING_CLASSES)), "confusion": confusion}
+
+
+def _measured(encoders: PhotographEncoder, scene: Scene, camera: Camera) -> AzimuthMeasures:
+    """Compare the predictions from the only sphere of a camera with the plan around it."""
+    (photograph,) = camera.photographs.values()
+    image = photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
+    log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
+    heading, room = np.array([camera.heading]), np.array([camera.room_index])
+    pose = (camera.position_m[None], heading, room, scene.plan.geometry, len(log_m), camera.camera_height_m)
+    view = render_layout(*pose)
+    return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0], scores)
+
+
+def bench_localisability(setting: Setting) -> dict[str, Any]:
+    """Compare the share of photographs that the model finds with the share that the plan alone predicts.
+
+    In furnished test homes, with 4 spots each. `interval` is the 95 % interval of the predicted minus the found share,
+    by resampling homes.
+    """
+    manifest, homes = setting.bundle.manifest, min(setting.homes, _SPOT_HOMES)
+    outcomes = outcomes_of(setting.bundle, homes, "test", setting.textures)
+    predicted = predicted_shares(manifest, errors_of(manifest), [outcome.spot for outcome in outcomes])
+    rng, rows = np.random.default_rng(0), dict[str, Any]()
+    for name in CONDITIONS:
+        found = np.array([float(outcome.found[name]) for outcome in outcomes])
+        rows[name] = {
+            "found": float(found.mean()),
+            "predicted": float(predicted[name].mean()),
+            "interval": _difference_interval(predicted[name] - found, homes, rng),
+        }
+    difference = [abs(row["found"] - row["predicted"]) for row in rows.values()]
+    return {"n": len(outcomes), "mean_difference": float(np.mean(difference)), **rows}
+
+
+def _difference_interval(
+    difference: Float[np.ndarray, "n"], homes: int, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the 95 % interval of the mean difference of spots, which are sorted by home."""
+    by_home = difference.reshape(homes, -1).mean(axis=1)
+    means = by_home[rng.integers(homes, size=(_RESAMPLES, homes))].mean(axis=1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(low), float(high)
+
+
+_SPHERE_SIZE, _VIEW_SIZE = (512, 1024), (640, 480)
+# Fields of view (degrees): of a blank wall, as it seldom fills more, and of the others; elevation of a ceiling.
+_WALL_DEG, _FIELD_DEG, _CEILING_DEG = 50.0, 80.0, 60.0
+_COLUMNS = 128
+
+
+def bench_uninformative(setting: Setting) -> dict[str, Any]:
+    """Measure how often photographs that cannot tell the place are believed, in test homes of 4 cameras each.
+
+    A blank wall is the wall without openings that fills the view and is nearest, in unfurnished homes. A landscape is
+    a textured ground below a sky, drawn for this.
+    """
+    model, manifest = setting.model, setting.bundle.manifest
+    scenes = GeneratedScenes(homes=setting.homes, furniture="empty", textures=setting.textures)
+    confidence: dict[str, list[float]] = {"blank_wall": [], "ceiling": [], "landscape": []}
+    for name in scenes.scenes("test"):
+        scene = scenes.load(name)
+        for number, camera in enumerate(scene.cameras):
+            height = CameraHeight(camera.camera_height_m)
+            grid = model.grid(scene.plan, height.height_m)
+            rng = np.random.default_rng([len(confidence["ceiling"]), number])
+            for kind, picture in _pictures(scene.plan, camera, rng).items():
+                field_deg = _WALL_DEG if kind == "blank_wall" else _FIELD_DEG
+                stated = StatedCamera(projection="perspective", hfov_deg=field_deg)
+                query = model.encoder.query(model.open(encode_jpeg(picture), stated), None, height)
+                answer = model.localise(scene.plan, grid, query)
+                believed = answer.confidence(manifest.confidence_for(view=True))
+                confidence[kind].append(math.nan if believed is None else believed.position)
+    return {kind: _summary(found) for kind, found in confidence.items()}
+
+
+def _pictures(plan: FloorPlan, camera: Camera, rng: np.random.Generator) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+    (photograph,) = camera.photographs.values()
+    sphere = photograph.image(*_SPHERE_SIZE)
+    wide = Perspective.of_hfov(*_VIEW_SIZE, math.radians(_FIELD_DEG))
+    azimuth = float(rng.uniform(-math.pi, math.pi))
+    pictures = {
+        "ceiling": cut_view(sphere, wide, azimuth=azimuth, pitch=math.radians(_CEILING_DEG), roll=0.0),
+        "landscape": cut_view(landscape(rng), wide, azimuth=azimuth, pitch=0.0, roll=0.0),
     }
+    blank = blank_azimuth(plan, camera)
+    if blank is not None:
+        narrow = Perspective.of_hfov(*_VIEW_SIZE, math.radians(_WALL_DEG))
+        pictures["blank_wall"] = cut_view(sphere, narrow, azimuth=blank, pitch=0.0, roll=0.0)
+    return pictures
 
 
-def bench_heights(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure accuracy in test homes with a right, a wrong and an unknown camera height."""
-    return {"test": _rows(bundle, HEIGHTS, homes, textures, heldout=False)}
+def blank_azimuth(plan: FloorPlan, camera: Camera) -> float | None:
+    """Return the azimuth (radians, relative to the sphere's centre) of the nearest view without openings."""
+    poses = PoseSet(camera.position_m[None], np.array([camera.room_index]))
+    layouts = layouts_at(plan, poses, np.array([camera.heading]), _COLUMNS)
+    half = math.ceil(_COLUMNS * _WALL_DEG / 720.0)
+    around = (np.arange(_COLUMNS)[:, None] + np.arange(-half, half + 1)) % _COLUMNS
+    farthest = layouts.log_profile[0][around].max(axis=1)
+    if layouts.kind is not None:
+        farthest[(layouts.kind[0][around] != WALL_CODE).any(axis=1)] = np.inf
+    best = int(farthest.argmin())
+    if not np.isfinite(farthest[best]):
+        return None
+    return float(wrap_angle((best + 0.5) / _COLUMNS * 2.0 * math.pi - math.pi))
 
 
-def bench_copies(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure accuracy in plans of four copies of a home that differ in their doors, with and without openings."""
-    rows = {name: TERMS[name] for name in ("all", "without_openings")}
-    return {"test": _rows(bundle, rows, homes, textures, heldout=False, copies=True)}
+def landscape(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw a sphere: sky above hills above a ground of patches, seen from 1.5 m."""
+    height, width = _SPHERE_SIZE
+    azimuth = (np.arange(width) + 0.5) / width * 2.0 * np.pi
+    elevation = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
+    waves = rng.integers(2, 12, 6)[:, None] * azimuth + rng.uniform(0.0, 2.0 * np.pi, (6, 1))
+    hills = 0.05 + 0.02 * np.sin(waves).sum(axis=0)
+    sky = np.array([90, 140, 220]) + (1.0 - elevation.clip(0.0)[:, None] / (np.pi / 2.0)) * np.array([110, 80, 30])
+    distance_m = 1.5 / np.tan(np.maximum(-elevation, 0.01))
+    x, y = distance_m[:, None] * np.sin(azimuth), distance_m[:, None] * np.cos(azimuth)
+    patches = rng.uniform(0.6, 1.2, (64, 64))[np.floor(x).astype(int) % 64, np.floor(y).astype(int) % 64]
+    picture = np.broadcast_to(sky[:, None], (height, width, 3)).copy()
+    picture[elevation[:, None] < hills] = np.array([60, 90, 50])
+    below = elevation < 0.0
+    picture[below] = patches[below][..., None] * rng.uniform(60.0, 150.0, 3)
+    return picture.clip(0.0, 255.0).astype(np.uint8)
 
 
-def _rows(
-    bundle: Bundle,
-    rows: Mapping[str, Mapping[str, Any]],
-    homes: int,
-    textures: Path | None,
-    *,
-    heldout: bool,
-    copies: bool = False,
-) -> dict[str, Any]:
-    """Return the figures by row and heading."""
-    common: dict[str, Any] = {"heldout": heldout, "copies": copies, "minor": heldout or copies}
+def _summary(confidence: list[float]) -> dict[str, float]:
+    values = np.array(confidence)
     return {
-        name: _figures(
-            bundle,
-            {heading: Benchmark(settings=row, heading_known=known, **common) for heading, known in _HEADINGS.items()},
-            homes,
-            textures,
-        )
-        for name, row in rows.items()
+        "n": len(values),
+        "above_half": float((values > CONFIDENT).mean()),
+        "median": float(np.median(values)),
+        "highest": float(values.max()),
     }

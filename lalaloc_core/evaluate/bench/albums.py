@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
@@ -13,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.evaluate.bench.measured import Found, Setting, summary
 from lalaloc_core.evaluate.methods.lalaloc import found_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
@@ -36,53 +37,63 @@ _PHOTOGRAPHS = 20
 # Annotated rooms of an album, their distance (m), and the field of view (degrees) of their two photographs.
 _ROOMS, _APART_M, _FIELD_DEG = 10, 3.0, 70.0
 _BEGIN = datetime(2026, 1, 1, 12)
-_NEAR_M, _TURNED = 1.0, math.radians(30.0)
 
 
 class _Score(NamedTuple):
-    """Result of one photograph: right room, pose within 1 m and 30°, within 1 m, and the confidence of the room."""
+    """Result of one photograph: right room, errors of position (m) and heading (radians), and the room's confidence."""
 
     room: bool
-    pose: bool
-    near: bool
+    error_m: float
+    turned: float
     confidence: float
 
+    @classmethod
+    def of(cls, truth: Pose, pose: Pose | None, confidence: float) -> _Score:
+        """Compare a pose with the true one; None is a miss."""
+        if pose is None:
+            return cls(False, math.inf, math.inf, 0.0)
+        turned = abs(float(wrap_angle(pose.heading - truth.heading)))
+        error_m = float(np.linalg.norm(pose.position_m - truth.position_m))
+        return cls(pose.room_index == truth.room_index, error_m, turned, confidence)
 
-def bench_albums(bundle: Bundle, homes: int, textures: Path | None, annotated: Path | None) -> dict[str, Any]:
+
+def bench_albums(setting: Setting) -> dict[str, Any]:
     """Measure albums of 20 photographs, with unknown field of view, camera height and heading.
 
-    Rows: in the order of a walk, without order, each alone, and as spheres; with `annotated`, a folder of annotated
-    photographs, two views of each in albums of ten rooms, without doors or order. Photographs that are refused, as
-    overexposed walls can be taken for paper, are counted and in no other figure.
+    Rows: in the order of a walk, without order, each alone, and as spheres; of annotated photographs, two views of each
+    in albums of ten rooms, without doors or order. Photographs that are refused, as overexposed walls can be taken for
+    paper, are counted and in no other figure.
     """
-    model, refused = LocalModel(bundle), 0
-    scores: dict[str, list[_Score]] = {}
+    model, refused = setting.model, 0
+    scores: defaultdict[str, list[_Score]] = defaultdict(list)
     clicks, seconds, again_s = list[int](), list[float](), list[float]()
-    for index in range(homes):
-        case = _home(model, index, textures, spheres=False)
+    for index in range(setting.homes):
+        case = _home(setting, index, spheres=False)
         refused += _PHOTOGRAPHS - len(case.photographs)
         memory, begin = AlbumMemory(), time.perf_counter()
-        _add(scores, "walk", _solved(model, case, memory))
+        scores["walk"] += _solved(model, case, memory)
         seconds.append(time.perf_counter() - begin)
-        _add(scores, "without_order", _solved(model, case, memory, by_time=False))
-        _add(scores, "each_alone", _alone(model, case))
+        scores["without_order"] += _solved(model, case, memory, by_time=False)
+        scores["each_alone"] += _alone(model, case)
         begin = time.perf_counter()
         count = case.clicks(model, memory)
         clicks.append(count)
         again_s.append((time.perf_counter() - begin) / (count + 1))
-        _add(scores, "spheres", _solved(model, _home(model, index, textures, spheres=True), AlbumMemory()))
-    for case in [] if annotated is None else _annotated(model, annotated):
-        _add(scores, "annotated", _solved(model, case, AlbumMemory()))
-        _add(scores, "annotated_each_alone", _alone(model, case))
-    figures: dict[str, Any] = {row: _summary(found) for row, found in scores.items()}
-    figures["refused_photographs"] = refused
-    figures["clicks_per_album"] = float(np.mean(clicks))
-    figures["median_solve_s"], figures["median_again_s"] = float(np.median(seconds)), float(np.median(again_s))
-    return figures
+        scores["spheres"] += _solved(model, _home(setting, index, spheres=True), AlbumMemory())
+    for case in [] if setting.annotated is None else _annotated(model, setting.annotated):
+        scores["annotated"] += _solved(model, case, AlbumMemory())
+        scores["annotated_each_alone"] += _alone(model, case)
+    return {row: _figures(found) for row, found in scores.items()} | {
+        "refused_photographs": refused,
+        "clicks_per_album": float(np.mean(clicks)),
+        "median_solve_s": float(np.median(seconds)),
+        "median_again_s": float(np.median(again_s)),
+    }
 
 
-def _home(model: LocalModel, index: int, textures: Path | None, *, spheres: bool) -> AlbumCase:
-    album = taken_album("test", index, _PHOTOGRAPHS, spheres=spheres, textures=textures)
+def _home(setting: Setting, index: int, *, spheres: bool) -> AlbumCase:
+    model = setting.model
+    album = taken_album("test", index, _PHOTOGRAPHS, spheres=spheres, textures=setting.textures)
     projection = "equirectangular" if spheres else "perspective"
     photographs, truth = list[AlbumPhotograph](), list[Pose]()
     for number, each in enumerate(album.photographs):
@@ -128,7 +139,7 @@ def _entry(
 def _solved(model: LocalModel, case: AlbumCase, memory: AlbumMemory, *, by_time: bool = True) -> list[_Score]:
     pins = case.solve(model, memory, by_time=by_time)
     return [
-        _score(truth, None if pin.pose is None else case.pose(pin.pose), pin.confidence)
+        _Score.of(truth, None if pin.pose is None else case.pose(pin.pose), pin.confidence)
         for pin, truth in zip(pins, case.truth, strict=True)
     ]
 
@@ -144,29 +155,14 @@ def _alone(model: LocalModel, case: AlbumCase) -> list[_Score]:
         room_share = float(answer.posterior.pose[ground.grid.poses.room_index == best.room_index].sum())
         confidence = answer.confidence(manifest.confidence_for(view=query.is_view))
         fit = 1.0 if confidence is None else confidence.fit
-        found.append(_score(truth, found_pose(query, best), fit * room_share))
+        found.append(_Score.of(truth, found_pose(query, best), fit * room_share))
     return found
 
 
-def _score(truth: Pose, pose: Pose | None, confidence: float) -> _Score:
-    if pose is None:
-        return _Score(False, False, False, 0.0)
-    near = float(np.linalg.norm(pose.position_m - truth.position_m)) < _NEAR_M
-    turned = abs(float(wrap_angle(pose.heading - truth.heading)))
-    return _Score(pose.room_index == truth.room_index, near and turned < _TURNED, near, confidence)
-
-
-def _add(scores: dict[str, list[_Score]], row: str, found: Sequence[_Score]) -> None:
-    scores.setdefault(row, []).extend(found)
-
-
-def _summary(found: Sequence[_Score]) -> dict[str, float]:
-    room, pose, near, confidence = np.array(found, float).T
-    return {
-        "n": len(found),
-        "right_room": float(room.mean()),
-        "within_1m_30deg": float(pose.mean()),
-        "within_1m": float(near.mean()),
-        "mean_confidence": float(confidence.mean()),
-        "expected_calibration_error": expected_calibration_error(confidence, room > 0.0),
-    }
+def _figures(found: Sequence[_Score]) -> dict[str, float]:
+    """Return the summary with the confidence of the room, which is no probability of a position."""
+    rooms, confidence = np.array([score.room for score in found]), np.array([score.confidence for score in found])
+    figures = summary([Found(score.error_m, score.turned, score.confidence) for score in found])
+    del figures["median_cm"]
+    calibration_error = expected_calibration_error(confidence, rooms)
+    return figures | {"right_room": float(rooms.mean()), "expected_calibration_error": calibration_error}

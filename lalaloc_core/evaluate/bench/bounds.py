@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.calibrate.measured_errors import photograph_of
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, layouts_of_pose
 from lalaloc_core.evaluate.methods.method import Pose
@@ -56,20 +56,28 @@ class Asked(NamedTuple):
     query: Query
 
 
-def bench_bounds(bundle: Bundle, homes: int, textures: Path | None, annotated: Path | None = None) -> dict[str, Any]:
+def bench_bounds(setting: Setting) -> dict[str, Any]:
     """Measure spheres, views and turns of furnished test homes, heading unknown, with true walls and openings.
 
     Each row has the share within 1 m, and of the others the shares by cause: another place fits equally well, the true
-    place costs more, or it costs less and the search lost it. With `annotated`, a folder of annotated photographs, also
-    views of each of them, in the first gallery of its photograph.
+    place costs more, or it costs less and the search lost it. Of annotated photographs, also views of each, in the
+    first gallery of its photograph.
     """
-    model = LocalModel(bundle)
+    model = setting.model
+    homes = GeneratedScenes(homes=setting.homes, furniture="full", textures=setting.textures)
     kinds = {"sphere": None, **{f"view_{field:g}": (1, field) for field in _FIELDS_DEG}, "turn": _TURN}
-    figures: dict[str, Any] = {
-        kind: _shares(_outcomes(model, _asked(model, homes, textures, shown))) for kind, shown in kinds.items()
-    }
-    if annotated is not None:
-        figures |= {f"annotated_{field:g}": _of_annotated(model, annotated, field) for field in _ANNOTATED_DEG}
+    figures: dict[str, Any] = {}
+    for kind, shown in kinds.items():
+        count, field_deg = shown or (1, _FIELDS_DEG[0])
+        scenes = ViewScenes(homes, field_deg, count)
+        asked = (
+            asked
+            for name in scenes.scenes("test")
+            for asked in _asked(model, scenes.load(name), None if shown is None else count)
+        )
+        figures[kind] = _shares(_outcomes(model, asked))
+    if setting.annotated is not None:
+        figures |= {f"annotated_{field:g}": _of_annotated(model, setting.annotated, field) for field in _ANNOTATED_DEG}
     return figures
 
 
@@ -78,7 +86,7 @@ def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str
     photographs = AnnotatedPhotographs(folder)
     scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
     found = {
-        key.photograph: _outcomes(model, _views(model, scenes.load(key.scene)))
+        key.photograph: _outcomes(model, _asked(model, scenes.load(key.scene), 1))
         for key in photographs.keys(galleries=1)
         if not key.outline
     }
@@ -105,30 +113,19 @@ def _shares(outcomes: Mapping[str, Counter[str]]) -> dict[str, Any]:
     }
 
 
-def _asked(model: LocalModel, homes: int, textures: Path | None, shown: tuple[int, float] | None) -> Iterator[Asked]:
-    count, field_deg = shown or (1, 80.0)
-    scenes = ViewScenes(GeneratedScenes(homes=homes, furniture="full", textures=textures), field_deg, count)
+def _asked(model: LocalModel, scene: Scene, count: int | None) -> Iterator[Asked]:
+    """Yield the queries of a scene's views, so many together; None for the spheres that they are cut from."""
     manifest, encoder = model.bundle.manifest, model.encoder
-    for name in scenes.scenes("test"):
-        scene = scenes.load(name)
-        for first in range(0, len(scene.cameras), count):
-            cameras = scene.cameras[first : first + count]
-            camera, height = cameras[0], CameraHeight(cameras[0].camera_height_m)
-            if shown is None:
-                sphere = photograph_of(camera).sphere.photograph.image(manifest.image_height, manifest.image_width)
-                query = encoder.spheres.query(sphere, None, height)
-            else:
-                opened = [photograph_of(view).open(patch_size(manifest)) for view in cameras]
-                turns = [view.heading - camera.heading for view in cameras]
-                query = encoder.query(opened[0], None, height, others=list(zip(opened[1:], turns[1:], strict=True)))
-            pose = Pose.at(camera.position_m, camera.room_index, camera.heading)
-            yield Asked(scene.plan, pose, query)
-
-
-def _views(model: LocalModel, scene: Scene) -> Iterator[Asked]:
-    for camera in scene.cameras:
-        view = photograph_of(camera).open(patch_size(model.bundle.manifest))
-        query = model.encoder.query(view, None, CameraHeight(camera.camera_height_m))
+    for first in range(0, len(scene.cameras), count or 1):
+        cameras = scene.cameras[first : first + (count or 1)]
+        camera, height = cameras[0], CameraHeight(cameras[0].camera_height_m)
+        if count is None:
+            sphere = photograph_of(camera).sphere.photograph.image(manifest.image_height, manifest.image_width)
+            query = encoder.spheres.query(sphere, None, height)
+        else:
+            opened = [photograph_of(view).open(patch_size(manifest)) for view in cameras]
+            turns = [view.heading - camera.heading for view in cameras]
+            query = encoder.query(opened[0], None, height, others=list(zip(opened[1:], turns[1:], strict=True)))
         yield Asked(scene.plan, Pose.at(camera.position_m, camera.room_index, camera.heading), query)
 
 

@@ -18,13 +18,14 @@ from typing import Any
 import httpx
 import numpy as np
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.foreign import without_openings
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
-from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, sample_shots
+from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.photograph.cameras import Perspective
 
 _REQUESTS = 40
@@ -34,14 +35,14 @@ _SMALL_PROCESS_MB = 50.0
 _PHONE_SIZE, PHONE_FIELD_DEG, _PHONE_PHOTOGRAPHS = (4032, 3024), 80.0, 4
 
 
-def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
+def bench_service(setting: Setting) -> dict[str, Any]:
     """Measure the latency of `POST /localise` from one client, and the memory of the service's processes."""
     home = home_of_area(100.0)
     shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
-    materials = MaterialLibrary.create(np.random.default_rng(1), textures)
+    materials = MaterialLibrary.create(np.random.default_rng(1), setting.textures)
     images = SphereRenderer(materials, height=512, width=1024).render(shots).numpy()
     pictures = [encode_jpeg(image) for image in images]
-    with running_service(bundle.folder) as (client, process):
+    with running_service(setting.bundle.folder) as (client, process):
         plan_id, bare_id = _upload(client, home.plan), _upload(client, without_openings(home.plan))
         report: dict[str, Any] = {"requests": _REQUESTS, "sphere": "1024x512 JPEG"}
         heights = [{"camera_height_m": f"{shot.home.plan.camera_height_m}"} for shot in shots]
@@ -53,7 +54,7 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
             "unknown_heading": list(zip(pictures, heights, strict=True)),
         }
         rows["without_openings"] = rows["unknown_heading"]
-        if bundle.manifest.view is not None:
+        if setting.bundle.manifest.view is not None:
             views = [phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
             lens = {"hfov_deg": f"{PHONE_FIELD_DEG:g}"}
             rows["phone"] = [(views[k % len(views)], {**height, **lens}) for k, height in enumerate(heights)]

@@ -1,7 +1,8 @@
-"""Speed of rendering, of LaLaLoc against ICP, and of writing, reading and evaluating data sets."""
+"""Speed of rendering, of LaLaLoc against ICP, of data sets, and of the stages and functions of a query."""
 
 from __future__ import annotations
 
+import cProfile
 import multiprocessing
 import os
 import statistics
@@ -11,15 +12,18 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import numpy as np
 import torch
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, local_refiner
 from lalaloc_core.evaluate.methods.method import Method, Question
+from lalaloc_core.evaluate.report.report_tables import markdown_table
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
 from lalaloc_core.learn.data.dataset import Camera
@@ -31,6 +35,9 @@ from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.local_model import LocalModel
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.search.pipeline import StageClock, localise
 from lalaloc_core.render.profile import layout_depth, wall_profile
 from lalaloc_core.render.reference import reference_depth
 from lalaloc_core.render.sampling import pose_grid, random_poses
@@ -56,7 +63,7 @@ def median_ms(call: Callable[[], object], repeats: int = 9) -> float:
 _GRID_STEP_M = 0.5
 
 
-def bench_rendering(bundle: Bundle) -> dict[str, float]:
+def bench_rendering(setting: Setting) -> dict[str, float]:
     """Measure layout depth in closed form and by ray casting, and the pose grid of a 100 m² home."""
     poses, plan = 200, home_of_area(100.0).plan
     sampled = random_poses(plan, poses, np.random.default_rng(0))
@@ -74,7 +81,7 @@ def bench_rendering(bundle: Bundle) -> dict[str, float]:
             room = plan.rooms[sampled.room_index[index]]
             reference_depth(room, sampled.position_m[index], 0.0, 1.5, 128, 256)
 
-    encoders = PhotographEncoder(bundle)
+    encoders = PhotographEncoder(setting.bundle)
     closed_form_ms = median_ms(closed_form) / poses
     oracle_ms = median_ms(oracle, repeats=3) / len(sample)
     grid = build_grid(plan, encoders.layouts, step_m=_GRID_STEP_M, camera_height_m=1.5)
@@ -92,13 +99,15 @@ def bench_rendering(bundle: Bundle) -> dict[str, float]:
 _METHOD_QUERIES = 5
 
 
-def bench_methods(bundle: Bundle) -> dict[str, Any]:
+def bench_methods(setting: Setting) -> dict[str, Any]:
     """Measure seconds per query of ICP and of LaLaLoc in a furnished home of 100 m², heading known.
 
     The plan's wall cloud (ICP) and pose grid (LaLaLoc) are prepared before and not counted.
     """
     home = home_of_area(100.0)
     shots = sample_shots(home, _METHOD_QUERIES + 1, np.random.default_rng(2), "full")
+    # One height, so that all share one pose grid.
+    shots = [replace(shot, camera_height_m=shots[0].camera_height_m) for shot in shots]
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(2)))
     grid = pose_grid(home.plan, _GRID_STEP_M)
     questions = [
@@ -107,21 +116,21 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
             grid=grid,
             grid_step_m=_GRID_STEP_M,
             camera=Camera(
-                name=str(index),
+                name="",
                 position_m=shot.position_m,
                 room_index=shot.room_index,
                 heading=shot.heading,
-                # One height, so that all share one pose grid.
-                camera_height_m=shots[0].camera_height_m,
+                camera_height_m=shot.camera_height_m,
                 photographs={},
             ),
             kind="photograph",
-            photograph=RenderedPhotograph(replace(shot, camera_height_m=shots[0].camera_height_m), renderers),
+            photograph=RenderedPhotograph(shot, renderers),
         )
-        for index, shot in enumerate(shots)
+        for shot in shots
     ]
+    encoders = PhotographEncoder(setting.bundle, threads=1)
     icp = _mean_seconds(Icp(), questions)
-    lalaloc = _mean_seconds(LaLaLoc(PhotographEncoder(bundle, threads=1), refiner=local_refiner(bundle)), questions)
+    lalaloc = _mean_seconds(LaLaLoc(encoders, refiner=local_refiner(setting.bundle)), questions)
     return {
         "area_m2": home.plan.area_m2,
         "grid_poses": len(grid),
@@ -143,7 +152,7 @@ _SPHERE_HEIGHT = 256
 _QUERIES = 300
 
 
-def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
+def bench_datasets(setting: Setting) -> dict[str, Any]:
     """Measure writing synthetic test scenes, reading their annotations, and localising 300 spheres.
 
     Each takes one process per core.
@@ -151,7 +160,7 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
     cores = os.cpu_count() or 1
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as scratch:
         root = Path(scratch) / "scenes"
-        settings = Synthesis(root=root, height=_SPHERE_HEIGHT, textures=textures)
+        settings = Synthesis(root=root, height=_SPHERE_HEIGHT, textures=setting.textures)
         begin = time.perf_counter()
         synthesise(settings, share_out(_SCENES, "test"), workers=cores)
         writing = time.perf_counter() - begin
@@ -173,7 +182,7 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
             furniture="full",
             lighting="warm",
             limit=_QUERIES,
-            bundle=str(bundle.folder),
+            bundle=str(setting.bundle.folder),
         )
         begin = time.perf_counter()
         answered = len(run_evaluation(RunFolder(Path(scratch) / "run"), info))
@@ -192,3 +201,57 @@ def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
 
 def _count_cameras(root: Path, name: str) -> int:
     return len(Structured3D(root).load(name).cameras)
+
+
+_FUNCTIONS = 20
+_STAGES = ("encode", "retrieve", "vdr", "lpo")
+
+
+def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
+    """Return tables of the stages and of the slowest functions of queries in a home of 100 m², in one thread.
+
+    Stages are timed without the profiler, as medians over the queries; functions with it, by their own time.
+    """
+    home = home_of_area(100.0)
+    shots = sample_shots(home, queries, np.random.default_rng(1), "full")
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))
+    model = LocalModel(bundle)
+    height, width = bundle.manifest.image_height, bundle.manifest.image_width
+    images = renderers.renderer(height, width).render(shots).cpu().numpy()
+    grid = model.grid(home.plan, home.plan.camera_height_m)
+
+    def time_query(index: int, *, known: bool) -> dict[str, float]:
+        clock, shot = StageClock(), shots[index]
+        with clock.stage("encode"):
+            heading = shot.heading if known else None
+            query = model.encoder.spheres.query(images[index], heading, CameraHeight(shot.camera_height_m))
+        localise(home.plan, grid, model.encoder.layouts, query, refiner=model.refiner, clock=clock)
+        return clock.timings_ms
+
+    for known in (True, False):
+        time_query(0, known=known)
+    timings = {known: [time_query(index, known=known) for index in range(queries)] for known in (True, False)}
+    rows = [
+        (stage, *(f"{statistics.median(query[stage] for query in timings[known]):.1f} ms" for known in (True, False)))
+        for stage in _STAGES
+    ]
+    tables = [markdown_table((f"stage, median of {queries} queries", "known heading", "unknown heading"), rows)]
+    for known in (True, False):
+        profiler = cProfile.Profile()
+        profiler.enable()
+        for index in range(queries):
+            time_query(index, known=known)
+        profiler.disable()
+        slowest = sorted(profiler.getstats(), key=lambda entry: -entry.inlinetime)[:_FUNCTIONS]
+        rows = [
+            (_name(entry.code), f"{entry.callcount / queries:.0f}", f"{1e3 * entry.inlinetime / queries:.2f}")
+            for entry in slowest
+        ]
+        title = f"function, {'known' if known else 'unknown'} heading"
+        tables.append(markdown_table((title, "calls per query", "own ms per query"), rows))
+    return "\n".join(tables)
+
+
+def _name(code: CodeType | str) -> str:
+    """Return file and name of a function, or the profiler's description of a built-in one."""
+    return f"`{code}`" if isinstance(code, str) else f"`{Path(code.co_filename).name}` {code.co_qualname}"

@@ -7,12 +7,11 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.learn.data.synthetic.generated import (
     SPLIT_NUMBERS,
     RenderedPhotograph,
@@ -53,15 +52,15 @@ class _Row(NamedTuple):
     best: bool
 
 
-def bench_steps(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+def bench_steps(setting: Setting) -> dict[str, Any]:
     """Measure steps after photographs of 80° in furnished test homes, 2 in each, heading unknown.
 
     The best step of each kind is carried out where the answer is not sure.
     """
-    model, renderers = LocalModel(bundle), split_renderer_cache(_SPLIT, 0, textures)
+    model, renderers = setting.model, split_renderer_cache(_SPLIT, 0, setting.textures)
     rows: list[_Row] = []
     spent_s: list[float] = []
-    for index in range(homes):
+    for index in range(setting.homes):
         home, rng = home_of(_SPLIT, 0, index)
         grid = None
         for shot in sample_shots(home, _SHOTS, rng, "full"):

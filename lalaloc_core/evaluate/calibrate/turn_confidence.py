@@ -36,7 +36,7 @@ from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_ren
 from lalaloc_core.learn.data.synthetic.turned import Phone, photographs_of_turn
 from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.learn.metrics import Accuracy
-from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
+from lalaloc_core.learn.synth.augmentation import jittered, optics
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size

@@ -1,8 +1,7 @@
-"""Reports on evaluation runs: an HTML page, contact sheets of the worst queries, annotated photographs.
+"""Reports on evaluation runs: an HTML page, the worst queries, and figures of annotated photographs.
 
-Begin with `html.py`, the page. `worst.py` draws the worst queries, `photograph_report.py` evaluates photographs of real
-rooms; `pictures.py` draws plans and spheres for all of them, `charts.py` draws the charts.
+Begin with `html.py`, the page; `charts.py` draws its charts. `worst.py` lists the worst queries, `photograph_report.py`
+evaluates photographs of real rooms.
 """
 
 from lalaloc_core.evaluate.report.html import write_report
-from lalaloc_core.evaluate.report.worst import write_worst

@@ -1,30 +1,53 @@
-"""Charts of a report: error curves, calibration, outcomes and times."""
+"""Charts of a report, drawn once by matplotlib: error curves, calibration, outcomes and times."""
 
 from __future__ import annotations
 
+import base64
+import io
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle, islice
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lalaloc_core.evaluate.report.figures import (
-    MUTED,
-    PAPER,
-    SERIES,
-    Chart,
-    bar_colours,
-    chart_style,
-    finish,
-    line_styles,
-)
-from lalaloc_core.evaluate.report.reading import TOTAL, Run, stage_times
-from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
-from lalaloc_core.evaluate.runs.score import position_errors_m
+from lalaloc_core.evaluate.report.scored_runs import TOTAL, Run, stage_times
+from lalaloc_core.evaluate.runs.score import Outcome, count_outcomes, position_errors_m
 
+INK, MUTED, RULE, PAPER = "#1c2128", "#59626d", "#d5dbe1", "#ffffff"
+SERIES = ("#0b63b5", "#c2410c", "#0f7b53", "#a3297a", "#8a6d00", "#0e7c86", "#6d4ed1", "#7a4a2a")
+_DASHES = ("-", "--", ":", "-.")
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "lalaloc",
+    # Names of runs can contain dollar signs.
+    "text.parse_math": False,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": RULE,
+    "grid.linewidth": 0.7,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    "savefig.facecolor": "auto",
+    "legend.frameon": False,
+}
 CURVE_LIMITS_M = (0.001, 20.0)
 CONFIDENCE_BINS = 20
 _TICKS = {0.001: "0.1 cm", 0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m", 10.0: "10 m"}
@@ -35,11 +58,25 @@ _LEGEND_CHARACTERS = 84
 OUTCOME_COLOURS = dict(zip(Outcome, (SERIES[0], SERIES[4], SERIES[1], MUTED), strict=True))
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Chart:
+    """Drawn chart, on white; `name` is that of its files, and `alt` describes it to screen readers."""
+
+    name: str
+    alt: str
+    svg: bytes
+
+    @property
+    def data_uri(self) -> str:
+        """The drawing as a data URI."""
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
+
+
 def draw_charts(runs: Sequence[Run]) -> dict[str, Chart]:
     """Draw the charts for which the runs have data, by name."""
     answered = [run for run in runs if run.predictions]
     charts = []
-    with chart_style():
+    with mpl.rc_context(_STYLE):
         if answered:
             charts += [_error_curves(answered), _outcomes(answered)]
         confident = [run for run in answered if run.scores is not None and run.scores.reliability]
@@ -63,7 +100,7 @@ def _error_curves(runs: Sequence[Run]) -> Chart:
     figure = Figure(figsize=(_WIDTH_INCHES, 3.3 + _legend_inches(list(lines))), layout="constrained")
     axes = figure.subplots()
     low, high = CURVE_LIMITS_M
-    for errors_m, style in zip(lines.values(), line_styles(len(lines)), strict=True):
+    for errors_m, style in zip(lines.values(), _line_styles(len(lines)), strict=True):
         reached = np.sort(errors_m[errors_m <= high])
         share = np.arange(1, len(reached) + 1) / len(errors_m)
         x = np.concatenate([[low], np.maximum(reached, low), [high]])
@@ -75,11 +112,10 @@ def _error_curves(runs: Sequence[Run]) -> Chart:
     _percent(axes, "y", "queries within")
     _legend(figure, axes.get_lines(), list(lines))
     poses = "after each stage" if len(runs) == 1 else "with the final pose of each run"
-    return finish(
+    return _chart(
         figure,
-        name="error-curves",
-        title="Cumulative position error",
-        description=f"Share of all queries {poses} by position error, from 0.1 cm to 20 m on a "
+        "error-curves",
+        f"Cumulative position error. Share of all queries {poses} by position error, from 0.1 cm to 20 m on a "
         "logarithmic axis. The table below the chart has the same figures.",
     )
 
@@ -88,7 +124,7 @@ def _calibration(runs: Sequence[Run]) -> Chart:
     figure = Figure(figsize=(_WIDTH_INCHES, 2.6 + _legend_inches([run.name for run in runs])), layout="constrained")
     diagram, histogram = figure.subplots(1, 2)
     diagram.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
-    for run, style in zip(runs, line_styles(len(runs)), strict=True):
+    for run, style in zip(runs, _line_styles(len(runs)), strict=True):
         assert run.scores is not None
         bins = run.scores.reliability
         points = [100.0 * part.confidence for part in bins], [100.0 * part.frequency for part in bins]
@@ -115,13 +151,12 @@ def _calibration(runs: Sequence[Run]) -> Chart:
     _percent(histogram, "x", "confidence", step=50)
     _percent(histogram, "y", "queries", step=None)
     _legend(figure, diagram.get_lines()[1:], [run.name for run in runs])
-    return finish(
+    return _chart(
         figure,
-        name="calibration",
-        title="Calibration of the confidence",
-        description="Left: share of answers within 1 m against their mean confidence, in ten bins; the dashed "
-        "diagonal is perfect calibration, and larger dots have more queries. Right: distribution of the confidence. "
-        "The table below the chart has the same figures.",
+        "calibration",
+        "Calibration of the confidence. Left: share of answers within 1 m against their mean confidence, in ten bins; "
+        "the dashed diagonal is perfect calibration, and larger dots have more queries. Right: distribution of the "
+        "confidence. The table below the chart has the same figures.",
     )
 
 
@@ -133,12 +168,11 @@ def _outcomes(runs: Sequence[Run]) -> Chart:
     figure = _stacked_bars(shares, {kind.value: colour for kind, colour in OUTCOME_COLOURS.items()})
     _percent(figure.axes[0], "x", "queries")
     figure.axes[0].set_xlim(0.0, 100.0)
-    return finish(
+    return _chart(
         figure,
-        name="outcomes",
-        title="Located and failed queries",
-        description="Share of queries located, misaligned in the right room, in a wrong room, or without an answer, "
-        "one bar per run. The table below the chart has the same figures.",
+        "outcomes",
+        "Located and failed queries. Share of queries located, misaligned in the right room, in a wrong room, or "
+        "without an answer, one bar per run. The table below the chart has the same figures.",
     )
 
 
@@ -148,14 +182,13 @@ def _times(runs: Sequence[Run]) -> Chart:
         for run in runs
     }
     stages = list(dict.fromkeys(name for row in medians.values() for name in row))
-    figure = _stacked_bars(medians, bar_colours(stages))
+    figure = _stacked_bars(medians, _bar_colours(stages))
     figure.axes[0].set_xlabel("median per query (ms)")
-    return finish(
+    return _chart(
         figure,
-        name="times",
-        title="Time per stage",
-        description="Median milliseconds of each stage of a query, stacked, one bar per run. The table below the chart "
-        "has the same figures and the 95th percentile.",
+        "times",
+        "Time per stage. Median milliseconds of each stage of a query, stacked, one bar per run. The table below the "
+        "chart has the same figures and the 95th percentile.",
     )
 
 
@@ -200,3 +233,22 @@ def _legend_columns(names: Sequence[str]) -> int:
 
 def _legend_inches(names: Sequence[str]) -> float:
     return 0.2 * math.ceil(len(names) / _legend_columns(names)) if len(names) > 1 else 0.0
+
+
+def _chart(figure: Figure, name: str, alt: str) -> Chart:
+    svg = io.BytesIO()
+    # Without a date, equal runs give equal reports.
+    figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    return Chart(name=name, alt=alt, svg=svg.getvalue())
+
+
+def _line_styles(count: int) -> list[dict[str, Any]]:
+    """Return colour and dash of each line; the first 32 differ."""
+    return [
+        {"color": SERIES[index % len(SERIES)], "linestyle": _DASHES[index // len(SERIES) % len(_DASHES)]}
+        for index in range(count)
+    ]
+
+
+def _bar_colours(names: Sequence[str]) -> dict[str, str]:
+    return dict(zip(names, islice(cycle(SERIES), len(names)), strict=True))

@@ -1,7 +1,6 @@
 """Evaluation on annotated photographs of real rooms: walls and openings per azimuth, and galleries of rooms.
 
 FOLDER/photographs.json   all figures, and the figures of every photograph
-FOLDER/photographs.png    every photograph with the true and the predicted lines
 FOLDER/known, unknown     the runs in galleries, heading known and searched, for `lalaloc lab worst` and `report`
 """
 
@@ -10,20 +9,16 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
-from PIL import Image
+from jaxtyping import Float
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.draw.outline import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Thumbnail, draw_sheet
-from lalaloc_core.evaluate.report.report_tables import percent
+from lalaloc_core.evaluate.report.report_tables import markdown_table, percent
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.factories import describe_model
 from lalaloc_core.evaluate.runs.galleries import (
@@ -40,70 +35,10 @@ from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, ReadVi
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
 from lalaloc_core.learn.metrics import AzimuthSummary, ClassScores, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
-_HEIGHT, _WIDTH = 256, 512
-CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}
-# Rows (pixels) of the bars with the true and the predicted classes along the top of a picture.
-_TRUE_BAR, _PREDICTED_BAR, _BAR_WIDTH = 4.0, 13.0, 6.0
-_KEY = {TRUE_COLOUR: "annotated walls", PREDICTED_COLOUR: "predicted walls"} | {
-    colour: f"{name} (annotated above predicted)" for name, colour in CLASS_COLOURS.items()
-}
-
-
-def draw_photographs(
-    title: str, read: Sequence[ReadPhotograph], answers: Mapping[str, Sequence[GalleryAnswer]]
-) -> Image.Image:
-    """Draw one sheet with every photograph, the worst walls first; captions have the gallery answers by heading."""
-    ordered = sorted(read, key=lambda photograph: -photograph.measures.median_error)
-    return draw_sheet(title, _KEY, [Thumbnail(_picture(item), _caption(item, answers)) for item in ordered])
-
-
-def _caption(read: ReadPhotograph, answers: Mapping[str, Sequence[GalleryAnswer]]) -> list[str]:
-    measures, name = read.measures, read.photograph.name
-    located = ", ".join(f"{heading} {describe_answers(results, name)}" for heading, results in answers.items())
-    return [
-        f"{name} ({read.photograph.quality})",
-        f"|Δ log d| {measures.median_error:.3f}, 90 % below {measures.error_90:.2f}, bias {measures.bias:+.3f}, "
-        f"{measures.scale_ratio:.1f} times its scale",
-        f"in galleries, heading {located}" if answers else "not located",
-    ]
-
-
-def _picture(read: ReadPhotograph) -> Image.Image:
-    """Draw a photograph with floor and ceiling lines of true and predicted walls, and bars of their openings."""
-    photograph = read.photograph
-    true_m = photograph.profile_m(read.measures.outline, _WIDTH)
-    # The prediction has fewer columns than the picture.
-    column, known = ((np.arange(count) + 0.5) / count for count in (_WIDTH, len(read.profile_m)))
-    predicted_m = np.exp(np.interp(column, known, np.log(read.profile_m), period=1.0))
-    rises_m = [-CAMERA_HEIGHT_M]
-    if photograph.has_flat_ceiling:
-        rises_m.append(photograph.outlines[0].ceiling_height_m - CAMERA_HEIGHT_M)
-    strokes = [
-        Stroke([wall_line(profile, rise, _HEIGHT) for rise in rises_m], colour, width, width + 1.0)
-        for profile, colour, width in ((true_m, TRUE_COLOUR, 3.0), (predicted_m, PREDICTED_COLOUR, 1.5))
-    ]
-    strokes += _bars(photograph.classes(_WIDTH), _TRUE_BAR)
-    if read.class_scores is not None:
-        likeliest = read.class_scores.argmax(axis=1)
-        strokes += _bars(likeliest[np.arange(_WIDTH) * len(likeliest) // _WIDTH], _PREDICTED_BAR)
-    return draw_strokes(photograph.photograph.image(_HEIGHT, _WIDTH), strokes)
-
-
-def _bars(classes: Int[np.ndarray, "w"], row: float) -> list[Stroke]:
-    """Return a bar for every run of columns of one class, along a row of the picture; none for walls."""
-    edges = [0, *(np.flatnonzero(np.diff(classes)) + 1).tolist(), len(classes)]
-    return [
-        Stroke([np.array([[first, row], [last, row]])], CLASS_COLOURS[OPENING_CLASSES[classes[first]]], _BAR_WIDTH, 8.0)
-        for first, last in pairwise(edges)
-        if classes[first]
-    ]
-
-
-FIGURES_FILE, SHEET_FILE = "photographs.json", "photographs.png"
+FIGURES_FILE = "photographs.json"
 _HEADINGS = {"known": True, "unknown": False}
 # Views of each photograph, at equal angles.
 _VIEWS = 8
@@ -202,11 +137,11 @@ class PhotographResults:
             name = f"plans of other buildings, heading {heading}: confidence above {ACCEPTED:g}"
             rows.append((name, f"{percent(found['accepted'])} of {found['n']}"))
         columns = ["photograph", "quality", "median", "90 %", "bias", "by scale", *self.answers]
-        tables = [_table(["figure", "measured"], rows)]
+        tables = [markdown_table(["figure", "measured"], rows)]
         if (shares := self._read_as()) is not None:
             kinds = [(name, *map(percent, row)) for name, row in zip(OPENING_CLASSES, shares.tolist(), strict=True)]
-            tables.append(_table(["annotated, read as", *OPENING_CLASSES], kinds))
-        return "\n".join([*tables, _table(columns, [self._cells(read) for read in self.read])])
+            tables.append(markdown_table(["annotated, read as", *OPENING_CLASSES], kinds))
+        return "\n".join([*tables, markdown_table(columns, [self._cells(read) for read in self.read])])
 
     def _cells(self, read: ReadPhotograph) -> list[str]:
         measures, name = read.measures, read.photograph.name
@@ -276,7 +211,6 @@ def evaluate_photographs(
     figures = {"command": command, "model": describe_model(bundle), **results.figures()}
     out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / FIGURES_FILE, json.dumps(figures, indent=2, allow_nan=False) + "\n")
-    draw_photographs(f"{len(read)} photographs, model {bundle}", read, answers).save(out / SHEET_FILE)
     return results
 
 
@@ -315,11 +249,6 @@ def _gallery_rows(what: str, scores: GalleryScores) -> list[tuple[str, str]]:
         ),
         ("… expected calibration error of confidence", _number(scores.calibration_error)),
     ]
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def _classes(classes: ClassScores | None) -> str:

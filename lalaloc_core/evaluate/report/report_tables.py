@@ -1,17 +1,26 @@
-"""Tables of a report: figures as text."""
+"""Tables of a report: figures as text, in HTML or Markdown."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lalaloc_core.evaluate.report.charts import curves
-from lalaloc_core.evaluate.report.reading import Run, stage_times
-from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
-from lalaloc_core.evaluate.runs.score import Estimate, SliceScores, StageScores
+from lalaloc_core.evaluate.report.scored_runs import Run, stage_times
+from lalaloc_core.evaluate.runs.score import (
+    Estimate,
+    Outcome,
+    SliceScores,
+    StageScores,
+    choose_worst,
+    count_outcomes,
+    heading_errors_deg,
+    outcomes,
+    position_errors_m,
+)
 
 CURVE_POINTS_M = (0.01, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
 METRICS = ("median", "< 1 cm", "< 5 cm", "< 10 cm", "< 1 m", "right room", "heading")
@@ -122,6 +131,30 @@ def time_rows(runs: Sequence[Run]) -> list[Row]:
         for run in runs
         for name, time in stage_times(run.predictions).items()
     ]
+
+
+def worst_rows(runs: Sequence[Run], count: int) -> list[Row]:
+    """Return the queries without an answer and then those with the largest errors, up to `count` of each run."""
+    rows = []
+    for run in runs:
+        chosen = choose_worst(run.predictions, count)
+        errors_m, headings_deg = position_errors_m(chosen), heading_errors_deg(chosen)
+        for query, kind, error_m, heading_deg in zip(chosen, outcomes(chosen), errors_m, headings_deg, strict=True):
+            answered = kind is not Outcome.NO_ANSWER
+            cells = (
+                Cell(query.room),
+                Cell(kind.value),
+                Cell(distance(error_m) if answered else NOTHING),
+                Cell(f"{number(heading_deg)}°" if answered else NOTHING),
+                Cell(NOTHING if query.confidence is None else percent(query.confidence)),
+            )
+            rows.append(Row(run=run.name, part=f"{query.scene}/{query.camera}", cells=cells))
+    return rows
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (columns, ["---"] * len(columns), *rows))
 
 
 def percent(share: float) -> str:

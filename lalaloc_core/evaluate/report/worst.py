@@ -1,8 +1,4 @@
-"""The worst queries of a run: contact sheets, and statistics of their common features.
-
-FOLDER/worst-01.png ...   spheres with the true, the found and the predicted layout, the worst first
-FOLDER/worst.json         common features, and every query
-"""
+"""The worst queries of a run: a list, and statistics of their common features, in FOLDER/worst.json."""
 
 from __future__ import annotations
 
@@ -14,37 +10,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from PIL import Image
 
-from lalaloc_core.conventions import TWO_PI, column_azimuths
-from lalaloc_core.draw.outline import Stroke, draw_strokes, wall_line
-from lalaloc_core.errors import LaLaLocError, RunError
+from lalaloc_core.errors import BundleError, DatasetError, LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, encode, read_image
-from lalaloc_core.evaluate.methods.method import Pose
-from lalaloc_core.evaluate.report.pictures import (
-    FOUND_COLOUR,
-    PER_SHEET,
-    PICTURE_HEIGHT,
-    PICTURE_WIDTH,
-    PREDICTED_COLOUR,
-    TRUE_COLOUR,
-    Thumbnail,
-    draw_sheet,
-    layout_lines,
-)
-from lalaloc_core.evaluate.report.reopening import ReopenedRun
-from lalaloc_core.evaluate.report.report_tables import distance, percent
-from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
+from lalaloc_core.evaluate.methods.method import Pose, Question
+from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import position_errors_m
+from lalaloc_core.evaluate.runs.score import (
+    Outcome,
+    choose_worst,
+    is_symmetric,
+    outcomes,
+    position_errors_m,
+    symmetric_by_chance,
+)
 from lalaloc_core.files import atomic_write
-from lalaloc_core.learn.data.dataset import Scene
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import Query
+from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
 
 SUMMARY_FILE = "worst.json"
-_KEY = {TRUE_COLOUR: "true layout", FOUND_COLOUR: "found layout", PREDICTED_COLOUR: "predicted walls' floor line"}
+# Distance to a query's place in its run beyond which the data set has changed.
+_SAME_PLACE_M = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,26 +65,9 @@ class WorstQuery:
     found_cost: float | None = None
     distance_bias: float | None = None
 
-    @property
-    def caption(self) -> list[str]:
-        """Lines below its picture."""
-        place = f"{self.scene}/{self.camera} {self.room}"
-        if self.outcome is Outcome.WRONG_ROOM:
-            place += f", found in {self.found_room}"
-        result = "no answer" if self.error_m is None else f"{distance(self.error_m)} off"
-        if self.symmetric:
-            result += ", mirrored"
-        if self.confidence is not None:
-            result += f", confidence {percent(self.confidence)}"
-        if self.true_cost is not None and self.found_cost is not None:
-            result += f", cost {self.found_cost:.2f} (true {self.true_cost:.2f})"
-        if self.distance_bias is not None:
-            result += f", walls {100.0 * self.distance_bias:+.0f} %"
-        return [place, result, " ".join(self.facts)]
-
 
 def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
-    """Draw the worst queries of a run and return `SUMMARY_FILE`'s content without the queries: their common features.
+    """List the worst queries of a run in `SUMMARY_FILE` and return its content without them: their common features.
 
     Queries without an answer come first, then by error.
     """
@@ -104,36 +76,19 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
     if not predictions:
         raise RunError(f"the run at '{run}' has no predictions; run `lalaloc lab evaluate` first")
     chosen = choose_worst(predictions, count)
-    analyser = _QueryAnalyser(info)
+    reopened = _ReopenedRun(info)
     queries: list[WorstQuery] = []
-    thumbnails: list[Thumbnail] = []
     left_out: list[str] = []
     for prediction in chosen:
         try:
-            query, picture = analyser.analyse(prediction)
+            queries.append(reopened.analyse(prediction))
         except (LaLaLocError, OSError) as error:
             left_out.append(str(error))
-            continue
-        queries.append(query)
-        thumbnails.append(Thumbnail(picture, query.caption))
     out.mkdir(parents=True, exist_ok=True)
-    pages = []
-    for first in range(0, len(thumbnails), PER_SHEET):
-        part = thumbnails[first : first + PER_SHEET]
-        pages.append(f"worst-{first // PER_SHEET + 1:02d}.png")
-        title = f"{info.label}: worst {first + 1} to {first + len(part)} of {len(predictions)}"
-        draw_sheet(title, _KEY, part).save(out / pages[-1])
-    summary = {"pages": pages, "left_out": left_out, **summarise(predictions, chosen, queries)}
+    summary = {"left_out": left_out, **summarise(predictions, chosen, queries)}
     content = {**summary, "worst": [dataclasses.asdict(query) for query in queries]}
     atomic_write(out / SUMMARY_FILE, json.dumps(content, indent=2, allow_nan=False) + "\n")
     return summary
-
-
-def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Prediction]:
-    """Return up to `count` queries: first those without an answer, then by decreasing error."""
-    errors_m = position_errors_m(predictions)
-    order = np.argsort(-np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")
-    return [predictions[index] for index in order[:count]]
 
 
 def summarise(
@@ -169,13 +124,6 @@ def summarise(
     }
 
 
-def predicted_profile_m(query: Query, columns: int) -> Float[np.ndarray, "{columns}"]:
-    """Return the predicted wall profile (m) in the frame of the photograph, without the query's first roll."""
-    assert query.profile is not None
-    known = column_azimuths(query.profile.log_m.shape[1])
-    return np.exp(np.interp(column_azimuths(columns) + query.roll[0], known, query.profile.log_m[0], period=TWO_PI))
-
-
 def _lifts(predictions: Sequence[Prediction], chosen: Sequence[Prediction]) -> dict[str, dict[str, float]]:
     """Return, by fact, its share among the worst and among all queries, and their ratio, largest first."""
     lifts = {}
@@ -190,28 +138,29 @@ def _mean_confidence(predictions: Sequence[Prediction]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-class _QueryAnalyser:
-    """Data set and model of a run, reopened to analyse its queries."""
+class _ReopenedRun:
+    """Data set and model of a finished run; changed data is refused."""
 
     def __init__(self, info: RunInfo) -> None:
-        self._run = ReopenedRun(info)
-        encoders = None if info.bundle is None else self._run.open_model()
-        self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
+        self._info, self._dataset, self._encoders = info, build_dataset(info), None
+        self._appearance = choose_appearance(self._dataset, info.furniture, info.lighting)
+        if info.bundle is not None:
+            bundle = require_bundle(info)
+            if info.model is not None and info.model.get("sha256") not in (None, bundle.sha256):
+                raise BundleError(
+                    f"'{info.bundle}' holds another model than the run used: its SHA-256 is {bundle.sha256}"
+                )
+            encoders = PhotographEncoder(bundle)
+            self._encoders = encoders if encoders.predicts_profile else None
 
-    def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
-        """Return the analysis of a query, and its picture."""
-        scene, camera = self._run.find_camera(prediction)
-        image = self._run.photograph(scene, camera).image(PICTURE_HEIGHT, PICTURE_WIDTH)
-        found, height = prediction.final_pose, camera.camera_height_m
-        strokes = [_layout(scene, prediction.truth, height, TRUE_COLOUR, 3.0)]
-        if found is not None:
-            strokes.append(_layout(scene, found, height, FOUND_COLOUR, 1.5))
+    def analyse(self, prediction: Prediction) -> WorstQuery:
+        """Return the analysis of a query."""
+        scene, camera = self._find_camera(prediction)
+        found = prediction.final_pose
         fit: dict[str, float | None] = {}
         if self._encoders is not None:
-            question = self._run.question(scene, camera)
+            question = self._question(scene, camera)
             query = encode(self._encoders, question, read_image(self._encoders, question))
-            floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
-            strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
             weights = self._encoders.manifest.evidence_for(view=query.is_view)
             fit["true_cost"] = cost_of_pose(query, scene.plan, prediction.truth, weights)
             fit["found_cost"] = None if found is None else cost_of_pose(query, scene.plan, found, weights)
@@ -219,7 +168,7 @@ class _QueryAnalyser:
         errors_m = position_errors_m([prediction])
         first_m = position_errors_m([prediction], next(iter(prediction.stages), None))
         (outcome,) = outcomes([prediction])
-        worst = WorstQuery(
+        return WorstQuery(
             scene=prediction.scene,
             camera=prediction.camera,
             room=prediction.room,
@@ -233,12 +182,31 @@ class _QueryAnalyser:
             symmetric_by_chance=symmetric_by_chance(scene.plan, prediction),
             **fit,
         )
-        return worst, draw_strokes(image, strokes)
 
+    def _find_camera(self, prediction: Prediction) -> tuple[Scene, Camera]:
+        scene, truth = self._dataset.load(prediction.scene, []), prediction.truth
+        camera = next((item for item in scene.cameras if item.name == prediction.camera), None)
+        if camera is None:
+            raise DatasetError(f"camera '{prediction.camera}' is missing: the data set has changed", scene=scene.name)
+        moved_m = float(np.hypot(*(camera.position_m - truth.position_m)))
+        if moved_m > _SAME_PLACE_M or camera.room_index != truth.room_index:
+            raise DatasetError(
+                f"camera '{camera.name}' is {moved_m:.3f} m from its position in the run: the data set has changed",
+                scene=scene.name,
+            )
+        return scene, camera
 
-def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width: float) -> Stroke:
-    lines = layout_lines(scene.plan, pose, camera_height_m, PICTURE_HEIGHT, PICTURE_WIDTH)
-    return Stroke(lines, colour, width, width + 1.0)
+    def _question(self, scene: Scene, camera: Camera) -> Question:
+        info = self._info
+        return Question(
+            plan=scene.plan,
+            grid=pose_grid(scene.plan, info.grid_step_m),
+            grid_step_m=info.grid_step_m,
+            camera=camera,
+            kind=info.kind,
+            photograph=scene.photograph(camera, self._appearance) if info.kind == "photograph" else None,
+            heading_known=info.heading_known,
+        )
 
 
 def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:

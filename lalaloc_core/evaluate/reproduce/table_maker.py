@@ -19,8 +19,19 @@ from pathlib import Path
 import torch
 
 from lalaloc_core.evaluate.reproduce.ablations import train_ablation
-from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, draw_vogel_samples, markdown
-from lalaloc_core.evaluate.reproduce.table import SHIPPED, Budget, Column, Row, RowQuery, Table
+from lalaloc_core.evaluate.reproduce.table import (
+    SHIPPED,
+    Budget,
+    Column,
+    Figure,
+    Row,
+    RowQuery,
+    RowResult,
+    Table,
+    TableResult,
+    draw_vogel_samples,
+    markdown,
+)
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.factories import choose_appearance, describe_model
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo

@@ -10,8 +10,7 @@ from lalaloc_core.errors import DatasetError, InvalidInputError, InvalidPhotogra
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, collect_error
-from lalaloc_core.learn.data.photograph_files import FilePhotograph
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, FilePhotograph, Scene, collect_error
 from lalaloc_core.learn.data.views import ViewPhotograph, encode_jpeg
 from lalaloc_core.localise.album.entry import AlbumPhotograph, Correction, photograph_entry
 from lalaloc_core.localise.album.evidence import AlbumMemory

@@ -11,8 +11,7 @@ import torch
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.decode import VdrDecode
-from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
+from lalaloc_core.evaluate.methods.explicit import ExplicitLayout, VdrDecode
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight, local_refiner
 from lalaloc_core.evaluate.methods.method import Method
@@ -20,6 +19,7 @@ from lalaloc_core.evaluate.methods.similarity import LayoutMetric, PoseOracle, S
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.learn.data.dataset import Appearance, Dataset
 from lalaloc_core.learn.data.dataset_detection import open_dataset
+from lalaloc_core.learn.data.folder import HeldoutScenes
 from lalaloc_core.learn.data.synthetic.altered_photographs import DisturbedScenes, MismatchedScenes
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
 from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
@@ -92,9 +92,9 @@ def _spheres(info: RunInfo) -> Dataset:
     arguments: dict[str, Any] = dict(info.generated or {})
     generator = arguments.pop("generator", "synth")
     if generator == "heldout":
-        # Needs embree, from the extra `oracle`.
-        from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
-
+        # Runs of up to 0.11 state the seed and furniture of a generator.
+        if arguments.pop("seed", 0) != 0 or arguments.pop("furniture", "full") != "full":
+            raise InvalidInputError("the out-of-distribution homes are furnished ones of seed 0")
         return HeldoutScenes(**arguments)
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])

@@ -13,8 +13,8 @@ from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotated import GalleryKey
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data.folder import HeldoutScenes
 from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
-from lalaloc_core.learn.heldout.homes import HomeKey, home_of
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 
@@ -149,14 +149,15 @@ def describe_answers(answers: Sequence[GalleryAnswer], photograph: str) -> str:
 
 
 # Five homes and five offices, each with and without openings; the fit of the confidence has other ones.
-_EACH, _HOMES, _OFFICES = 5, (2, 0), 77
+_EACH, _OFFICES = 5, 77
 # Confidence above which a photograph counts as accepted.
 ACCEPTED = 0.5
 
 
 def foreign_plans() -> list[FloorPlan]:
     """Return out-of-distribution homes and offices, each with openings and then without."""
-    homes = [home_of(HomeKey(*_HOMES, index)).plan.plan for index in range(_EACH)]
+    heldout = HeldoutScenes(homes=_EACH)
+    homes = [heldout.load(name).plan for name in heldout.scenes("test")]
     offices = [office_plan(np.random.default_rng([_OFFICES, index])) for index in range(_EACH)]
     return [drawn for plan in homes + offices for drawn in (plan, without_openings(plan))]
 

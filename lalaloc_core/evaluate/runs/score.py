@@ -1,4 +1,4 @@
-"""Scores of predictions: the paper's metrics (section 5), each with a 95 % interval.
+"""Scores of predictions, the paper's metrics (section 5) each with a 95 % interval, and kinds of failures.
 
 A query without an answer is a miss in every share and has an infinite error in every median. The bootstrap resamples
 scenes, not queries, because queries of one scene are correlated. Intervals of shares are at least as wide as Wilson's.
@@ -11,9 +11,11 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
+import shapely
 from jaxtyping import Bool, Float, Int
 from scipy.stats import binomtest
 
@@ -22,6 +24,7 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import SCORES_FILE, Prediction, RunFolder, without_infinity
 from lalaloc_core.files import atomic_write
+from lalaloc_core.floorplan import FloorPlan
 
 _RESAMPLES = 1000
 _COVERAGE = 0.95
@@ -300,3 +303,77 @@ def _recall(bootstrap: _Bootstrap, hits: list[bool | None]) -> Estimate | None:
 def _timings(predictions: Sequence[Prediction], summary: Callable[[list[float]], Any]) -> dict[str, float]:
     stages = list(dict.fromkeys(name for prediction in predictions for name in prediction.timings_ms))
     return {name: float(summary([p.timings_ms[name] for p in predictions if name in p.timings_ms])) for name in stages}
+
+
+# One step of the paper's grid: a larger error is beyond the grid poses around the true one.
+ALIGNMENT_LIMIT_M = 0.5
+
+
+class Outcome(StrEnum):
+    """Outcome of a query; every query has exactly one."""
+
+    LOCATED = "located"
+    WRONG_ALIGNMENT = "wrong alignment"
+    WRONG_ROOM = "wrong room"
+    NO_ANSWER = "no answer"
+
+
+def outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> list[Outcome]:
+    """Return the outcome of each query, for the final pose or the pose after a stage."""
+    errors_m = position_errors_m(predictions, stage)
+    pairs = zip(predictions, errors_m, strict=True)
+    return [_outcome(prediction, stage, float(error_m)) for prediction, error_m in pairs]
+
+
+def count_outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> dict[Outcome, int]:
+    """Return the number of queries by outcome, for all outcomes."""
+    found = outcomes(predictions, stage)
+    return {outcome: found.count(outcome) for outcome in Outcome}
+
+
+def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Prediction]:
+    """Return up to `count` queries: first those without an answer, then by decreasing error."""
+    errors_m = position_errors_m(predictions)
+    order = np.argsort(-np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")
+    return [predictions[index] for index in order[:count]]
+
+
+def symmetric_positions(room: shapely.Polygon, x_m: float, y_m: float) -> list[tuple[float, float]]:
+    """Return a position mirrored along either axis of its room's bounding box, and turned by 180°."""
+    left, bottom, right, top = room.bounds
+    across, along = left + right - x_m, bottom + top - y_m
+    return [(across, y_m), (x_m, along), (across, along)]
+
+
+def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
+    """Return whether a misaligned pose in the right room fits the mirrored room.
+
+    It then lies within `ALIGNMENT_LIMIT_M` of one of the true position's `symmetric_positions`.
+    """
+    pose = prediction.final_pose
+    if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
+        return False
+    return shapely.Point(pose.x_m, pose.y_m).within(_symmetric_area(plan, prediction))
+
+
+def symmetric_by_chance(plan: FloorPlan, prediction: Prediction) -> float:
+    """Return the share of the wrong positions in the true room for which `is_symmetric` holds."""
+    truth = prediction.truth
+    room = plan.rooms[truth.room_index].shape
+    wrong = room.difference(shapely.Point(truth.x_m, truth.y_m).buffer(ALIGNMENT_LIMIT_M))
+    return wrong.intersection(_symmetric_area(plan, prediction)).area / wrong.area if wrong.area > 0.0 else 0.0
+
+
+def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry:
+    truth = prediction.truth
+    places = symmetric_positions(plan.rooms[truth.room_index].shape, truth.x_m, truth.y_m)
+    return shapely.union_all(shapely.points(places)).buffer(ALIGNMENT_LIMIT_M)
+
+
+def _outcome(prediction: Prediction, stage: str | None, error_m: float) -> Outcome:
+    pose = prediction.pose_after(stage)
+    if pose is None:
+        return Outcome.NO_ANSWER
+    if pose.room_index != prediction.truth.room_index:
+        return Outcome.WRONG_ROOM
+    return Outcome.LOCATED if error_m <= ALIGNMENT_LIMIT_M else Outcome.WRONG_ALIGNMENT

@@ -1,8 +1,9 @@
 """Data sets: scenes with cameras and photographs, in any file format.
 
 Begin with `dataset.py`, the interface of every data set. `dataset_detection.py` detects the format of a folder and
-opens its reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own data) or `annotated.py` (annotated photographs
-of real rooms). `assembly.py` builds validated plans for the readers. Generated data sets are in `synthetic/`.
+opens its reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own data, and the out-of-distribution homes) or
+`annotated.py` (annotated photographs of real rooms). `assembly.py` builds validated plans for the readers. Generated
+data sets are in `synthetic/`.
 """
 
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, load_scenes

@@ -6,16 +6,20 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
+from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, is_annotation, read_annotation
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.data.room_gallery import build_gallery
+from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom, plan_of_rooms
 from lalaloc_core.learn.dataset_names import GALLERIES
+from lalaloc_core.learn.synth.homes.plans import generate_home
 
 _SCENE = re.compile(r"(?P<photograph>.+)-(?P<gallery>\d+)(?P<alternative>-alternative)?")
 
@@ -105,3 +109,115 @@ class AnnotatedPhotographs:
 def annotation_files(root: Path) -> list[Path]:
     """Return the annotation files of a folder, sorted by name."""
     return [path for path in sorted(root.glob("*.json")) if is_annotation(path)]
+
+
+GALLERY_ROOMS = 20
+# Maximum number of annotated rooms among the others; the rest are generated.
+_MAX_DRAWN = 9
+# Maximum relative change of size: of annotated rooms to their drawing, of generated rooms to the own room.
+_RESCALED = 0.1
+# Number of most similar generated rooms from which a gallery draws.
+_SIMILAR = 30
+_POOL_HOMES = 60
+# Seed of homes outside all splits: training, validation and test seeds begin with 0, 1 and 2.
+_POOL = 7
+_PER_ROW = 5
+# Gap between rooms, wider than a wall, so that no door belongs to two rooms.
+_GAP_M = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RoomGallery:
+    """Plan of `GALLERY_ROOMS` rooms, and the pose of the own room's frame in it: origin, and heading of its +y."""
+
+    plan: FloorPlan
+    room_index: int
+    position_m: Float[np.ndarray, "2"]
+    heading: float
+
+
+def build_gallery(
+    own: DrawnRoom,
+    others: Sequence[DrawnRoom],
+    camera_height_m: float,
+    rng: np.random.Generator,
+    like: DrawnRoom | None = None,
+) -> RoomGallery:
+    """Place a room among similar ones, all aligned with the axes and randomly rotated by quarter turns.
+
+    `own` has the camera at its origin, looking along +y. Of the `others`, those most similar to `like` (default: `own`)
+    in size and shape are used, up to `_MAX_DRAWN`, rescaled within `_RESCALED`; the rest are generated rooms of similar
+    shape, scaled to the size within the same range.
+    """
+    like = like or own
+    drawn = sorted(others, key=lambda room: _dissimilarity(like, room))[:_MAX_DRAWN]
+    generated, shapes = _generated()
+    pool = [generated[k] for k in np.argsort(np.abs(shapes - _shape(like)).sum(axis=1), kind="stable")[:_SIMILAR]]
+    chosen = rng.choice(len(pool), GALLERY_ROOMS - 1 - len(drawn), replace=False)
+    low, high = 1.0 - _RESCALED, 1.0 + _RESCALED
+    rooms = [room.scaled(rng.uniform(low, high)) for room in drawn]
+    rooms += [pool[k].scaled(like.size_m / pool[k].size_m * rng.uniform(low, high)) for k in chosen]
+    rooms = [room.mirrored() if rng.random() < 0.5 else room for room in rooms]
+    turns = [0.5 * np.pi * int(rng.integers(4)) - room.main_direction for room in (own, *rooms)]
+    turned = [room.turned(turn) for room, turn in zip((own, *rooms), turns, strict=True)]
+    order = rng.permutation(GALLERY_ROOMS)
+    places = _side_by_side([turned[k] for k in order], rng)
+    placed = [turned[k].moved(place) for k, place in zip(order, places, strict=True)]
+    room_index = int(np.flatnonzero(order == 0)[0])
+    plan = plan_of_rooms(f"gallery of {own.name}", placed, camera_height_m)
+    # Azimuth grows clockwise, angles counter-clockwise.
+    return RoomGallery(plan, room_index, places[room_index], float(wrap_angle(-turns[0])))
+
+
+@lru_cache(maxsize=1)
+def _generated() -> tuple[tuple[DrawnRoom, ...], Float[np.ndarray, "n 2"]]:
+    """Return rooms of generated homes with unique names, and their shapes."""
+    homes = [generate_home(np.random.default_rng([_POOL, number])) for number in range(_POOL_HOMES)]
+    rooms = tuple(
+        _drawn(f"{room.name}, home {number}", home.plan, index)
+        for number, home in enumerate(homes)
+        for index, room in enumerate(home.plan.rooms)
+    )
+    return rooms, np.stack([_shape(room) for room in rooms])
+
+
+def _drawn(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
+    room = plan.rooms[index]
+    openings = []
+    for face in plan.opening_faces:
+        if face.room == index:
+            start, end = room.walls_m[face.wall].reshape(2, 2)
+            line_m = start + np.array([[face.start], [face.end]]) * (end - start)
+            openings.append(DrawnOpening(kind=plan.openings[face.opening].kind, line_m=line_m))
+    return DrawnRoom(
+        name=name,
+        polygon_m=room.polygon_m,
+        ceiling_height_m=room.ceiling_height_m,
+        openings=tuple(openings),
+        room_type=room.type,
+    )
+
+
+def _shape(room: DrawnRoom) -> Float[np.ndarray, "2"]:
+    """Return the logs of a room's aspect ratio and of the floor's share of its bounding box."""
+    extent_m = room.turned(-room.main_direction).extent_m
+    return np.log([extent_m.max() / extent_m.min(), room.size_m**2 / extent_m.prod()])
+
+
+def _dissimilarity(first: DrawnRoom, second: DrawnRoom) -> float:
+    return float(np.abs(_shape(first) - _shape(second)).sum() + abs(np.log(first.size_m / second.size_m)))
+
+
+def _side_by_side(rooms: Sequence[DrawnRoom], rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
+    """Return the translations that arrange rooms in rows, with gaps of `_GAP_M` and a little more."""
+    moves, top_m = [], 0.0
+    for first in range(0, len(rooms), _PER_ROW):
+        row = rooms[first : first + _PER_ROW]
+        right_m = 0.0
+        for room in row:
+            # A random offset varies the position of the pose grid in the room.
+            corner = np.array([right_m, top_m]) + rng.uniform(0.0, 0.5, 2)
+            moves.append(corner - room.polygon_m.min(axis=0))
+            right_m = corner[0] + room.extent_m[0] + _GAP_M
+        top_m += max(room.extent_m[1] for room in row) + _GAP_M + 0.5
+    return moves

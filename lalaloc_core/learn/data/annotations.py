@@ -23,8 +23,8 @@ from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import is_number, path_below, read_json
+from lalaloc_core.learn.data.dataset import FilePhotograph
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom, plan_of_rooms
-from lalaloc_core.learn.data.photograph_files import FilePhotograph
 from lalaloc_core.render.profile import nearest_walls, wall_profile
 
 CAMERA_HEIGHT_M = 1.5

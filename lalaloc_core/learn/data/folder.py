@@ -1,4 +1,4 @@
-"""A user's own data: plans in the native format, photographs, and a table of their poses.
+"""A user's own data, and the out-of-distribution homes: plans in the native format, spheres, a table of their poses.
 
     ROOT/<scene>/plan.json      floor plan (docs/reference/plan-format.md)
     ROOT/<scene>/poses.csv      photograph,x_m,y_m,heading_deg,camera_height_m
@@ -11,6 +11,7 @@ The column `camera_height_m` and its cells are optional; the default is the plan
 from __future__ import annotations
 
 import csv
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +23,11 @@ import numpy as np
 import shapely
 
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
+from lalaloc_core.errors import DatasetError, InvalidFloorPlanError, InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.assembly import path_below, pose_fault
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split, collect_error
-from lalaloc_core.learn.data.photograph_files import FilePhotograph
+from lalaloc_core.learn.data.dataset import Appearance, Camera, FilePhotograph, Scene, Split, collect_error
+from lalaloc_core.learn.dataset_names import HELDOUT_HOMES
 
 PLAN_FILE = "plan.json"
 POSES_FILE = "poses.csv"
@@ -193,3 +194,50 @@ def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *,
             yield _Row(path=path, scene=scene, line=lines.line_num, cells=stripped)
     except csv.Error as error:
         raise DatasetError(f"line {lines.line_num} is not valid CSV: {error}", scene=scene, path=path) from error
+
+
+_FOLDER = Path(__file__).resolve().parents[3] / "datasets" / "heldout"
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldoutScenes:
+    """The first of the sixty homes, furnished, with four spheres each. All are test homes."""
+
+    homes: int = HELDOUT_HOMES
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.homes <= HELDOUT_HOMES:
+            raise InvalidInputError(f"homes is {self.homes}; there are {HELDOUT_HOMES} out-of-distribution homes")
+        if not _FOLDER.is_dir():
+            raise DatasetError("out-of-distribution homes are in the repository, not in installations", path=_FOLDER)
+
+    @property
+    def description(self) -> str:
+        """Name of the data set in results."""
+        return "out-of-distribution homes"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        """The only appearance."""
+        return (Appearance("full"),)
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of the homes."""
+        return self._folder.scenes(split)[: self.homes]
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Read a home; its cameras are named by number."""
+        scene = self._folder.load(name, problems)
+        cameras = (
+            dataclasses.replace(
+                camera,
+                name=Path(camera.name).stem,
+                photographs=dict.fromkeys(self.appearances, *camera.photographs.values()),
+            )
+            for camera in scene.cameras
+        )
+        return dataclasses.replace(scene, cameras=tuple(cameras))
+
+    @property
+    def _folder(self) -> OwnData:
+        return OwnData(_FOLDER)

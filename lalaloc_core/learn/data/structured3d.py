@@ -22,8 +22,15 @@ import numpy as np
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split, collect_error
-from lalaloc_core.learn.data.photograph_files import FilePhotograph
+from lalaloc_core.learn.data.dataset import (
+    Appearance,
+    Camera,
+    DatasetPhotograph,
+    FilePhotograph,
+    Scene,
+    Split,
+    collect_error,
+)
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
 
 # Scene numbers of the official splits.

@@ -24,9 +24,16 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
-from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, read_json
+from lalaloc_core.learn.data.assembly import (
+    OpenRingError,
+    RoomOutline,
+    assemble_plan,
+    chain_rings,
+    is_number,
+    read_json,
+    signed_area,
+)
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening
-from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area
 
 _MM_PER_M = 1000.0
 # All other types are rooms.

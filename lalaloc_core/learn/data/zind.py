@@ -26,9 +26,8 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, path_below, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split, collect_error
+from lalaloc_core.learn.data.dataset import Appearance, Camera, FilePhotograph, Scene, Split, collect_error
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening
-from lalaloc_core.learn.data.photograph_files import FilePhotograph
 
 DATA_FILE = "zind_data.json"
 PARTITION_FILE = "zind_partition.json"

@@ -42,14 +42,12 @@ from lalaloc_core.bundle import (
 )
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
-from lalaloc_core.learn.export.object_table import OBJECTS, shares_by_type
+from lalaloc_core.learn.export.object_table import OBJECTS, ObjectNetwork, shares_by_type
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork, paper_encoders, ring_image_encoder, trunk
-from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.layout_network import RingLayoutEncoder
-from lalaloc_core.nets.object_network import ObjectNetwork
+from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import TAP_STRIDES

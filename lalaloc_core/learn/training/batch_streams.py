@@ -15,10 +15,19 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.training.batches import Batch, LoadFailure, Stream, draw_visits, stack_rows, worker_share
+from lalaloc_core.learn.training.batches import (
+    Batch,
+    LoadFailure,
+    Rotation,
+    Stream,
+    draw_visits,
+    sample_heading,
+    sample_rotation,
+    stack_rows,
+    worker_share,
+)
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
-from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
 from lalaloc_core.learn.training.sources import Group, Source, SphereSample
 from lalaloc_core.render.profile import render_layout
 from lalaloc_core.render.sweep import profiles_at

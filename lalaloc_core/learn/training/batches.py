@@ -1,4 +1,4 @@
-"""Loading of batches in worker processes, and reporting of files that could not be used."""
+"""Batches: loaded in worker processes, turned, with photographs; files that could not be used are reported."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped, UInt8
+from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.learn.synth.augmentation import stretched
+from lalaloc_core.learn.training.config import Turns
 
 _LOG = logging.getLogger(__name__)
 _Drawn = TypeVar("_Drawn")
@@ -87,3 +92,87 @@ def _without_failures(items: Iterable[Any]) -> Iterator[Any]:
 
 def _single_thread(_: int) -> None:
     torch.set_num_threads(1)
+
+
+_QUARTER = TWO_PI / 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotation:
+    """Rotation and mirroring of a sphere.
+
+    Attributes:
+        shift: pixels by which its columns move to the right.
+        heading: azimuth of the centre column after the shift, radians; layouts are cast at this heading.
+    """
+
+    shift: int
+    heading: float
+    mirrored: bool
+
+    def picture(self, image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w 3"]:
+        """Rotate and mirror a sphere."""
+        turned = np.roll(image, self.shift, axis=1)
+        return turned[:, ::-1] if self.mirrored else turned
+
+    def profile(self, profile_m: Shaped[np.ndarray, "*n columns"]) -> Shaped[np.ndarray, "*n columns"]:
+        """Mirror wall profiles, or other values by azimuth column, that were cast at `heading`."""
+        return profile_m[..., ::-1] if self.mirrored else profile_m
+
+
+def sample_rotation(turns: Turns, heading: float, width: int, rng: np.random.Generator) -> Rotation:
+    """Draw the rotation of a sphere of `width` columns whose centre column looks along `heading` (radians)."""
+    pixel = TWO_PI / width
+    shift = int(rng.integers(width)) if turns == "any" else round((heading - _target(turns, rng)) / pixel)
+    mirrored = turns != "none" and bool(rng.random() < 0.5)
+    return Rotation(shift=shift, heading=float(wrap_angle(heading - shift * pixel)), mirrored=mirrored)
+
+
+def sample_heading(turns: Turns, rng: np.random.Generator) -> float:
+    """Draw the heading (radians) of a layout."""
+    return float(rng.uniform(0.0, TWO_PI)) if turns == "any" else _target(turns, rng)
+
+
+def _target(turns: Turns, rng: np.random.Generator) -> float:
+    return 0.0 if turns == "none" else float(rng.integers(4)) * _QUARTER
+
+
+# Rooms are stretched along two axes by log-uniform factors between these limits, because half of the available
+# unlabelled photographs show halls.
+_MIN_STRETCH, _MAX_STRETCH = 0.5, 1.6
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Photographs with targets by column.
+
+    `openings` are probabilities of door, window and passage; passages are NaN where the teacher cannot tell them from
+    walls. `log_distance` is that of the walls in camera heights; NaN where they are not visible.
+    """
+
+    images: UInt8[Tensor, "n h w 3"]
+    openings: Float[Tensor, "n c 3"]
+    log_distance: Float[Tensor, "n c"]
+
+    def draw(self, count: int, columns: int, generator: torch.Generator) -> Photographs:
+        """Draw photographs, each randomly rotated, stretched and mirrored, with targets of `columns` columns."""
+        width = self.images.shape[2]
+        chosen = torch.randint(len(self.images), (count,), generator=generator)
+        shifts = torch.randint(width, (count,), generator=generator)
+        mirrored = torch.randint(2, (count,), generator=generator).bool()
+        low, high = np.log(_MIN_STRETCH), np.log(_MAX_STRETCH)
+        factors = torch.exp(low + (high - low) * torch.rand(count, 2, generator=generator))
+        turns = list(zip(chosen.tolist(), shifts.tolist(), strict=True))
+        images, openings, log_distance = (
+            torch.stack([part[index].roll(shift, axis) for index, shift in turns])
+            for part, axis in ((self.images, 1), (self.openings, 0), (self.log_distance, 0))
+        )
+        images, openings, log_distance = stretched(images, openings, log_distance, factors)
+        images[mirrored] = images[mirrored].flip(2)
+        openings[mirrored] = openings[mirrored].flip(1)
+        log_distance[mirrored] = log_distance[mirrored].flip(1)
+        return Photographs(
+            images,
+            openings.unflatten(1, (columns, -1)).mean(dim=2),
+            log_distance.unflatten(1, (columns, -1)).nanmean(dim=2),
+        )

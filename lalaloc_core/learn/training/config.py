@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.nets.decoder import DECODED_WIDTH
-from lalaloc_core.nets.layout_network import RingConfig
+from lalaloc_core.nets.layout_network import DECODED_WIDTH, RingConfig
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig

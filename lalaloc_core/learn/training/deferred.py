@@ -17,8 +17,7 @@ from torch import Tensor
 
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.render_scene import RenderScene
-from lalaloc_core.learn.training.batches import Batch, stack_rows
-from lalaloc_core.learn.training.rotation import Rotation
+from lalaloc_core.learn.training.batches import Batch, Rotation, stack_rows
 
 Row = dict[str, np.ndarray]
 

@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
+from lalaloc_core.learn.synth.augmentation import jittered, optics
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
-from lalaloc_core.learn.training.batches import Batch
+from lalaloc_core.learn.training.batches import Batch, Photographs
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
-from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
     TrainingStage,

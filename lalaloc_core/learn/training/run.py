@@ -11,16 +11,14 @@ import torch
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training.checkpoint import Checkpoint, Validate
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.end_to_end import EndToEndStage
 from lalaloc_core.learn.training.image_stage import ImageStage
-from lalaloc_core.learn.training.layout_stage import LayoutStage
+from lalaloc_core.learn.training.layout_stage import EndToEndStage, LayoutStage
 from lalaloc_core.learn.training.loop import run_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage
 from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.learn.training.validate import LayoutValidation
-from lalaloc_core.learn.training.view_stage import PHOTOGRAPH_SIZE, ViewStage, view_window
-from lalaloc_core.learn.training.view_validation import ViewValidation
+from lalaloc_core.learn.training.view_stage import PHOTOGRAPH_SIZE, ViewStage, ViewValidation, view_window
 from lalaloc_core.learn.training.warm_start import (
     check_same_networks,
     find_checkpoint,

@@ -13,15 +13,13 @@ from torch import Tensor, nn
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import SphereBatches
-from lalaloc_core.learn.training.batches import Batch, load_batches
+from lalaloc_core.learn.training.batches import Batch, Photographs, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
-from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork
-from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_features import WallModes
-from lalaloc_core.nets.layout_network import RingLayoutEncoder
+from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder

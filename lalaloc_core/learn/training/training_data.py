@@ -14,9 +14,9 @@ from torch import nn
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
+from lalaloc_core.learn.training.batches import Photographs
 from lalaloc_core.learn.training.checkpoint import Validate
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.photograph_batches import Photographs
 from lalaloc_core.learn.training.photograph_targets import load_photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, SceneSource, Source
 from lalaloc_core.learn.training.validate import ImageValidation
@@ -34,8 +34,6 @@ class TrainingData:
         textures: folder of material pictures for the generator; None makes all materials procedural.
         deferred: render the generator's spheres on the training device instead of in the workers.
         validation_scenes: maximum number of validation scenes, spread evenly over the split.
-        heldout: out-of-distribution scenes; image validation reports their validation split too, but no choice depends
-            on it.
         photographs: folders of spheres for the image stages, see `training.photograph_targets`.
         teachers: segmenter and bundle that predict the walls and openings of those without annotation.
     """
@@ -45,7 +43,6 @@ class TrainingData:
     textures: Path | None = None
     deferred: bool = False
     validation_scenes: int = 50
-    heldout: Dataset | None = None
     photographs: tuple[Path, ...] = ()
     teachers: tuple[Path, ...] = ()
 
@@ -105,18 +102,7 @@ class TrainingData:
         cache = folder / "validation.npz" if folder is not None and self.dataset is None else None
         validation = ImageValidation(config, scenes, layout_encoder, device, usual, problems, cache=cache)
         _log(problems)
-        if self.heldout is None:
-            return validation
-        heldout = ImageValidation(
-            config,
-            list(load_scenes(self.heldout, self.heldout.scenes("validation"))),
-            layout_encoder,
-            device,
-            self.heldout.appearances[0],
-            prefix="heldout",
-            cache=None if folder is None else folder / "heldout.npz",
-        )
-        return lambda modules: validation(modules) | heldout(modules)
+        return validation
 
 
 def _log(problems: list[DatasetError] | None) -> None:

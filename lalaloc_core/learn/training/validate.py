@@ -24,8 +24,8 @@ from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.learn.metrics import Accuracy, count_classes, score_classes
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import opening_kinds
+from lalaloc_core.learn.training.batches import Rotation, sample_rotation
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.rotation import Rotation, sample_rotation
 from lalaloc_core.nets.image_features import ImageFeatures
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
@@ -93,14 +93,12 @@ class ImageValidation:
         usual: Appearance | None = None,
         problems: list[DatasetError] | None = None,
         *,
-        prefix: str = "val",
         cache: Path | None = None,
     ) -> None:
         self.columns = config.profile_columns
         self.balance = config.image.opening_balance
         self.device = device
         self.layout_encoder = layout_encoder
-        self.prefix = prefix
         self.queries = _queries(config, scenes)
         looks = [_appearance(query.camera, usual) for query in self.queries]
         readable: list[bool] = [True] * len(looks)
@@ -156,14 +154,14 @@ class ImageValidation:
                 for profile, layouts in zip(torch.cat(profiles), self._layouts, strict=True)
             ]
             metrics |= self._accuracies("profile_", nearest)
-            metrics[f"{self.prefix}_nll"] = sum(prediction.nll for prediction in predictions) / len(self.queries)
+            metrics["val_nll"] = sum(prediction.nll for prediction in predictions) / len(self.queries)
             true = torch.cat([part.true_profile_m for part in predictions if part.true_profile_m is not None])
             error = (torch.cat(profiles) - true.log()).abs().median(dim=1).values
-            metrics[f"{self.prefix}_log_error"] = float(error.median())
+            metrics["val_log_error"] = float(error.median())
         confusions = [prediction.confusion for prediction in predictions if prediction.confusion is not None]
         if confusions:
             accuracy = score_classes(np.sum(confusions, axis=0), OPENING_CLASSES).balanced_accuracy
-            metrics[f"{self.prefix}_opening_accuracy"] = accuracy
+            metrics["val_opening_accuracy"] = accuracy
         for module, was_training in modes:
             module.train(was_training)
         return metrics
@@ -177,8 +175,8 @@ class ImageValidation:
         metrics = {}
         for name, members in slices.items():
             accuracy = Accuracy.from_errors(errors[members])
-            metrics[f"{self.prefix}_{method}within_1m{name}"] = accuracy.within_1m
-            metrics[f"{self.prefix}_{method}median_cm{name}"] = accuracy.median_cm
+            metrics[f"val_{method}within_1m{name}"] = accuracy.within_1m
+            metrics[f"val_{method}median_cm{name}"] = accuracy.median_cm
         return metrics
 
     def _predict(self, encoder: nn.Module, layout_encoder: nn.Module, part: slice) -> _Prediction:

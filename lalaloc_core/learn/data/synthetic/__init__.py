@@ -2,8 +2,7 @@
 
 Begin with `generated.py`: homes of the generator, rendered on demand. For calibration, `altered_photographs.py`
 degrades or replaces their photographs, `foreign.py` asks for them in other plans, and `copied.py`
-puts copies of a home into one plan. `heldout.py` generates the out-of-distribution homes (extra `oracle`); `writing.py`
-implements `lalaloc lab synth`.
+puts copies of a home into one plan; `writing.py` implements `lalaloc lab synth`.
 """
 
 from lalaloc_core.learn.data.synthetic.altered_photographs import MismatchedScenes

@@ -18,8 +18,7 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, WithoutDepth
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
-from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
-from lalaloc_core.learn.synth.augmentation.stretching import stretched_images
+from lalaloc_core.learn.synth.augmentation import jittered, optics, stretched_images
 
 # Standard deviation of the log ratio between photographed and planned lengths, along two axes.
 _LENGTH_ERROR = 0.1

@@ -12,8 +12,7 @@ from torch import Tensor
 from lalaloc_core.conventions import TWO_PI, column_azimuths, row_elevations
 from lalaloc_core.learn.synth.rendering.cast import Hits, SceneBatch, cast_own_walls
 from lalaloc_core.learn.synth.rendering.prisms import cross_prisms, resolve_prisms
-from lalaloc_core.learn.synth.scene.materials import PICTURE_SIZE, MaterialLibrary
-from lalaloc_core.learn.synth.scene.patterns import smooth_noise
+from lalaloc_core.learn.synth.scene.materials import PICTURE_SIZE, MaterialLibrary, smooth_noise
 from lalaloc_core.learn.synth.scene.render_scene import Backdrop, Prisms
 from lalaloc_core.learn.synth.scene.surfaces import Surfaces
 

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.learn.synth.camera.develop import develop
-from lalaloc_core.learn.synth.camera.exposure import without_stitching
-from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
-from lalaloc_core.learn.synth.homes.plans import generate_home
+from lalaloc_core.learn.synth.camera import develop, without_stitching
 from lalaloc_core.learn.synth.records import Row
 from lalaloc_core.learn.synth.rendering.cast import Hits, SceneBatch, trace
 from lalaloc_core.learn.synth.rendering.shading import Atlas, Outdoors, shade
@@ -26,12 +21,11 @@ from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.lighting import Mood, relit
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import Decals, Prisms, RenderScene, SceneRecords
-from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.learn.synth.scene.shots import Shot
 
 # Small batches stay in a CPU's caches, large ones fill a GPU.
 _BATCH_PIXELS = {"cpu": 1 << 17}
 _BATCH_PIXELS_ELSEWHERE = 1 << 21
-_SHEET_ROWS, _SHEET_COLUMNS = 4, 4
 # Padding of tables: walls of no room, decals on no wall, and a small box far away.
 _NO_ROOM = -(10**6)
 _PADDING = {"decals": Decals.row(wall=-1.0), "prisms": Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0)}
@@ -179,16 +173,3 @@ def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBa
         wall_surface=stack([scene.wall_surface for scene in scenes], torch.long),
         **{field.name: stack_records(field.name) for field in dataclasses.fields(SceneRecords)},
     )
-
-
-def contact_sheet(path: Path, rng: np.random.Generator, textures: Path | None = None, *, height: int = 256) -> None:
-    """Write a sheet of 16 spheres of 16 homes, from empty to full.
-
-    `textures` is a folder of material pictures, and `height` that of one sphere in pixels.
-    """
-    renderer = SphereRenderer(MaterialLibrary.create(rng, textures), height=height, width=2 * height, supersample=2)
-    levels: list[FurnitureLevel] = ["empty", "simple", "full", "full"] * _SHEET_ROWS
-    shots = [sample_shots(generate_home(rng), 1, rng, level)[0] for level in levels]
-    pictures = renderer.render(shots).numpy()
-    rows = pictures.reshape(_SHEET_ROWS, _SHEET_COLUMNS, height, 2 * height, 3).swapaxes(1, 2)
-    Image.fromarray(rows.reshape(_SHEET_ROWS * height, _SHEET_COLUMNS * 2 * height, 3)).save(path, quality=85)

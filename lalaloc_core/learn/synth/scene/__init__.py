@@ -1,7 +1,6 @@
 """Scenes: surroundings of one camera in a home as arrays to render (walls, decals, furniture, materials, light).
 
-Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`); `facts.py` lists
-properties that make a shot hard.
+Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`).
 """
 
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

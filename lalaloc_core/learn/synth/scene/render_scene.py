@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.learn.synth.camera.exposure import Exposure
+from lalaloc_core.learn.synth.camera import Exposure
 from lalaloc_core.learn.synth.records import Column, Joined, Records, columns
 from lalaloc_core.learn.synth.scene.surfaces import Surfaces
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.learn.synth.camera.exposure import Exposure
+from lalaloc_core.learn.synth.camera import Exposure
 from lalaloc_core.learn.synth.furniture.furnish import Prism
 from lalaloc_core.learn.synth.records import Row
 from lalaloc_core.learn.synth.scene.render_scene import (

@@ -1,17 +1,21 @@
-"""Shell of a room: floor, ceiling and walls, and wall decorations that do not hide its edges."""
+"""Shell of a room: floor, ceiling with beams and lamps, walls with their windows, and what hangs on them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from enum import IntEnum
 
 import numpy as np
+import shapely
 
 from lalaloc_core.floorplan import Room
-from lalaloc_core.learn.synth.furniture.furnish import wall_frame
+from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, Prism, rectangle, wall_frame
+from lalaloc_core.learn.synth.furniture.pieces import Finish
+from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.scene.lighting import Lighting
 from lalaloc_core.learn.synth.scene.render_scene import VisibleRooms
 from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
-from lalaloc_core.learn.synth.scene.streams import ScenePart, Streams
 from lalaloc_core.learn.synth.scene.surfaces import Colour, HouseStyle, bright, paint, pale, vivid
 
 # Trims reach this far beyond the ends of their wall, the floor and the ceiling: no crack is seen.
@@ -112,3 +116,223 @@ def _hang_picture(tables: SceneTables, wall: int, length_m: float, rng: np.rando
     tables.add_decal(wall, s_m=(s0, s1), z_m=(z0, z1), surface=frame)
     inset = rng.uniform(0.015, 0.05)
     tables.add_decal(wall, s_m=(s0 + inset, s1 - inset), z_m=(z0 + inset, z1 - inset), surface=picture)
+
+
+class ScenePart(IntEnum):
+    """Parts of a scene that have streams of their own in a staged scene."""
+
+    MOOD = 0
+    ROOM = 1
+    FLOOR = 2
+    ACCENT = 3
+    TRIM = 4
+    OPENING = 5
+    RADIATOR = 6
+    FURNITURE = 7
+    LAMPS = 8
+    CAMERA = 9
+    MATERIALS = 10
+
+
+class Streams:
+    """Random streams of one scene; with `is_staged` every part restarts its stream, see `begin`.
+
+    Attributes:
+        shapes: decides everything except materials.
+        materials: separate, because shapes must not depend on the available pictures.
+    """
+
+    def __init__(self, seed: int, *, is_staged: bool) -> None:
+        self._seed, self.is_staged = seed, is_staged
+        self.shapes = np.random.default_rng(seed)
+        self.materials = np.random.default_rng([seed, ScenePart.MATERIALS])
+
+    def begin(self, part: ScenePart, *which: int) -> None:
+        """Restart the streams for a part, so that in a staged scene it does not depend on the parts before it.
+
+        `which` numbers the room or opening, if there are several.
+        """
+        if self.is_staged:
+            for stream, number in ((self.shapes, ()), (self.materials, (ScenePart.MATERIALS,))):
+                fresh = np.random.default_rng([self._seed, part, *which, *number])
+                stream.bit_generator.state = fresh.bit_generator.state
+
+
+# Boxes end so far above openings and the camera.
+_ABOVE_OPENING_M, _ABOVE_CAMERA_M = 0.03, 0.25
+# Slopes are stairs of so many steps, because boxes have level undersides.
+_STEPS = 6
+_MAX_BEAMS = 6
+# Share of a box's footprint that must lie in the room: boxes outside would be seen through windows.
+_INSIDE = 0.995
+_KINDS = ("beams", "soffit", "tray", "slope")
+
+
+def ceiling_boxes(
+    room: Room, openings: Sequence[Opening], camera_height_m: float, rng: np.random.Generator
+) -> list[Prism]:
+    """Return boxes below a room's ceiling; none where the ceiling is too low for them."""
+    top = room.ceiling_height_m
+    floor_m = camera_height_m + _ABOVE_CAMERA_M
+    kind = _KINDS[int(rng.choice(len(_KINDS), p=(0.35, 0.3, 0.15, 0.2)))]
+    wall = int(rng.integers(len(room.walls_m)))
+    if kind == "beams":
+        return _beams(room, wall, max(floor_m, top - rng.uniform(0.08, 0.35)), rng)
+    width = rng.uniform(0.2, 1.0)
+    if kind == "slope":
+        lowest = max(floor_m, _clear_m(openings, [wall]), top - rng.uniform(0.3, 1.4))
+        depth = rng.uniform(0.4, 1.0) * room.area_m2**0.5 / _STEPS
+        boxes = [
+            _along_wall(room, wall, (step * depth, (step + 1) * depth), lowest + (top - lowest) * step / _STEPS)
+            for step in range(_STEPS)
+        ]
+    else:
+        walls = [wall] if kind == "soffit" else list(range(len(room.walls_m)))
+        bottom = max(floor_m, _clear_m(openings, walls), top - rng.uniform(0.12, 0.5))
+        boxes = [_along_wall(room, number, (0.0, width), bottom) for number in walls]
+    return [box for box in boxes if box is not None]
+
+
+def _clear_m(openings: Sequence[Opening], walls: list[int]) -> float:
+    """Return the height above all openings in some walls."""
+    return max((opening.head_m + _ABOVE_OPENING_M for opening in openings if opening.wall in walls), default=0.0)
+
+
+def _along_wall(room: Room, wall: int, reach_m: tuple[float, float], bottom_m: float) -> Prism | None:
+    """Return a box along a wall between two distances from it; None if it does not fit."""
+    start, along, inwards = wall_frame(room, wall)
+    length = float(np.hypot(*(room.walls_m[wall][2:] - room.walls_m[wall][:2])))
+    near, far = (start + inwards * reach for reach in reach_m)
+    return _box(room, shapely.Polygon([near, near + along * length, far + along * length, far]), along, bottom_m)
+
+
+def _beams(room: Room, wall: int, bottom_m: float, rng: np.random.Generator) -> list[Prism]:
+    """Return parallel beams from wall to wall."""
+    _, along, inwards = wall_frame(room, wall)
+    middle = np.array(room.shape.centroid.coords[0])
+    reach = float(np.hypot(*np.ptp(room.polygon_m, axis=0)))
+    half, spacing = rng.uniform(0.04, 0.15), rng.uniform(0.5, 1.8)
+    count = min(int(reach / spacing) + 1, _MAX_BEAMS)
+    finish: Finish = "wood" if rng.random() < 0.5 else "white"
+    beams = []
+    for number in range(count):
+        centre = middle + inwards * spacing * (number - 0.5 * (count - 1))
+        near, far = centre - inwards * half, centre + inwards * half
+        strip = shapely.Polygon([near - along * reach, near + along * reach, far + along * reach, far - along * reach])
+        parts = shapely.get_parts(strip.intersection(room.shape))
+        outlines = [part.minimum_rotated_rectangle for part in parts if part.area]
+        beams += [
+            _box(room, outline, along, bottom_m, finish) for outline in outlines if isinstance(outline, shapely.Polygon)
+        ]
+    return [beam for beam in beams if beam is not None]
+
+
+def _box(
+    room: Room, footprint: shapely.Polygon, along: np.ndarray, bottom_m: float, finish: Finish = "paint"
+) -> Prism | None:
+    """Return a box from a footprint up to the ceiling; None if it is flat or reaches out of the room."""
+    if room.ceiling_height_m - bottom_m < 0.03 or footprint.intersection(room.shape).area < _INSIDE * footprint.area:
+        return None
+    corners = shapely.get_coordinates(footprint)
+    across = np.array([-along[1], along[0]])
+    low, high = (np.array([function(corners @ along), function(corners @ across)]) for function in (np.min, np.max))
+    centre = 0.5 * (low + high)
+    middle = along * centre[0] + across * centre[1]
+    half_a, half_b = (0.5 * (high - low)).tolist()
+    return Prism.upright(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish=finish, piece=-1)
+
+
+_HALF_DEPTH_M = 0.05
+_CURTAIN_FROM_WALL_M, _RADIATOR_FROM_WALL_M = 0.07, 0.06
+_MIN_HALF_WIDTH_M = 0.02
+
+
+def add_window(tables: SceneTables, style: HouseStyle, wall: int, window: Opening, rng: np.random.Generator) -> None:
+    """Add frame, panes and bars of a window, sometimes with a blind or a sheer curtain."""
+    s0, s1, z0, z1 = window.start_m, window.end_m, window.sill_m, window.head_m
+    border = rng.uniform(0.04, 0.09)
+    tables.add_decal(wall, s_m=(s0 - 0.03, s1 + 0.03), z_m=(z0 - 0.03, z1 + 0.03), surface=style.trim)
+    # The leaf of a French window has a broad rail at its foot.
+    rail = rng.uniform(0.1, 0.35) if z0 < 0.1 and rng.random() < 0.5 else border
+    tables.add_decal(wall, s_m=(s0 + border, s1 - border), z_m=(z0 + rail, z1 - border), surface=style.outdoors)
+    sashes = max(1, round((s1 - s0) / rng.uniform(0.6, 1.4)))
+    for k in range(1, sashes):
+        s = s0 + (s1 - s0) * k / sashes
+        tables.add_decal(wall, s_m=(s - 0.6 * border, s + 0.6 * border), z_m=(z0, z1), surface=style.trim)
+    if rng.random() < 0.2:
+        z = rng.uniform(0.4, 0.7) * (z1 - z0) + z0
+        tables.add_decal(wall, s_m=(s0, s1), z_m=(z - 0.02, z + 0.02), surface=style.trim)
+    if rng.random() < 0.15:
+        # A roller blind.
+        blind = tables.surfaces.add("furniture", bright(rng), glow=rng.uniform(0.4, 1.2))
+        tables.add_decal(wall, s_m=(s0, s1), z_m=(z1 - rng.uniform(0.2, 0.9) * (z1 - z0), z1), surface=blind)
+    elif rng.random() < 0.08:
+        # A sheer curtain before the whole window.
+        sheer = tables.surfaces.add("furniture", bright(rng), scale=rng.uniform(1.0, 3.0), glow=rng.uniform(0.3, 1.0))
+        bottom = 0.04 if rng.random() < 0.6 else z0 - 0.05
+        tables.add_decal(wall, s_m=(s0 - 0.15, s1 + 0.15), z_m=(bottom, z1 + 0.1), surface=sheer)
+
+
+def add_curtains(tables: SceneTables, room: Room, window: Opening, rng: np.random.Generator, *, is_bare: bool) -> None:
+    """Add curtains on both sides of a window, rarely in a bare home."""
+    if rng.random() >= (0.1 if is_bare else 0.45):
+        return
+    cloth = tables.surfaces.add("furniture", np.clip(paint(rng), 0.03, 0.85), scale=rng.uniform(1.5, 4.0))
+    width, top = rng.uniform(0.15, 0.6), min(window.head_m + 0.15, room.ceiling_height_m - 0.01)
+    bottom = 0.03 if rng.random() < 0.7 else max(0.03, window.sill_m - 0.1)
+    for s in (window.start_m, window.end_m):
+        _hang(
+            tables,
+            room,
+            window.wall,
+            at_m=s,
+            half_m=0.5 * width,
+            from_wall_m=_CURTAIN_FROM_WALL_M,
+            z_m=(bottom, top),
+            surface=cloth,
+        )
+
+
+def add_radiator(tables: SceneTables, style: HouseStyle, room: Room, window: Opening, rng: np.random.Generator) -> None:
+    """Add a radiator below some windows."""
+    if window.sill_m > 0.45 and rng.random() < 0.35:
+        middle, half = 0.5 * (window.start_m + window.end_m), 0.4 * (window.end_m - window.start_m)
+        z_m = (0.1, min(0.7, window.sill_m - 0.05))
+        _hang(
+            tables,
+            room,
+            window.wall,
+            at_m=middle,
+            half_m=half,
+            from_wall_m=_RADIATOR_FROM_WALL_M,
+            z_m=z_m,
+            surface=style.trim,
+        )
+
+
+def _hang(
+    tables: SceneTables,
+    room: Room,
+    wall: int,
+    *,
+    at_m: float,
+    half_m: float,
+    from_wall_m: float,
+    z_m: tuple[float, float],
+    surface: int,
+) -> None:
+    """Add a flat box before a wall, narrower at the wall's end, if it stays in the room and off the camera.
+
+    `at_m` is the position of the box's middle along the wall, `from_wall_m` its distance from the wall, `half_m` half
+    its width, and `z_m` its lower and upper end above the floor.
+    """
+    start, along, inwards = wall_frame(room, wall)
+    length = float(np.hypot(*(room.walls_m[wall, 2:] - room.walls_m[wall, :2])))
+    half_m = min(half_m, at_m, length - at_m)
+    if half_m <= _MIN_HALF_WIDTH_M:
+        return
+    centre = start + along * at_m + inwards * from_wall_m
+    footprint = rectangle(centre, along, half_m, _HALF_DEPTH_M)
+    is_clear = shapely.distance(footprint, shapely.Point(tables.camera_m)) > CAMERA_CLEARANCE_M
+    if is_clear and room.shape.contains(footprint):
+        tables.add_box(centre, along, half_m=(half_m, _HALF_DEPTH_M), z_m=z_m, surface=surface)

@@ -1,0 +1,51 @@
+"""Groups of benchmarks by name, and the runner of `lalaloc bench`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.evaluate.bench.accuracy import (
+    GROUPS,
+    bench_azimuths,
+    bench_localisability,
+    bench_uninformative,
+    measure,
+)
+from lalaloc_core.evaluate.bench.albums import bench_albums
+from lalaloc_core.evaluate.bench.bounds import bench_bounds
+from lalaloc_core.evaluate.bench.measured import Setting
+from lalaloc_core.evaluate.bench.service_latency import bench_service
+from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
+from lalaloc_core.evaluate.bench.steps import bench_steps
+from lalaloc_core.evaluate.bench.turns import bench_films, bench_turns
+
+_BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
+    **{group: partial(measure, rows) for group, rows in GROUPS.items()},
+    "rendering": bench_rendering,
+    "service": bench_service,
+    "turns": bench_turns,
+    "films": bench_films,
+    "bounds": bench_bounds,
+    "steps": bench_steps,
+    "albums": bench_albums,
+    "localisability": bench_localisability,
+    "uninformative": bench_uninformative,
+    "azimuths": bench_azimuths,
+    "methods": bench_methods,
+    "datasets": bench_datasets,
+}
+
+
+def run_bench(
+    bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None, annotated: Path | None = None
+) -> dict[str, Any]:
+    """Measure groups of figures with one bundle; see `Setting`."""
+    bundle = Bundle.open(bundle_folder)
+    setting = Setting(bundle, homes, textures, annotated)
+    machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
+    return machine | {group: _BENCHMARKS[group](setting) for group in groups}
