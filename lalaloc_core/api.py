@@ -46,13 +46,13 @@ from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight, known_heading, stated_height
 from lalaloc_core.localise.query.query import UNKNOWN_HEADING, check_height_m
 from lalaloc_core.localise.search.pipeline import run_steps
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film, read_film
+from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import open_turn
 
 PlanSource = FloorPlan | ImportedPlan | str | PathLike[str] | bytes | Image.Image | UInt8[np.ndarray, "h w *c"]
@@ -194,8 +194,8 @@ class LaLaLoc:
         """
         plan = read_plan(plan)
         height = self._height(plan, camera_height_m)
-        opened, linked, film = read_turn(photographs, self.bundle.manifest, camera or StatedCamera())
-        turn = Turn.of_overlap(opened, [UNKNOWN_HEADING] * len(opened), height, linked, film)
+        opened, angles, film = read_turn(photographs, self.bundle.manifest, camera or StatedCamera())
+        turn = Turn.of_overlap(opened, [UNKNOWN_HEADING] * len(opened), height, angles, film)
         ground = self._ground(plan, self._grid_height_m(plan, height))
         return compose_turn(turn, self._model.search_turn(turn, ground), ground, self.bundle)
 
@@ -357,7 +357,7 @@ class Track:
 
 def read_turn(
     source: TurnSource, manifest: Manifest, stated: StatedCamera
-) -> tuple[Sequence[Photograph], LinkedTurn, Film | None]:
+) -> tuple[Sequence[Photograph], Sequence[TurnAngles], Film | None]:
     """Read photographs of one spot, a folder of them, or a film; see `LaLaLoc.localise_turn`.
 
     Returns:
@@ -370,7 +370,7 @@ def read_turn(
             film = read_film(photograph_content(source), stated=stated, patch_size=size)
         except InvalidFilmError as error:
             raise InvalidFilmError(f"'{source}': {error}" if is_path else str(error)) from error
-        return film.photographs, LinkedTurn.of(film.angles), film
+        return film.photographs, film.angles, film
     sources = pictures_in(Path(source), require=False) if is_path else source
     if not 2 <= len(sources) <= MAX_TURN_PHOTOGRAPHS:
         where = f"'{source}'" if is_path else "the turn"
@@ -378,7 +378,7 @@ def read_turn(
     with named(source):
         contents = [photograph_content(each) for each in sources]
         photographs, angles = open_turn(contents, stated, sphere_size=sphere_size(manifest), patch_size=size)
-    return photographs, LinkedTurn.of(angles), None
+    return photographs, angles, None
 
 
 def pictures_in(folder: Path, *, require: bool = True) -> list[Path]:

@@ -40,7 +40,6 @@ LAYERS = {
     "lalaloc_core.localise.refine": 7,
     "lalaloc_core.localise.search": 8,
     "lalaloc_core.localise.localisability": 9,
-    "lalaloc_core.localise.sequence": 9,
     "lalaloc_core.localise.venue": 9,
     "lalaloc_core.localise.tracking": 10,
     "lalaloc_core.localise.album": 10,

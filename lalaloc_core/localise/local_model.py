@@ -16,12 +16,9 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, p
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.query.query import UNKNOWN_HEADING
-from lalaloc_core.localise.refine import RefinementJob, refine_walls, refined_by_walls
+from lalaloc_core.localise.refine import RefinementJob, RefinementResult, refine_walls, refined_by_walls
 from lalaloc_core.localise.search.pipeline import Localisation, Refiner, localise, run_steps
-from lalaloc_core.localise.sequence import SequenceJob
-from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
-from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
+from lalaloc_core.localise.search.turn_search import TurnLocalisation
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.turn_angles import TurnAngles
@@ -77,14 +74,14 @@ class LocalModel:
         plan: FloorPlan,
         grid: PoseGrid,
         photographs: Sequence[Photograph],
-        linked: LinkedTurn,
+        angles: Sequence[TurnAngles],
         height: CameraHeight,
-    ) -> SequenceLocalisation:
+    ) -> TurnLocalisation:
         """Search the place of photographs of one spot, and the angles that are not known."""
         known = [UNKNOWN_HEADING] * len(photographs)
-        return self.search_turn(Turn.of_overlap(photographs, known, height, linked), Ground(plan, grid))
+        return self.search_turn(Turn.of_overlap(photographs, known, height, angles), Ground(plan, grid))
 
-    def search_turn(self, turn: Turn, ground: Ground) -> SequenceLocalisation:
+    def search_turn(self, turn: Turn, ground: Ground) -> TurnLocalisation:
         """Search the place of a turn."""
         queries = [turn.query(self.encoder, *spot) for spot in turn.spots]
         return run_steps(turn.steps(ground, self.encoder, queries), self.refiner)
@@ -97,10 +94,8 @@ class _LocalRefiner:
         self._bundle = bundle
         self._by_latents: Refiner | None = None
 
-    def refine(self, job: RefinementJob | SequenceJob) -> Any:
+    def refine(self, job: RefinementJob) -> RefinementResult | None:
         """Refine the poses of a job within their rooms."""
-        if isinstance(job, SequenceJob):
-            return refine_sequence(job)
         if refined_by_walls(job):
             return refine_walls(job)
         if self._by_latents is None:

@@ -18,7 +18,6 @@ from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
-from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError, OverloadedError
 from service.pools import LostReason, PoolState
@@ -156,9 +155,7 @@ class RemoteOptimiser:
         workers = 0 if self._lpo is None else 1
         return PoolState(workers=workers, ready=workers, warmed_up=True, fault=None)
 
-    async def refine(
-        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
-    ) -> RefinementResult | SequenceResult | None:
+    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
         """Refine as `LpoPool.refine` does, but without taking turns between clients."""
         if self._lpo is None or timeout_s <= 0.0:
             return None

@@ -18,7 +18,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
-from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from lalaloc_core.localise.venue.index_search import ShardSizes
 from lalaloc_core.photograph import Photograph
 from service.app import create_app
@@ -74,7 +73,7 @@ class LpoReplica:
         """Load the refiner; check the bundle as `EncoderReplica` does."""
         self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.compute.worker_threads)
 
-    def refine(self, job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
+    def refine(self, job: RefinementJob) -> RefinementResult:
         """Return the result of a job."""
         # Copied, because torch warns about the read-only arrays of shared memory.
         return self._refine(deepcopy(job))

@@ -14,12 +14,11 @@ from typing import Any, Protocol, TypeVar
 
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult, refine_walls, refined_by_walls
 from lalaloc_core.localise.search.pipeline import next_step
-from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.capacity.fair_share import FairSemaphore, with_headroom
 from service.capacity.query_context import QueryContext
 from service.capacity.threads import Threads
 from service.pools import LostReason, PoolState
-from service.settings import Settings, work_factor
+from service.settings import Settings
 from service.telemetry import LOGGER_NAME, Telemetry
 
 # LPO stops this long (s) before the request's deadline; ranking and sending the answer need the rest.
@@ -27,7 +26,7 @@ _RESERVED_S = 0.25
 
 T = TypeVar("T")
 FoundT = TypeVar("FoundT")
-SearchSteps = Generator[RefinementJob | SequenceJob | None, Any, T]
+SearchSteps = Generator[RefinementJob | None, Any, T]
 
 
 class Optimiser(Protocol):
@@ -42,9 +41,7 @@ class Optimiser(Protocol):
         """Start the workers and return at once."""
         ...
 
-    async def refine(
-        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
-    ) -> RefinementResult | SequenceResult | None:
+    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
         """Return the result of a client's job; None if it failed or took longer than `timeout_s`."""
         ...
 
@@ -82,11 +79,10 @@ class Executor:
         """Run a search on the compute threads; it holds no thread in its pauses and while a worker refines poses."""
         lpo_timeout_s = partial(self._lpo_timeout_s, context)
         step = await self.compute(context, partial(self._steps.next, steps, None, lpo_timeout_s))
-        while step is None or isinstance(step, RefinementJob | SequenceJob):
+        while step is None or isinstance(step, RefinementJob):
             result = None
             if step is not None:
-                photographs = step.heading.shape[1] if isinstance(step, SequenceJob) else 1
-                result = await self._optimiser.refine(step, self._lpo_timeout_s(context, photographs), context.client)
+                result = await self._optimiser.refine(step, self._lpo_timeout_s(context), context.client)
             step = await self.compute(context, partial(self._steps.next, steps, result, lpo_timeout_s))
         return step
 
@@ -104,8 +100,8 @@ class Executor:
         """Wait for the computations in progress, and stop the threads."""
         self._threads.close()
 
-    def _lpo_timeout_s(self, context: QueryContext, photographs: int = 1) -> float:
-        return min(self._lpo_deadline_s * work_factor(photographs), context.left_s - _RESERVED_S)
+    def _lpo_timeout_s(self, context: QueryContext) -> float:
+        return min(self._lpo_deadline_s, context.left_s - _RESERVED_S)
 
 
 class StepRunner:
@@ -115,9 +111,7 @@ class StepRunner:
         self._optimiser = optimiser
         self._telemetry = telemetry
 
-    def next(
-        self, steps: SearchSteps[T], result: object, timeout_s: Callable[[], float]
-    ) -> RefinementJob | SequenceJob | T | None:
+    def next(self, steps: SearchSteps[T], result: object, timeout_s: Callable[[], float]) -> RefinementJob | T | None:
         """Continue a search.
 
         Args:

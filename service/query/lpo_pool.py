@@ -6,7 +6,6 @@ from typing import get_args
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
-from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.capacity.fair_share import FairSemaphore
 from service.pools import JobLostError, LostReason, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
@@ -36,7 +35,7 @@ class LpoPool:
             start_s=_START_S,
             max_start_s=_MAX_START_S,
         )
-        self._workers: WorkerPool[RefinementJob | SequenceJob, RefinementResult | SequenceResult] = WorkerPool(
+        self._workers: WorkerPool[RefinementJob, RefinementResult] = WorkerPool(
             spec,
             workers=settings.cores.workers,
             queue_limit=settings.lpo.queue,
@@ -62,9 +61,7 @@ class LpoPool:
         """Numbers of workers, all and warm."""
         return self._workers.state
 
-    async def refine(
-        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
-    ) -> RefinementResult | SequenceResult | None:
+    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
         """Return the result of a job, or None if it failed or took longer than `timeout_s`.
 
         Cancelling removes a job that has not started from the queue. Clients take turns.

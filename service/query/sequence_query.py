@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from lalaloc_core.localise.answers.turns import Turn, compose_turn
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.film import Film
+from lalaloc_core.photograph.turn_angles import TurnAngles
 from service.query.answers import sequence_answer
 from service.query.grounds import Site
 from service.query.queries import SequenceQuery
@@ -26,8 +27,8 @@ class SequenceSearch:
         """Localise photographs, or the frames of a film, together."""
         form, context, executor = query.form, query.context, self._parts.executor
         site = await self._parts.grounds.site(where, form)
-        photographs, linked, film = await self._decode(query)
-        turn = self._turn(query, photographs, linked, film, site)
+        photographs, angles, film = await self._decode(query)
+        turn = self._turn(query, photographs, angles, film, site)
         await site.wait(context)
         spots, known = zip(*turn.spots, strict=True)
         queries = await self._parts.reader.encode(spots, known, [turn.height] * len(spots), context)
@@ -51,22 +52,22 @@ class SequenceSearch:
 
         return await executor.compute(context, compose)
 
-    async def _decode(self, query: SequenceQuery) -> tuple[list[Photograph], LinkedTurn | None, Film | None]:
+    async def _decode(self, query: SequenceQuery) -> tuple[list[Photograph], Sequence[TurnAngles] | None, Film | None]:
         """Return the photographs, or the film's frames, and the angles of a turn that their overlap tells."""
         form, reader = query.form, self._parts.reader
         if query.film is not None:
             film = await reader.film(query.film, form.stated_camera, query.context)
-            return list(film.photographs), LinkedTurn.of(film.angles), film
+            return list(film.photographs), film.angles, film
         if form.relative_heading_deg is not None:
             return await reader.decode(query.contents, form.stated_camera, query.context), None, None
         photographs, angles = await reader.decode_turn(query.contents, form.stated_camera, query.context)
-        return photographs, None if angles is None else LinkedTurn.of(angles), None
+        return photographs, angles, None
 
     def _turn(
         self,
         query: SequenceQuery,
         photographs: list[Photograph],
-        linked: LinkedTurn | None,
+        angles: Sequence[TurnAngles] | None,
         film: Film | None,
         site: Site,
     ) -> Turn:
@@ -76,8 +77,8 @@ class SequenceSearch:
             self._parts.reader.known_heading(form.heading_of(index), site.north, photograph)
             for index, photograph in enumerate(photographs)
         ]
-        if linked is not None:
-            return Turn.of_overlap(photographs, known, site.height, linked, film)
+        if angles is not None:
+            return Turn.of_overlap(photographs, known, site.height, angles, film)
         given_deg = form.relative_heading_deg or [None] * len(photographs)
         headings = [None if angle is None else math.radians(angle) for angle in given_deg]
         return Turn.of_headings(photographs, known, site.height, headings, math.radians(form.relative_heading_std_deg))

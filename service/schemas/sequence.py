@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from lalaloc_core.localise.sequence.measured_motion import MIN_ANGLE_STD
 from service.schemas.fields import (
     Degrees,
     Finite,
@@ -26,7 +24,7 @@ from service.schemas.photographs import PhotographFields, ViewAnswer
 from service.schemas.query_fields import CameraFields, PlaceFields
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
-AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
+AngleStd = Annotated[float, Finite, Field(ge=0.01, le=180)]
 _WALK = (
     "photographs of a walk are no query of their own: send them to a session (POST /sessions), or to an album "
     "(POST /albums); photographs from one spot need motion=turn"

@@ -1,6 +1,6 @@
 """Program of an LPO worker process, the only part of the service that imports torch.
 
-It turns a `RefinementJob` into a `RefinementResult`, and a `SequenceJob` into a `SequenceResult`.
+It turns a `RefinementJob` into a `RefinementResult`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import numpy as np
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
-from lalaloc_core.localise.sequence.joint_refinement import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, th
 
 def load_refiner(
     bundle_folder: Path, model_sha256: str, threads: int, *, by_latents: bool = True
-) -> Callable[[RefinementJob | SequenceJob], RefinementResult | SequenceResult]:
+) -> Callable[[RefinementJob], RefinementResult]:
     """Return the function from job to result.
 
     Args:
@@ -63,10 +62,7 @@ def load_refiner(
     if by_latents:
         refiner()
 
-    def refine(job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
-        return refine_sequence(job) if isinstance(job, SequenceJob) else refiner().refine(job)
-
-    return refine
+    return lambda job: refiner().refine(job)
 
 
 def warm_up_job(manifest: Manifest, *, optimise_heading: bool, by_profile: bool) -> RefinementJob:

@@ -13,7 +13,9 @@ import pytest
 from jaxtyping import Float
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn
+from lalaloc_core.localise.answers.turns import Turn
+from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.overlap import Features, Link, Step, agreeing_links, headings_in_order, usual_steps
@@ -68,14 +70,19 @@ def test_closed_turn_fixes_the_field_of_view() -> None:
     assert "estimated from all photographs of the turn" in turned[0].warnings[-1]
 
 
+def turn_of(angles: list[TurnAngles]) -> Turn:
+    """Return a turn of photographs with a field of view of 53°."""
+    taken = photographs([0.0], hfov_deg=53.0) * len(angles)
+    return Turn.of_overlap(taken, [UNKNOWN_HEADING] * len(angles), CameraHeight(1.5), angles)
+
+
 def test_photographs_without_overlap_form_groups() -> None:
     angles = angles_of_turn(turn_views(photographs([0.0, 24.0, 120.0, 144.0, 250.0], hfov_deg=53.0)))
     assert [angle.group for angle in angles] == [0, 0, 1, 1, 2]
     assert math.degrees(angles[3].heading) == pytest.approx(24.0, abs=0.5)
-    linked = LinkedTurn.of(angles)
-    assert linked.turns is None
-    assert [motion.turn is None for motion in linked.motions] == [False, True, False, True]
-    (warning,) = linked.warnings(math.radians(53.0))
+    turn = turn_of(angles)
+    assert turn.turns is None
+    (warning,) = turn.warnings
     assert "3 groups (photo[0], photo[1]; photo[2], photo[3]; photo[4])" in warning
     assert "half the field of view, 26°" in warning
 
@@ -90,9 +97,9 @@ def test_photographs_of_plain_walls_get_their_angles_by_order() -> None:
     # The turn closes, so the middle of the gap is the least certain.
     sd_deg = np.degrees([angle.heading_sd for angle in angles])
     assert 3.0 < sd_deg[4] < sd_deg[5] < 8.0
-    linked = LinkedTurn.of(angles)
-    assert linked.turns is not None
-    (warning,) = linked.warnings(math.radians(53.0))
+    turn = turn_of(angles)
+    assert turn.turns is not None
+    (warning,) = turn.warnings
     assert "nothing links photo[4], photo[5], photo[6] to most others" in warning
     assert f"within ± {2.0 * sd_deg.max():.0f}°" in warning
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
@@ -16,20 +15,15 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.query.query import KnownHeading
 from lalaloc_core.localise.refine import RefinementJob
-from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
-from lalaloc_core.localise.sequence import Motion, SequenceJob
-from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, SequenceRefine, localise_sequence_steps
-from lalaloc_core.localise.sequence.turn_localisation import (
-    EXACT,
-    ON_THE_SPOT,
-    LinkedTurn,
-    found_turns,
-    judged_turn,
-    localised_turn,
-)
+from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine, StageClock, localise_steps
+from lalaloc_core.localise.search.turn_search import RelativeHeading, SearchedTurn, TurnLocalisation, searched_turn
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.film import Film
+from lalaloc_core.photograph.turn_angles import TurnAngles
+from lalaloc_core.photograph.turn_order import LIKELY_SD
 
+# Standard deviation up to which relative headings are exact: the networks predict by columns of 2.8°.
+_EXACT = math.radians(5.0)
 _NO_ANGLES = (
     "features have no pictures that could overlap, so the angles between them were searched: send relative_heading_deg"
 )
@@ -44,8 +38,8 @@ class Turn:
         known: known heading of each.
         height: camera height.
         turns: headings (radians) minus that of the first photograph, if they are known well enough for one query.
-        motions: motions between the photographs in `order`.
-        linked: angles by overlap; None if they are stated, or for features and spheres.
+        relative: relative headings of the photographs, in groups.
+        overlap: angles by overlap; None if they are stated, or for features and spheres.
         relative_headings: relative heading of each photograph as answers tell it; None where it was searched.
         film: the film; None for photographs.
     """
@@ -54,8 +48,8 @@ class Turn:
     known: Sequence[KnownHeading]
     height: CameraHeight
     turns: Sequence[float] | None
-    motions: Sequence[Motion]
-    linked: LinkedTurn | None = None
+    relative: Sequence[RelativeHeading]
+    overlap: Sequence[TurnAngles] | None = None
     relative_headings: Sequence[Angle | None]
     film: Film | None = None
 
@@ -65,13 +59,14 @@ class Turn:
         photographs: Sequence[Photograph],
         known: Sequence[KnownHeading],
         height: CameraHeight,
-        linked: LinkedTurn,
+        overlap: Sequence[TurnAngles],
         film: Film | None = None,
     ) -> Turn:
         """Return a turn whose angles the overlap of its photographs tells."""
-        several = len({angle.group for angle in linked.angles}) < len(photographs)
+        is_one = not any(angle.group or angle.heading_sd > LIKELY_SD for angle in overlap)
+        several = len({angle.group for angle in overlap}) < len(photographs)
         # Of other groups, only the angles within the group are known.
-        relative = [
+        told = [
             Angle(
                 value_deg=math.degrees(angle.heading),
                 std_deg=math.degrees(angle.heading_sd),
@@ -79,16 +74,16 @@ class Turn:
             )
             if several and not angle.group
             else None
-            for angle in linked.angles
+            for angle in overlap
         ]
         return cls(
             photographs=photographs,
             known=known,
             height=height,
-            turns=linked.turns,
-            motions=linked.motions,
-            linked=linked,
-            relative_headings=relative,
+            turns=[angle.heading for angle in overlap] if is_one else None,
+            relative=[RelativeHeading(angle.group, angle.heading, angle.heading_sd) for angle in overlap],
+            overlap=overlap,
+            relative_headings=told,
             film=film,
         )
 
@@ -102,19 +97,20 @@ class Turn:
         std: float,
     ) -> Turn:
         """Return a turn with stated headings (radians) relative to each other, and the deviation between two."""
-        relative = [None if angle is None or headings[0] is None else angle - headings[0] for angle in headings]
         given = [angle for angle in headings if angle is not None]
-        is_exact = 0 < len(given) == len(headings) and std <= EXACT
-        motions = [
-            ON_THE_SPOT if None in (first, second) else replace(ON_THE_SPOT, turn=second - first, turn_std=std)
-            for first, second in itertools.pairwise(headings)
+        # A photograph without a heading is a group of its own.
+        relative = [
+            RelativeHeading(index + 1, 0.0, 0.0) if angle is None else RelativeHeading(0, angle - given[0], std)
+            for index, angle in enumerate(headings)
         ]
+        is_exact = 0 < len(given) == len(headings) and std <= _EXACT
+        told = [None if angle is None or headings[0] is None else angle - headings[0] for angle in headings]
         return cls(
             photographs=photographs,
             known=known,
             height=height,
             turns=[angle - given[0] for angle in given] if is_exact else None,
-            motions=motions,
+            relative=relative,
             relative_headings=[
                 None
                 if angle is None
@@ -123,19 +119,19 @@ class Turn:
                     std_deg=math.degrees(std) if index else 0.0,
                     source="given",
                 )
-                for index, angle in enumerate(relative)
+                for index, angle in enumerate(told)
             ],
         )
 
     @property
-    def is_one_query(self) -> bool:
-        """True unless one of the photographs is a sphere, which shows all that others could add."""
-        return not any(photograph.is_sphere for photograph in self.photographs)
+    def sphere(self) -> int | None:
+        """Number of the first full sphere, which shows all that the others could add; None if there is none."""
+        return next((index for index, photograph in enumerate(self.photographs) if photograph.is_sphere), None)
 
     @property
     def spots(self) -> list[tuple[Spot, KnownHeading]]:
         """All photographs together if their angles are known, else each by itself; with the known heading."""
-        if self.is_one_query and self.turns is not None:
+        if self.sphere is None and self.turns is not None:
             return [self._joint_spot(self.turns)]
         return [(Spot(photograph), known) for photograph, known in zip(self.photographs, self.known, strict=True)]
 
@@ -151,32 +147,24 @@ class Turn:
         encoder: PhotographEncoder,
         queries: Sequence[Query],
         *,
-        refine: SequenceRefine = "lpo",
+        refine: Refine = "lpo",
         top_k: int = 5,
         config: LocaliseConfig | None = None,
         clock: StageClock | None = None,
-    ) -> Generator[RefinementJob | SequenceJob | None, Any, SequenceLocalisation]:
-        """Search the place, and the angles that are not known; see `search.pipeline.next_step`."""
-        # One search, whose stages are those of a sequence.
+    ) -> Generator[RefinementJob | None, Any, TurnLocalisation]:
+        """Search the angles that are not known, then the place; see `search.pipeline.next_step`."""
         config = replace(config or LocaliseConfig(), vdr_candidates=0)
-        plan, grid = ground.plan, ground.grid
-
-        def joint_steps(query: Query) -> Generator[RefinementJob, Any, Localisation]:
-            return localise_steps(
-                plan, grid, encoder.layouts, query, refine=refine, top_k=top_k, config=config, clock=clock
-            )
-
-        if self.is_one_query and self.turns is not None:
-            return localised_turn((yield from joint_steps(queries[0])), self.turns)
-        order = range(len(queries)) if self.linked is None else self.linked.order
-        ordered = [queries[index] for index in order]
-        found = yield from localise_sequence_steps(
-            plan, grid, encoder.layouts, ordered, self.motions, refine=refine, top_k=top_k, clock=clock
+        plan, grid, sphere = ground.plan, ground.grid, self.sphere
+        if sphere is None and self.turns is not None:
+            searched, query = SearchedTurn(list(self.turns)), queries[0]
+        else:
+            searched = yield from searched_turn(plan, grid, encoder.layouts, queries, self.relative, config.matching)
+            query = self.query(encoder, *self._joint_spot(searched.headings)) if sphere is None else queries[sphere]
+        found = yield from localise_steps(
+            plan, grid, encoder.layouts, query, refine=refine, top_k=top_k, config=config, clock=clock
         )
-        found = found if self.linked is None else self.linked.in_order(found)
-        if not self.is_one_query:
-            return found
-        return judged_turn(found, (yield from joint_steps(self.query(encoder, *self._joint_spot(found_turns(found))))))
+        reference = searched.headings[sphere or 0]
+        return TurnLocalisation(found, [angle - reference for angle in searched.headings], searched.contradicted)
 
     def _joint_spot(self, turns: Sequence[float]) -> tuple[Spot, KnownHeading]:
         """Return all photographs as one that sees more azimuths, so that overlapping parts count once."""
@@ -188,33 +176,51 @@ class Turn:
         spot = Spot(self.photographs[0], list(zip(self.photographs[1:], turns[1:], strict=True)))
         return spot, next(stated, self.known[0])
 
-    def contradictions(self, found: SequenceLocalisation) -> list[str]:
-        """Return warnings about photographs that do not fit the one before, by its place or its stated angle."""
-        order = range(len(self.photographs)) if self.linked is None else self.linked.order
-        return [
-            f"photo[{order[index + 1]}]: its place or angle contradicts photo[{order[index]}] and was ignored"
-            for index in found.motions_contradicted
-        ]
-
     @property
     def warnings(self) -> list[str]:
-        """Warnings about angles that were searched."""
+        """Warnings about angles that are assumed or had to be searched."""
         if self.film is not None:
             return []
-        if self.linked is not None:
-            return self.linked.warnings(min(photograph.hfov.value for photograph in self.photographs))
-        has_turn = any(motion.turn is not None for motion in self.motions)
-        return [] if has_turn or not self.is_one_query else [_NO_ANGLES]
+        if self.overlap is not None:
+            return _overlap_warnings(self.overlap, min(photograph.hfov.value for photograph in self.photographs))
+        is_told = any(angle is not None for angle in self.relative_headings)
+        return [] if is_told or self.sphere is not None else [_NO_ANGLES]
+
+
+def _overlap_warnings(angles: Sequence[TurnAngles], hfov: float) -> list[str]:
+    """Return a warning about angles that are assumed or had to be searched, for a field of view (radians)."""
+    groups: dict[int, list[int]] = {}
+    for index, angle in enumerate(angles):
+        groups.setdefault(angle.group, []).append(index)
+    remedy = (
+        f"turn by at most half the field of view, {math.degrees(0.5 * hfov):.0f}°, from one photograph to the next, or "
+        "state the relative headings"
+    )
+    if len(groups) > 1:
+        names = "; ".join(", ".join(f"photo[{index}]" for index in groups[group]) for group in sorted(groups))
+        return [
+            f"the photographs overlap only within {len(groups)} groups ({names}), so the angles between these were "
+            f"searched: {remedy}"
+        ]
+    assumed = [index for index, angle in enumerate(angles) if angle.is_assumed]
+    if not assumed:
+        return []
+    names = ", ".join(f"photo[{index}]" for index in assumed)
+    sd_deg = math.degrees(max(angles[index].heading_sd for index in assumed))
+    return [
+        f"nothing links {names} to most others, as on plain walls, so their angles were assumed by their order, within "
+        f"± {2.0 * sd_deg:.0f}°, as of one turn in equal steps: {remedy}"
+    ]
 
 
 def compose_turn(
-    turn: Turn, found: SequenceLocalisation, ground: Ground, bundle: Bundle, *, warnings: Sequence[str] = ()
+    turn: Turn, found: TurnLocalisation, ground: Ground, bundle: Bundle, *, warnings: Sequence[str] = ()
 ) -> TurnAnswer:
     """Compose the answer about photographs of one spot; its first pose has the next step.
 
     `warnings` are those besides warnings about the photographs.
     """
-    turns = found_turns(found)
+    turns = found.turns
     poses = [
         compose_answer(
             picture,
@@ -231,16 +237,13 @@ def compose_turn(
         for index, (photograph, picture) in enumerate(zip(turn.photographs, found.pictures, strict=True))
     ]
     named = [f"photo[{index}]: {text}" for index, pose in enumerate(poses) for text in pose.view.warnings]
-    share = min(ground.share(picture) for picture in found.pictures)
-    changed = {
-        "confidence": found.confidence(bundle.manifest, share),
-        "warnings": [*turn.warnings, *turn.contradictions(found), *named, *warnings],
-        "stage": found.stage,
-        "camera_height_m": found.camera_height_m,
-    }
+    contradicted = [
+        f"photo[{index}]: its relative heading contradicts the other photographs and was ignored"
+        for index in found.contradicted
+    ]
     film = turn.film
     return TurnAnswer(
-        **(vars(poses[0]) | changed),
+        **(vars(poses[0]) | {"warnings": [*turn.warnings, *contradicted, *named, *warnings]}),
         poses=poses,
         times_s=None if film is None else list(film.times_s),
         film=None if film is None else _film_reading(film),

@@ -1,0 +1,128 @@
+"""Tests of the search of a turn: relative headings by enumeration, and places of photographs in a plan."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encode.layout_encoder import build_grid
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.localise.match import MatchingConfig, PoseGrid
+from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
+from lalaloc_core.localise.search import turn_search
+from lalaloc_core.localise.search.pipeline import localise, run_steps
+from lalaloc_core.localise.search.turn_search import RelativeHeading, SearchedTurn, TurnLocalisation, searched_turn
+from lalaloc_core.render.sampling import PoseSet
+from tests.strategies import plan_of, rectangle
+
+CAMERA_M, STEP_M, HEADINGS = 1.5, 0.5, 32
+SPOT_M, ROOM = (1.6, 7.0), 2
+
+
+@pytest.fixture(scope="module")
+def plan() -> FloorPlan:
+    hall = [[1.0, 5.0], [13.0, 5.0], [13.0, 6.4], [3.0, 6.4], [3.0, 8.0], [1.0, 8.0]]
+    return plan_of(rectangle(4.0, 3.0), rectangle(4.0, 3.0, corner=(10.0, 0.0)), hall)
+
+
+@pytest.fixture(scope="module")
+def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
+    return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
+
+
+def query_at(encoders: PhotographEncoder, plan: FloorPlan, heading: float) -> Query:
+    """Return the query of a perfect image encoder at `SPOT_M`, heading unknown."""
+    pose = PoseSet(np.array([SPOT_M]), np.array([ROOM]))
+    roll = np.arange(HEADINGS) * (math.tau / HEADINGS)
+    profile_m = np.concatenate([encoders.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
+    profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -3.0))
+    latents = encoders.layouts(profile_m, np.full(HEADINGS, CAMERA_M), np.full(HEADINGS, 2.5))
+    height = CameraHeight(CAMERA_M, 0.0)
+    return Query(latents, roll, 0.0, heading_known=False, camera_height=height, profile=profile)
+
+
+@pytest.fixture
+def search(plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder) -> partial[SearchedTurn]:
+    def found(headings: list[float], relative: list[RelativeHeading]) -> SearchedTurn:
+        queries = [query_at(encoders, plan, heading) for heading in headings]
+        return run_steps(searched_turn(plan, grid, encoders, queries, relative, MatchingConfig()), None)
+
+    return partial(found)
+
+
+def misses_deg(found: SearchedTurn, headings: list[float]) -> np.ndarray:
+    turns = np.subtract(headings, headings[0])
+    return np.degrees(np.abs(wrap_angle(np.array(found.headings) - turns)))
+
+
+def test_headings_equal_those_of_enumeration() -> None:
+    rng = np.random.default_rng(3)
+    relative = [RelativeHeading(0, 0.0, 0.0), RelativeHeading(1, 0.0, 0.0), RelativeHeading(0, 1.2, 0.4)]
+    heading = [math.tau / count * np.arange(count) + offset for count, offset in ((6, 0.1), (5, 0.0), (4, 0.7))]
+    seen = [rng.normal(0.0, 2.0, (7, len(each))) for each in heading]
+    prior = rng.normal(0.0, 0.5, 7)
+
+    def weight(row: int, column: int) -> float:
+        off = wrap_angle(heading[2][row] - heading[0][column] - 1.2) / math.hypot(0.4, 0.5 * math.tau / 4)
+        return math.exp(-0.5 * off**2) + turn_search._FLOOR
+
+    joint = np.zeros((7, 6, 5, 4))
+    for place, first, second, third in itertools.product(*map(range, joint.shape)):
+        evidence = seen[0][place, first] + seen[1][place, second] + seen[2][place, third]
+        joint[place, first, second, third] = math.exp(prior[place] + evidence) * weight(third, first)
+    place = int(joint.sum(axis=(1, 2, 3)).argmax())
+    best = int(joint[place].sum(axis=(1, 2)).argmax())
+    rows = [best, int(joint[place].sum(axis=(0, 2)).argmax()), int(joint[place].sum(axis=1)[best].argmax())]
+    found = turn_search._most_probable(seen, heading, relative, prior)
+    expected = [heading[number][row] for number, row in enumerate(rows)]
+    # Headings lie between hypotheses, nearest to the best.
+    off = wrap_angle(np.array(found.headings) - np.array(expected) + expected[0])
+    assert np.abs(off).max() < math.tau / 4
+
+
+def test_unknown_relative_headings_are_found(search: partial[SearchedTurn]) -> None:
+    headings = [0.3, 1.5, 4.0]
+    found = search(headings, [RelativeHeading(index, 0.0, 0.0) for index in range(3)])
+    assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
+    assert found.contradicted == ()
+
+
+def test_relative_headings_within_groups_are_kept(search: partial[SearchedTurn]) -> None:
+    headings = [0.3, 1.5, 4.0, 4.7]
+    groups = [RelativeHeading(0, 0.0, 0.0), RelativeHeading(0, 1.2, 0.01), RelativeHeading(1, 0.0, 0.0)]
+    found = search(headings, [*groups, RelativeHeading(1, 0.7, 0.01)])
+    assert found.headings[1] == pytest.approx(1.2)
+    assert wrap_angle(found.headings[3] - found.headings[2]) == pytest.approx(0.7)
+    assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
+
+
+def test_wrong_relative_heading_is_reported_and_ignored(search: partial[SearchedTurn]) -> None:
+    headings = [0.3, 1.5, 4.0]
+    told = [RelativeHeading(0, 0.0, 0.0), RelativeHeading(0, 2.9, 0.1), RelativeHeading(0, 3.7, 0.1)]
+    found = search(headings, told)
+    assert found.contradicted == (1,)
+    assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
+
+
+def test_places_are_limited(search: partial[SearchedTurn], monkeypatch: pytest.MonkeyPatch) -> None:
+    headings = [0.3, 1.5]
+    monkeypatch.setattr(turn_search, "_MAX_PLACES", 8)
+    found = search(headings, [RelativeHeading(index, 0.0, 0.0) for index in range(2)])
+    assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
+
+
+def test_photographs_have_the_place_of_all_and_their_own_headings(
+    plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
+) -> None:
+    joint = localise(plan, grid, encoders, query_at(encoders, plan, 0.3), refine="none")
+    found = TurnLocalisation(joint, [-0.5, 0.0, 1.0])
+    np.testing.assert_allclose(found.turns, [0.0, 0.5, 1.5])
+    for picture, heading in zip(found.pictures, found.headings, strict=True):
+        assert picture.candidates == joint.candidates
+        np.testing.assert_allclose(picture.query.roll, joint.query.roll + heading)
