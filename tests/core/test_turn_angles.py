@@ -15,7 +15,7 @@ from jaxtyping import Float
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.answers.turns import Turn
 from lalaloc_core.localise.query import CameraHeight
-from lalaloc_core.localise.query.stated_pose import UNKNOWN_HEADING
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.overlap import Features, Link, Step, agreeing_links, headings_in_order, usual_steps

@@ -122,18 +122,16 @@ def confidence_of(
     *,
     heading_known: bool,
     share: float = 1.0,
-    linked_fit: float = 0.0,
 ) -> Confidence | None:
     """Return the confidence of an answer; None without a model, or if the model was not fitted on the stage.
 
     `signals` are the answer's after `stage`; `heading_known` states that the heading was given exactly; `share` is the
-    probability that the place is among those that were searched. `linked_fit` is the highest probability that a
-    photograph which measured motions link to this one is of the plan: then this one is, too.
+    probability that the place is among those that were searched.
     """
     fit = None if model is None else model.fit_probability(stage, asdict(signals), heading_known=heading_known)
     if fit is None:
         return None
-    fit = max(fit, linked_fit) * share
+    fit *= share
     return Confidence(
         fit=fit,
         position=fit * posterior.position,

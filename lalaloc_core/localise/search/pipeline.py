@@ -103,7 +103,6 @@ class Localisation:
         heading_contradicted: whether a heading was given that the picture contradicts.
         hints_missed: hints that do not hold at the answer; of strict hints, those that the picture contradicts.
         best: the best candidate after each stage that ran, in order.
-        linked_fit: highest probability that a photograph which measured motions link to this one is of the plan.
     """
 
     query: Query
@@ -115,7 +114,6 @@ class Localisation:
     hints_missed: tuple[HintName, ...] = ()
     best: dict[SearchStage, Candidate] = field(default_factory=dict)
     timings_ms: dict[str, float] = field(default_factory=dict)
-    linked_fit: float = 0.0
 
     @property
     def camera_height_m(self) -> float:
@@ -134,7 +132,6 @@ class Localisation:
             self.posterior,
             heading_known=self.query.heading_known,
             share=share,
-            linked_fit=self.linked_fit,
         )
 
 
