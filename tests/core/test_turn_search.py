@@ -33,16 +33,16 @@ def plan() -> FloorPlan:
 
 @pytest.fixture(scope="module")
 def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
+    return build_grid(plan, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
 def query_at(encoders: PhotographEncoder, plan: FloorPlan, heading: float) -> Query:
     """Return the query of a perfect image encoder at `SPOT_M`, heading unknown."""
     pose = PoseSet(np.array([SPOT_M]), np.array([ROOM]))
     roll = np.arange(HEADINGS) * (math.tau / HEADINGS)
-    profile_m = np.concatenate([encoders.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
+    profile_m = np.concatenate([encoders.layouts.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
     profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -3.0))
-    latents = encoders.layouts(profile_m, np.full(HEADINGS, CAMERA_M), np.full(HEADINGS, 2.5))
+    latents = encoders.layouts.latents(profile_m, np.full(HEADINGS, CAMERA_M), np.full(HEADINGS, 2.5))
     height = CameraHeight(CAMERA_M, 0.0)
     return Query(latents, roll, 0.0, heading_known=False, camera_height=height, profile=profile)
 
@@ -51,7 +51,7 @@ def query_at(encoders: PhotographEncoder, plan: FloorPlan, heading: float) -> Qu
 def search(plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder) -> partial[SearchedTurn]:
     def found(headings: list[float], relative: list[RelativeHeading]) -> SearchedTurn:
         queries = [query_at(encoders, plan, heading) for heading in headings]
-        return run_steps(searched_turn(plan, grid, encoders, queries, relative, MatchingConfig()), None)
+        return run_steps(searched_turn(plan, grid, encoders.layouts, queries, relative, MatchingConfig()), None)
 
     return partial(found)
 
@@ -120,7 +120,7 @@ def test_places_are_limited(search: partial[SearchedTurn], monkeypatch: pytest.M
 def test_photographs_have_the_place_of_all_and_their_own_headings(
     plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
 ) -> None:
-    joint = localise(plan, grid, encoders, query_at(encoders, plan, 0.3), refine="none")
+    joint = localise(plan, grid, encoders.layouts, query_at(encoders, plan, 0.3), refine="none")
     found = TurnLocalisation(joint, [-0.5, 0.0, 1.0])
     np.testing.assert_allclose(found.turns, [0.0, 0.5, 1.5])
     for picture, heading in zip(found.pictures, found.headings, strict=True):
