@@ -19,8 +19,8 @@ from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine, StageC
 from lalaloc_core.localise.search.turn_search import RelativeHeading, SearchedTurn, TurnLocalisation, searched_turn
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.film import Film
+from lalaloc_core.photograph.overlap import LIKELY_SD
 from lalaloc_core.photograph.turn_angles import TurnAngles
-from lalaloc_core.photograph.turn_order import LIKELY_SD
 
 # Standard deviation up to which relative headings are exact: the networks predict by columns of 2.8°.
 _EXACT = math.radians(5.0)

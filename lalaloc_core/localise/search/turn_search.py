@@ -29,7 +29,7 @@ from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost,
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.query import NO_HINTS, Query
 from lalaloc_core.localise.search.pipeline import Localisation, SearchStage
-from lalaloc_core.photograph.turn_order import LIKELY_SD
+from lalaloc_core.photograph.overlap import LIKELY_SD
 
 # Number of places whose headings are searched, the best by every n-th azimuth, with n = `_STRIDE`; and of pairs of a
 # place and a heading in memory, of all photographs.
