@@ -223,8 +223,8 @@ class LaLaLoc:
             InvalidInputError: there are too many photographs, or the plans are too large.
             InvalidFloorPlanError: a plan cannot be read.
         """
-        several = isinstance(plans, Sequence) and not isinstance(plans, str | bytes)
-        read = [read_plan(plan) for plan in plans] if several else [read_plan(plans)]
+        several = plans if isinstance(plans, Sequence) and not isinstance(plans, str | bytes) else [plans]
+        read = [read_plan(plan) for plan in several]
         sources = pictures_in(Path(photographs)) if isinstance(photographs, str | PathLike) else photographs
         if len(sources) > MAX_PHOTOGRAPHS:
             raise InvalidInputError(f"{len(sources)} photographs are given; the limit is {MAX_PHOTOGRAPHS}")

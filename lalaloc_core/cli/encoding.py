@@ -94,14 +94,15 @@ def _encode_turn(
 ) -> None:
     """Write the features of a turn, and the angles between them, which features cannot tell."""
     from lalaloc_core.api import read_turn
+    from lalaloc_core.localise.answers.turns import overlap_warnings
     from lalaloc_core.photograph.turned import stated_headings
 
-    photographs, linked, film = read_turn(arguments.turn, manifest, stated)
+    photographs, angles, film = read_turn(arguments.turn, manifest, stated)
     if film is None:
-        angles = linked.warnings(min(photograph.hfov.value for photograph in photographs))
+        warnings = overlap_warnings(angles, min(photograph.hfov.value for photograph in photographs))
     else:
-        angles = film.warnings
-    for warning in dict.fromkeys([*angles, *(text for photograph in photographs for text in photograph.warnings)]):
+        warnings = film.warnings
+    for warning in dict.fromkeys([*warnings, *(text for photograph in photographs for text in photograph.warnings)]):
         print(f"warning: {arguments.turn}: {warning}", file=sys.stderr)
     out = arguments.out or arguments.turn.with_suffix(".features")
     try:
@@ -110,7 +111,7 @@ def _encode_turn(
         raise InvalidInputError(f"'{out}' cannot be made: {error.strerror}") from error
     for index, photograph in enumerate(photographs):
         _write(out / f"{index:02}.features", encoder.features(photograph))
-    headings_deg, std_deg = stated_headings(linked.angles)
+    headings_deg, std_deg = stated_headings(angles)
     fields = {"motion": "turn", "relative_heading_deg": headings_deg, "relative_heading_std_deg": std_deg}
     _write(out / "turn.json", json.dumps(fields, indent=1).encode())
 

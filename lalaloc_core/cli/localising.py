@@ -213,5 +213,6 @@ def _draw(
     if picture != "plan" and drawn.photograph is not None:
         pixels = open_picture(content, max_size=PHOTOGRAPH_SIZE)
     elif picture != "plan":
-        pixels = open_photograph(content, sphere_size=PHOTOGRAPH_SIZE[::-1], stated=stated).sphere
+        width, height = PHOTOGRAPH_SIZE
+        pixels = open_photograph(content, sphere_size=(height, width), stated=stated).sphere
     write_picture(draw_answer(drawn, pixels, picture, title=title), out)

@@ -50,7 +50,7 @@ def write_pin_files(
     from lalaloc_core.draw.pins import DPI, draw_pins, report_pages
 
     plans = dict(zip(pinned.plan_ids, pinned.plans, strict=True))
-    document = pinned.document() | {"moved": list(moved)}
+    document: dict[str, Any] = pinned.document() | {"moved": list(moved)}
     entries, notes = document["photographs"], document["notes"]
     if all(plan.anchor is None for plan in pinned.plans):
         notes.append("the plan has no anchor (docs/reference/plan-format.md), so pins.geojson is left out")

@@ -88,7 +88,7 @@ def sequence_answer(
         confidence=answer.confidence,
         warnings=answer.warnings,
         film=None if answer.film is None else FilmAnswer.model_validate(asdict(answer.film)),
-        stage=answer.stage,
+        stage="lpo" if answer.stage == "lpo" else "retrieval",
         camera_height_m=answer.camera_height_m,
         timings_ms=first.timings_ms,
         model=first.model,

@@ -182,12 +182,12 @@ class Turn:
         if self.film is not None:
             return []
         if self.overlap is not None:
-            return _overlap_warnings(self.overlap, min(photograph.hfov.value for photograph in self.photographs))
+            return overlap_warnings(self.overlap, min(photograph.hfov.value for photograph in self.photographs))
         is_told = any(angle is not None for angle in self.relative_headings)
         return [] if is_told or self.sphere is not None else [_NO_ANGLES]
 
 
-def _overlap_warnings(angles: Sequence[TurnAngles], hfov: float) -> list[str]:
+def overlap_warnings(angles: Sequence[TurnAngles], hfov: float) -> list[str]:
     """Return a warning about angles that are assumed or had to be searched, for a field of view (radians)."""
     groups: dict[int, list[int]] = {}
     for index, angle in enumerate(angles):
@@ -242,8 +242,9 @@ def compose_turn(
         for index in found.contradicted
     ]
     film = turn.film
+    fields: dict[str, Any] = vars(poses[0]) | {"warnings": [*turn.warnings, *contradicted, *named, *warnings]}
     return TurnAnswer(
-        **(vars(poses[0]) | {"warnings": [*turn.warnings, *contradicted, *named, *warnings]}),
+        **fields,
         poses=poses,
         times_s=None if film is None else list(film.times_s),
         film=None if film is None else _film_reading(film),
