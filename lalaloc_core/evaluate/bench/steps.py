@@ -28,10 +28,10 @@ from lalaloc_core.localise.localisability.next_step import BEHIND_M, HEADING_ERR
 from lalaloc_core.localise.localisability.reports import known_of
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Hints, Query
-from lalaloc_core.localise.search.pipeline import Localisation, localise
-from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
-from lalaloc_core.localise.sequence.sequence_search import localise_sequence
+from lalaloc_core.localise.search.pipeline import Localisation, localise, run_steps
+from lalaloc_core.localise.tracking import Odometry, TrackState
+from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
+from lalaloc_core.localise.tracking.tracking_filter import track_steps
 from lalaloc_core.photograph import Photograph
 
 _FIELD_DEG, _SHOTS = 80.0, 2
@@ -139,23 +139,15 @@ class _Visit:
             return self._outcome(self.found)
         shot = dataclasses.replace(self.shot, position_m=place, room_index=int(room), heading=azimuth)
         sphere = CachedSphere(RenderedPhotograph(shot, self.renderers))
-        motion = Motion(
-            distance_m=way_m,
-            distance_std_m=_WAY_STD_M,
-            turn=step.turn,
-            turn_std=_WAY_STD,
-            direction=step.turn,
-            direction_std=_WAY_STD,
-        )
-        queries = [
-            self.model.encoder.query(view, None, self.height) for view in (self.photograph, self._view(sphere, 0.0))
-        ]
-        found = localise_sequence(
-            plan, self.grid, self.model.encoder.layouts, queries, [motion], refiner=refine_sequence
-        )
-        confidence = self._confidence(found.pictures[1])
-        assert confidence is not None
-        return confidence.position, float(np.linalg.norm(found.pictures[1].candidates[0].position_m - place))
+        forward_m, right_m = way_m * math.cos(step.turn), way_m * math.sin(step.turn)
+        motion = Odometry.of_stds(forward_m, right_m, step.turn, (_WAY_STD_M, _WAY_STD_M, _WAY_STD))
+        plans, layouts, state = TrackedPlans.of_plan(plan, self.grid), self.model.encoder.layouts, None
+        for view, odometry in ((self.photograph, None), (self._view(sphere, 0.0), motion)):
+            query = self.model.encoder.query(view, None, self.height)
+            state = state or TrackState.first(len(query.roll))
+            found = run_steps(track_steps(plans, layouts, state, query, odometry), self.model.refiner)
+            state = found.state
+        return found.pose.probability, math.hypot(found.pose.x_m - place[0], found.pose.y_m - place[1])
 
     def _view(self, sphere: CachedSphere, azimuth: float) -> Photograph:
         pitch, roll = tilt_by_hand(self.rng)

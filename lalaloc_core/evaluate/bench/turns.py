@@ -35,20 +35,18 @@ from lalaloc_core.learn.data.synthetic.turned import (
 from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.localise.answers.documents import Ground
+from lalaloc_core.localise.answers.turns import Turn
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.localise.search.pipeline import Localisation
-from lalaloc_core.localise.sequence.joint_refinement import refine_sequence
-from lalaloc_core.localise.sequence.measured_motion import Motion
-from lalaloc_core.localise.sequence.sequence_search import SequenceLocalisation, localise_sequence
-from lalaloc_core.localise.sequence.turn_localisation import LinkedTurn, found_turns, judged_turn
+from lalaloc_core.localise.search.turn_search import TurnLocalisation
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film, read_film
 from lalaloc_core.photograph.turn_angles import TurnAngles
 
-# Photographs taken while turning on the spot are this close together (m).
-_TURNED_STD_M = 0.1
 # Photographs once around; a spot per home, so that figures are of many homes.
 _PHOTOGRAPHS = 12
 _SPLIT = SPLIT_NUMBERS["test"]
@@ -72,25 +70,17 @@ def bench_turns(setting: Setting) -> dict[str, Any]:
 
 def _at_spot(spot: Spot, model: LocalModel) -> tuple[Found, Found]:
     """Localise the views of one spot with known and with unknown angles between them."""
-    (plan, views), encoder, manifest = spot, model.encoder, model.bundle.manifest
+    (plan, views), manifest = spot, model.bundle.manifest
     height = CameraHeight(views[0].camera_height_m)
     opened = [photograph_of(view).open(patch_size(manifest)) for view in views]
-    grid = model.grid(plan, height.height_m)
+    ground = Ground(plan, model.grid(plan, height.height_m))
 
-    def as_one(turns: Sequence[float]) -> Localisation:
-        query = encoder.query(opened[0], None, height, others=list(zip(opened[1:], turns[1:], strict=True)))
-        return model.localise(plan, grid, query)
+    def found(turns: Sequence[float | None]) -> Found:
+        turn = Turn.of_headings(opened, [UNKNOWN_HEADING] * len(opened), height, turns, std=0.0)
+        answer = model.search_turn(turn, ground)
+        return Found.of(answer.joint, views[0], answer.confidence(manifest))
 
-    known = as_one(spot.turns)
-    believed = known.confidence(manifest.confidence_for(view=True, turn=True))
-    motions = [Motion(distance_m=0.0, distance_std_m=_TURNED_STD_M)] * (len(views) - 1)
-    queries = [encoder.query(view, None, height) for view in opened]
-    unknown = localise_sequence(plan, grid, encoder.layouts, queries, motions, refiner=refine_sequence)
-    unknown = judged_turn(unknown, as_one(found_turns(unknown)))
-    return (
-        Found.of(known, views[0], None if believed is None else believed.position),
-        Found.of(unknown.pictures[0], views[0], unknown.confidence(manifest)),
-    )
+    return found(spot.turns), found([None] * len(opened))
 
 
 class _Links(NamedTuple):
@@ -165,9 +155,9 @@ def _turns_at(film: Film, instants: Sequence[Instant]) -> list[float]:
     return np.interp(film.times_s, times_s, turns).tolist()
 
 
-def _localised_film(model: LocalModel, plan: FloorPlan, film: Film, camera_height_m: float) -> SequenceLocalisation:
+def _localised_film(model: LocalModel, plan: FloorPlan, film: Film, camera_height_m: float) -> TurnLocalisation:
     height, grid = CameraHeight(camera_height_m), model.grid(plan, camera_height_m)
-    return model.localise_turn(plan, grid, film.photographs, LinkedTurn.of(film.angles), height)
+    return model.localise_turn(plan, grid, film.photographs, film.angles, height)
 
 
 def _of_turn(model: LocalModel, shot: Shot, frames: Sequence[Frame], phone: Phone) -> dict[str, tuple[Found, _Links]]:
@@ -178,7 +168,7 @@ def _of_turn(model: LocalModel, shot: Shot, frames: Sequence[Frame], phone: Phon
     turns = [float(wrap_angle(frame.heading - frames[0].heading)) for frame in frames]
 
     def located(photographs: Sequence[Photograph], angles: Sequence[TurnAngles]) -> tuple[Found, _Links]:
-        found = model.localise_turn(plan, grid, photographs, LinkedTurn.of(angles), height)
+        found = model.localise_turn(plan, grid, photographs, angles, height)
         answer = Found.of(found.pictures[0], shot, found.confidence(model.bundle.manifest))
         return answer, _Links.of(photographs, angles, turns, phone)
 
