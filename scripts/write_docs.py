@@ -29,8 +29,8 @@ from scripts.figures import (
     views_table,
 )
 from service.cli import entry_point as service_cli
+from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.openapi import openapi_text
-from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.settings import settings_table
 
 ROOT = Path(__file__).resolve().parent.parent

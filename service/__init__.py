@@ -21,7 +21,7 @@ cli/        command line
 on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
-Also here: `errors.py`, `problem_kinds.py` (errors over HTTP), `plan_documents.py`, `uploaded_file.py`, `openapi.py`.
+Also here: `errors.py` (errors and their HTTP problems), `plan_documents.py`, `uploaded_file.py`, `openapi.py`.
 """
 
 import os

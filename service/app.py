@@ -16,6 +16,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
+from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.http.api_description import describe_api, operation_id
 from service.http.fields import check_parameters
 from service.http.middleware import (
@@ -29,7 +30,6 @@ from service.http.middleware import (
 )
 from service.http.problems import install_problem_handlers
 from service.http.server import ServedApp, bound_uvicorn
-from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.query_components import LOCAL_BACKENDS, Backends
 from service.routes import ROUTERS
 from service.runtime import start_runtime

@@ -1,325 +1,332 @@
-"""Errors of the service; `problem_kinds.py` maps each to an HTTP status and a problem type."""
+"""Errors of the service, and the HTTP problem (RFC 9457) of every error, those of the core included."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
-from lalaloc_core.errors import LaLaLocError
+from lalaloc_core import errors as core
+
+URN = "urn:lalaloc:problem:"
 
 
-class ServiceError(LaLaLocError):
+@dataclass(frozen=True)
+class ProblemKind:
+    """HTTP status, stable type and title of an error; clients see its message if `public` is set."""
+
+    status: int
+    slug: str
+    title: str
+    public: bool = True
+
+    @property
+    def type(self) -> str:
+        """The stable URN of RFC 9457's `type`."""
+        return URN + self.slug
+
+
+INTERNAL = ProblemKind(500, "internal", "Internal error", public=False)
+
+# Problem of each class of errors; classes of the service enter theirs when they are defined.
+PROBLEMS: dict[type[Exception], ProblemKind] = {
+    core.InvalidFloorPlanError: ProblemKind(422, "invalid-floorplan", "Invalid floor plan"),
+    core.SeveralLevelsError: ProblemKind(422, "several-levels", "Several levels: choose one"),
+    core.MissingExtraError: ProblemKind(501, "missing-extra", "Package for this format not installed"),
+    core.InvalidPhotographError: ProblemKind(422, "invalid-photograph", "Invalid photograph"),
+    core.InvalidFilmError: ProblemKind(422, "invalid-film", "Invalid film"),
+    core.InvalidFeaturesError: ProblemKind(422, "invalid-features", "Invalid features"),
+    core.ForeignFeaturesError: ProblemKind(409, "foreign-features", "Features of another model"),
+    core.InvalidMotionError: ProblemKind(422, "invalid-motion", "Impossible motion between photographs"),
+    core.InvalidCorrectionError: ProblemKind(422, "invalid-correction", "Invalid correction of a pin"),
+    core.InvalidHintError: ProblemKind(422, "invalid-hint", "Invalid hint"),
+    core.InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
+    core.InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),
+    core.LaLaLocError: INTERNAL,
+    core.ConfigError: INTERNAL,
+    core.BundleError: INTERNAL,
+    core.CheckpointError: INTERNAL,
+    core.ExportError: INTERNAL,
+    core.InvalidStateError: INTERNAL,
+    core.InvalidEntryError: INTERNAL,
+    core.DatasetError: INTERNAL,
+    core.RunError: INTERNAL,
+}
+
+# Errors of the framework, such as an unknown route.
+HTTP_PROBLEMS: dict[int, ProblemKind] = {
+    400: ProblemKind(400, "malformed-request", "Malformed request"),
+    404: ProblemKind(404, "not-found", "Not found"),
+    405: ProblemKind(405, "method-not-allowed", "Method not allowed"),
+}
+
+
+def problem_kind(error: Exception) -> ProblemKind:
+    """Return the entry of the error's class, or of its nearest base class."""
+    return next((PROBLEMS[cls] for cls in type(error).__mro__ if cls in PROBLEMS), INTERNAL)
+
+
+class ServiceError(core.LaLaLocError):
     """Base of the errors that only the service raises.
 
     Attributes:
+        message: text with a place for each value that the constructor gets.
         retry_after_s: whole seconds until a retry makes sense; None if it does not.
     """
 
+    message = "{}"
     retry_after_s: int | None = None
 
+    def __init_subclass__(cls, problem: tuple[int, str, str] | None = None) -> None:
+        """Enter the problem of a class: status, end of its type, title."""
+        if problem is not None:
+            PROBLEMS[cls] = ProblemKind(*problem)
 
-class MalformedRequestError(ServiceError):
+    def __init__(self, *values: object, retry_after_s: int | None = None) -> None:
+        if retry_after_s is not None:
+            self.retry_after_s = retry_after_s
+        super().__init__(self.message.format(*values, retry_after_s=self.retry_after_s))
+
+
+class MalformedRequestError(ServiceError, problem=(400, "malformed-request", "Malformed request")):
     """The body does not follow its media type."""
 
 
-class InvalidRequestError(ServiceError):
-    """A field is missing, unknown, or outside its limits.
-
-    Attributes:
-        faults: (field, message) pairs.
-    """
+class InvalidRequestError(ServiceError, problem=(422, "invalid-request", "Invalid request")):
+    """A field is missing, unknown, or outside its limits; `faults` are pairs of a field and a message."""
 
     def __init__(self, faults: list[tuple[str, str]]) -> None:
         self.faults = faults
         super().__init__("; ".join(f"{field}: {message}" for field, message in faults))
 
 
-class UnknownFloorPlanError(ServiceError):
-    """No floor plan has this id."""
-
-    def __init__(self, plan_id: str) -> None:
-        super().__init__(f"floor plan '{plan_id[:64]}' does not exist")
-
-
-class UnknownVenueError(ServiceError):
-    """No venue has this id."""
-
-    def __init__(self, venue_id: str) -> None:
-        super().__init__(f"venue '{venue_id[:64]}' does not exist")
+class FeaturesRequiredError(ServiceError, problem=(403, "features-required", "Features required")):
+    message = (
+        "this service takes no photographs (LALALOC_REQUIRE_FEATURES): send the part features instead, which "
+        "`lalaloc encode` or the Python client with on_device=True compute from the photograph"
+    )
 
 
-class UnknownRevisionError(ServiceError):
-    """The floor plan has no such revision, or the revision was dropped."""
-
-    def __init__(self, plan_id: str, revision_id: str) -> None:
-        super().__init__(f"floor plan '{plan_id}' has no revision '{revision_id[:64]}'; old revisions are dropped")
+class UnknownModelFileError(ServiceError, problem=(404, "unknown-model-file", "Unknown file of the model")):
+    message = "model '{1}' has no file '{0:.64}' for devices"
 
 
-class UnknownAnswerError(ServiceError):
-    """No answer is kept under this id."""
-
-    def __init__(self, answer_id: str) -> None:
-        super().__init__(
-            f"no answer is kept under '{answer_id[:64]}'; answers expire (keep_answers_s) and are deleted with their "
-            "floor plan"
-        )
+class ChangedModelFileError(ServiceError, problem=(503, "model-file-changed", "File of the model changed")):
+    message = "the model's file '{}' was changed on the disk: restore the bundle, and restart the service"
+    retry_after_s = 60
 
 
-class UnknownSessionError(ServiceError):
-    """No session has this id."""
+class RangeError(ServiceError, problem=(416, "range-not-satisfiable", "Range not satisfiable")):
+    message = "the file has {} bytes; ask for a range within them"
 
-    def __init__(self, session_id: str) -> None:
-        super().__init__(
-            f"session '{session_id[:64]}' does not exist; sessions expire (session_ttl_s) and are deleted with their "
-            "floor plan or venue"
-        )
+    def __init__(self, size_bytes: int) -> None:
+        self.size_bytes = size_bytes
+        super().__init__(size_bytes)
 
 
-class SessionBusyError(ServiceError):
-    """Another photograph of the session is in progress."""
+class UnknownFloorPlanError(ServiceError, problem=(404, "unknown-floorplan", "Unknown floor plan")):
+    message = "floor plan '{:.64}' does not exist"
 
+
+class UnknownVenueError(ServiceError, problem=(404, "unknown-venue", "Unknown venue")):
+    message = "venue '{:.64}' does not exist"
+
+
+class UnknownRevisionError(ServiceError, problem=(404, "unknown-revision", "Unknown revision")):
+    message = "floor plan '{}' has no revision '{:.64}'; old revisions are dropped"
+
+
+class UnknownAnswerError(ServiceError, problem=(404, "unknown-answer", "Unknown answer")):
+    message = "no answer is kept under '{:.64}'; answers expire (keep_answers_s) and are deleted with their floor plan"
+
+
+class UnknownSessionError(ServiceError, problem=(404, "unknown-session", "Unknown session")):
+    message = (
+        "session '{:.64}' does not exist; sessions expire (session_ttl_s) and are deleted with their floor plan or "
+        "venue"
+    )
+
+
+class SessionBusyError(ServiceError, problem=(409, "session-busy", "Photograph of the session in progress")):
+    message = "session '{}' has a photograph in progress; send the next one after the answer to it"
     retry_after_s = 1
 
-    def __init__(self, session_id: str) -> None:
-        super().__init__(
-            f"session '{session_id}' has a photograph in progress; send the next one after the answer to it"
-        )
+
+class SessionOutdatedError(ServiceError, problem=(409, "session-outdated", "Session cannot go on")):
+    message = "session '{}' cannot go on: {}; begin a new session"
 
 
-class SessionOutdatedError(ServiceError):
-    """The plan, the venue or the model has changed since the session began."""
-
-    def __init__(self, session_id: str, reason: str) -> None:
-        super().__init__(f"session '{session_id}' cannot go on: {reason}; begin a new session")
+class PhotographOutOfOrderError(ServiceError, problem=(409, "photograph-out-of-order", "Photograph out of order")):
+    message = "number is {1}; the next photograph of session '{0}' is number {2}"
 
 
-class PhotographOutOfOrderError(ServiceError):
-    """The photograph is not the next one of its session."""
-
-    def __init__(self, session_id: str, number: int, expected: int) -> None:
-        super().__init__(f"number is {number}; the next photograph of session '{session_id}' is number {expected}")
+class TooManySessionsError(ServiceError, problem=(507, "too-many-sessions", "Too many sessions")):
+    message = "{0} sessions are open; the limit is {0} (max_sessions): delete some"
 
 
-class TooManySessionsError(ServiceError):
-    """The tenant's quota of sessions is used up."""
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} sessions are open; the limit is {limit} (max_sessions): delete some")
-
-
-class UnknownAlbumError(ServiceError):
-    """No album has this id."""
-
-    def __init__(self, album_id: str) -> None:
-        super().__init__(
-            f"album '{album_id[:64]}' does not exist; albums expire (album_ttl_s) and are deleted with their floor "
-            "plan or venue"
-        )
+class UnknownAlbumError(ServiceError, problem=(404, "unknown-album", "Unknown album")):
+    message = (
+        "album '{:.64}' does not exist; albums expire (album_ttl_s) and are deleted with their floor plan or venue"
+    )
 
 
-class UnknownAlbumPhotographError(ServiceError):
-    """The album has no photograph with this id."""
-
-    def __init__(self, album_id: str, photograph_id: str) -> None:
-        super().__init__(f"album '{album_id}' has no photograph '{photograph_id[:64]}'")
+class UnknownAlbumPhotographError(ServiceError, problem=(404, "unknown-photograph", "Unknown photograph")):
+    message = "album '{}' has no photograph '{:.64}'"
 
 
-class AlbumOutdatedError(ServiceError):
-    """Another model than the running one encoded the photographs of the album."""
-
-    def __init__(self, album_id: str) -> None:
-        super().__init__(
-            f"album '{album_id}' has the features of an earlier model and can only be read: create a new album and "
-            "send its photographs again"
-        )
+class AlbumOutdatedError(ServiceError, problem=(409, "album-outdated", "Album of an earlier model")):
+    message = (
+        "album '{}' has the features of an earlier model and can only be read: create a new album and send its "
+        "photographs again"
+    )
 
 
-class FeaturelessModelError(ServiceError):
-    """The model gives no features, which albums need."""
-
-    def __init__(self, model: str) -> None:
-        super().__init__(f"model '{model}' gives no features of photographs, of which albums are made; use another one")
+class FeaturelessModelError(ServiceError, problem=(501, "model-without-features", "Model without features")):
+    message = "model '{}' gives no features of photographs, of which albums are made; use another one"
 
 
-class TooManyAlbumsError(ServiceError):
-    """The tenant's quota of albums is used up."""
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} albums is reached (max_albums); delete one")
+class TooManyAlbumsError(ServiceError, problem=(507, "too-many-albums", "Too many albums")):
+    message = "the limit of {} albums is reached (max_albums); delete one"
 
 
-class TooManyPhotographsError(ServiceError):
-    """The album is full."""
-
-    def __init__(self, album_id: str, limit: int) -> None:
-        super().__init__(
-            f"album '{album_id}' has {limit} photographs; the limit is {limit} (max_album_photographs): create "
-            "another album for the rest"
-        )
+class TooManyPhotographsError(ServiceError, problem=(507, "too-many-photographs", "Album is full")):
+    message = (
+        "album '{0}' has {1} photographs; the limit is {1} (max_album_photographs): create another album for the rest"
+    )
 
 
-class UnanchoredPlanError(ServiceError):
-    """The floor plan has no anchor, and the requested answer needs latitude and longitude."""
+class UnanchoredPlanError(ServiceError, problem=(409, "floorplan-unanchored", "Floor plan has no anchor")):
+    """The requested answer needs latitude and longitude."""
+
+    message = "floor plan '{}' has no anchor{}; add one for answers in latitude and longitude"
 
     def __init__(self, plan_id: str, venue_id: str | None = None) -> None:
-        nor = "" if venue_id is None else f", nor has venue '{venue_id}'"
-        super().__init__(f"floor plan '{plan_id}' has no anchor{nor}; add one for answers in latitude and longitude")
+        super().__init__(plan_id, "" if venue_id is None else f", nor has venue '{venue_id}'")
 
 
-class UnmeasuredModelError(ServiceError):
+class UnmeasuredModelError(ServiceError, problem=(501, "model-unmeasured", "Model without measured errors")):
     """The model has no measured errors, which predictions need."""
 
 
-class UploadTooLargeError(ServiceError):
-    """The body exceeds its size limit."""
+class UploadTooLargeError(ServiceError, problem=(413, "upload-too-large", "Upload too large")):
+    """The body exceeds its size limit, which a setting states."""
 
-    def __init__(self, name: str, limit: int, stated: int | None = None) -> None:
-        size = "is too large" if stated is None else f"has {stated} bytes"
-        super().__init__(f"the body {size}; the limit is {limit} bytes (LALALOC_{name.upper()})")
+    message = "the body {}; the limit is {} bytes (LALALOC_{})"
+
+    def __init__(self, setting: str, limit: int, stated: int | None = None) -> None:
+        super().__init__("is too large" if stated is None else f"has {stated} bytes", limit, setting.upper())
 
 
-class BytesInFlightError(ServiceError):
+class BytesInFlightError(ServiceError, problem=(503, "overloaded", "Overloaded")):
     """The bodies in progress, of the tenant or of all together, leave no room for this one."""
 
+    message = "the body needs {} bytes; {} in progress have {} of {} bytes ({}). Retry after {retry_after_s} s"
     retry_after_s = 2
 
-    def __init__(self, count: int, in_use: int, limit: int, setting: str) -> None:
-        whose = "all uploads" if setting.endswith("TOTAL_BYTES") else "your uploads"
-        super().__init__(
-            f"the body needs {count} bytes; {whose} in progress have {in_use} of {limit} bytes ({setting}). Retry "
-            f"after {self.retry_after_s} s"
-        )
+
+class SpoolFullError(ServiceError, problem=(507, "store-full", "Storage full")):
+    message = (
+        "an upload of more than {} bytes (upload_memory_bytes) could not be written to a temporary file: the disk is "
+        "full or read-only (TMPDIR)"
+    )
+    retry_after_s = 60
 
 
-class UploadTimeoutError(ServiceError):
+class UploadTimeoutError(ServiceError, problem=(408, "upload-timeout", "Upload timed out")):
     """The upload did not finish in time, or was too slow."""
 
 
-class UnsupportedMediaError(ServiceError):
-    """The body has an unsupported media type."""
+class UnsupportedMediaError(ServiceError, problem=(415, "unsupported-media", "Unsupported media type")):
+    message = "{} is not supported; send {}"
 
     def __init__(self, given: str, accepted: tuple[str, ...]) -> None:
         self.accepted = accepted
         stated = f"content type '{given[:100]}'" if given else "a body without content type"
-        super().__init__(f"{stated} is not supported; send {' or '.join(accepted)}")
+        super().__init__(stated, " or ".join(accepted))
 
 
-class UnsupportedEncodingError(UnsupportedMediaError):
-    """The body is compressed."""
-
-    def __init__(self, encoding: str) -> None:
-        ServiceError.__init__(self, f"Content-Encoding '{encoding[:100]}' is not supported; send the body uncompressed")
+class UnsupportedEncodingError(ServiceError, problem=(415, "unsupported-media", "Unsupported media type")):
+    message = "Content-Encoding '{:.100}' is not supported; send the body uncompressed"
 
 
-class PlanTooLargeError(ServiceError):
-    """The plan's pose grid would exceed the limit of poses."""
+class PlanTooLargeError(ServiceError, problem=(422, "floorplan-too-large", "Floor plan too large")):
+    message = (
+        "the plan{} needs about {} grid poses at a step of {:g} m; the limit is {} (max_grid_poses); check that the "
+        "coordinates are in metres"
+    )
 
     def __init__(self, estimate: int, limit: int, step_m: float, level: str | None = None) -> None:
-        of_level = "" if level is None else f" of level '{level}'"
-        super().__init__(
-            f"the plan{of_level} needs about {estimate} grid poses at a step of {step_m:g} m; the limit is {limit} "
-            "(max_grid_poses); check that the coordinates are in metres"
-        )
+        super().__init__("" if level is None else f" of level '{level}'", estimate, step_m, limit)
 
 
-class PlanFailedError(ServiceError):
-    """The plan's pose grid could not be computed.
+class PlanFailedError(ServiceError, problem=(409, "floorplan-failed", "Floor plan could not be prepared")):
+    """The plan's pose grid could not be computed; `reason` is the value of the plan's field of this name."""
 
-    Attributes:
-        reason: value of the plan's `reason` field.
-    """
+    message = "floor plan '{}' could not be prepared: {}"
 
     def __init__(self, plan_id: str, reason: str) -> None:
         self.reason = reason
-        super().__init__(f"floor plan '{plan_id}' could not be prepared: {reason}")
+        super().__init__(plan_id, reason)
 
 
-class PlanNotReadyError(ServiceError):
-    """The pose grid was not finished within the request's deadline."""
-
+class PlanNotReadyError(ServiceError, problem=(503, "floorplan-not-ready", "Floor plan not ready")):
+    message = "floor plan '{0}' is still preparing ({2:.0%} done after waiting {1:.1f} s)"
     retry_after_s = 5
 
-    def __init__(self, plan_id: str, waited_s: float, progress: float) -> None:
-        super().__init__(
-            f"floor plan '{plan_id}' is still preparing ({progress:.0%} done after waiting {waited_s:.1f} s)"
-        )
+
+class TooManyFloorPlansError(ServiceError, problem=(507, "too-many-floorplans", "Too many floor plans")):
+    message = "the limit of {} stored floor plans is reached (LALALOC_MAX_FLOORPLANS); delete one"
 
 
-class TooManyFloorPlansError(ServiceError):
-    """The tenant's quota of floor plans is used up."""
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} stored floor plans is reached (LALALOC_MAX_FLOORPLANS); delete one")
+class TooManyVenuesError(ServiceError, problem=(507, "too-many-venues", "Too many venues")):
+    message = "the limit of {} stored venues is reached (max_venues); delete one"
 
 
-class TooManyVenuesError(ServiceError):
-    """The tenant's quota of venues is used up."""
-
-    def __init__(self, limit: int) -> None:
-        super().__init__(f"the limit of {limit} stored venues is reached (max_venues); delete one")
-
-
-class StorageQuotaError(ServiceError):
-    """The tenant's quota of stored bytes is used up."""
-
-    def __init__(self, used: int, growth: int, limit: int, setting: str = "LALALOC_MAX_STORED_BYTES") -> None:
-        super().__init__(
-            f"{used} bytes are stored, and this needs {growth} more; the limit is {limit} bytes ({setting}); delete "
-            "floor plans, or raise the limit"
-        )
+class StorageQuotaError(ServiceError, problem=(507, "storage-quota", "Storage quota used up")):
+    message = (
+        "{} bytes are stored, and this needs {} more; the limit is {} bytes ({}); delete floor plans, or raise the "
+        "limit"
+    )
 
 
-class VenueUnsearchableError(ServiceError):
-    """The venue has no plans, or all of them failed."""
-
-    def __init__(self, venue_id: str, plans: int, reason: str = "") -> None:
-        reason = reason or (f"all of its {plans} floor plans failed" if plans else "it has no floor plans")
-        super().__init__(f"venue '{venue_id}' cannot be searched: {reason}")
+class VenueUnsearchableError(
+    ServiceError, problem=(409, "venue-unsearchable", "No searchable floor plan in the venue")
+):
+    message = "venue '{}' cannot be searched: {}"
 
 
-class VenueNotReadyError(ServiceError):
-    """None of the venue's plans has a pose grid yet."""
-
+class VenueNotReadyError(ServiceError, problem=(503, "venue-not-ready", "Venue not ready")):
+    message = "none of the {1} floor plans of venue '{0}' is ready (after waiting {2:.1f} s)"
     retry_after_s = 5
 
-    def __init__(self, venue_id: str, plans: int, waited_s: float) -> None:
-        super().__init__(
-            f"none of the {plans} floor plans of venue '{venue_id}' is ready (after waiting {waited_s:.1f} s)"
-        )
 
+class RevisionMismatchError(ServiceError, problem=(412, "revision-mismatch", "Revision mismatch")):
+    """The plan or venue is not at the revision that the caller expects; `current` is the id of its revision."""
 
-class RevisionMismatchError(ServiceError):
-    """The plan or venue is not at the revision that the caller expects.
-
-    Attributes:
-        current: id of its current revision.
-    """
+    message = "{} '{}' has revision '{}', not '{:.64}'"
 
     def __init__(self, resource_id: str, expected: str, current: str, *, what: str = "floor plan") -> None:
         self.current = current
-        super().__init__(f"{what} '{resource_id}' has revision '{current}', not '{expected[:64]}'")
+        super().__init__(what, resource_id, current, expected)
 
 
-class IdempotencyKeyReusedError(ServiceError):
-    """The idempotency key was already used with another body."""
+class IdempotencyKeyReusedError(
+    ServiceError, problem=(422, "idempotency-key-reused", "Idempotency key used for another request")
+):
+    message = "Idempotency-Key '{:.64}' was already used with another body; use a new key"
 
-    def __init__(self, key: str) -> None:
-        super().__init__(f"Idempotency-Key '{key[:64]}' was already used with another body; use a new key")
 
-
-class IdempotencyInProgressError(ServiceError):
-    """A request with the same idempotency key is still running."""
-
+class IdempotencyInProgressError(
+    ServiceError, problem=(409, "idempotency-in-progress", "Request with this idempotency key in progress")
+):
+    message = "the request with Idempotency-Key '{:.64}' is still running; retry later"
     retry_after_s = 1
-
-    def __init__(self, key: str) -> None:
-        super().__init__(f"the request with Idempotency-Key '{key[:64]}' is still running; retry later")
 
 
 class DamagedDataError(ServiceError):
     """Stored data does not match its digest. It can be replaced or deleted, but not read."""
 
 
-class StoreUnavailableError(ServiceError):
+class StoreUnavailableError(ServiceError, problem=(503, "store-unavailable", "Storage unavailable")):
     """The database cannot be reached, or did not answer in time."""
 
     retry_after_s = 2
@@ -328,7 +335,7 @@ class StoreUnavailableError(ServiceError):
         super().__init__(reason)
 
 
-class StoreBusyError(StoreUnavailableError):
+class StoreBusyError(StoreUnavailableError, problem=(503, "store-unavailable", "Storage unavailable")):
     """No database connection became free in time.
 
     The database is up, so cached data must not be used in its place: it may be out of date.
@@ -338,36 +345,21 @@ class StoreBusyError(StoreUnavailableError):
         super().__init__("all database connections are in use")
 
 
-class StoreFullError(StoreUnavailableError):
-    """The database's disk is full."""
-
+class StoreFullError(StoreUnavailableError, problem=(507, "store-full", "Storage full")):
     retry_after_s = 60
 
     def __init__(self) -> None:
         super().__init__("the database's disk is full; nothing can be stored until space is freed")
 
 
-class SpoolFullError(ServiceError):
-    """An upload could not be written to a temporary file."""
-
-    retry_after_s = 60
-
-    def __init__(self, memory_bytes: int) -> None:
-        super().__init__(
-            f"an upload of more than {memory_bytes} bytes (upload_memory_bytes) could not be written to a "
-            "temporary file: the disk is full or read-only (TMPDIR)"
-        )
-
-
-class UnauthenticatedError(ServiceError):
+class UnauthenticatedError(ServiceError, problem=(401, "unauthenticated", "API key or token required")):
     """The request has no valid API key or token. Unknown and revoked keys get the same message."""
 
 
-class InsufficientScopeError(ServiceError):
-    """The API key or token lacks the scope that the route needs."""
+class InsufficientScopeError(ServiceError, problem=(403, "insufficient-scope", "API key or token lacks the scope")):
+    """The API key or token lacks the scope that the route needs; `given` is None while keys are off."""
 
     def __init__(self, needed: str, given: Iterable[str] | None) -> None:
-        """Create the error; `given` is None while keys are off."""
         if given is None:
             text = f"API keys are off, and this request needs one with scope '{needed}': set LALALOC_API_KEYS=on"
         else:
@@ -379,169 +371,94 @@ class InsufficientScopeError(ServiceError):
         super().__init__(text)
 
 
-class IssuerUnavailableError(ServiceError):
-    """The keys of the tokens' issuer are not known, because it cannot be reached."""
-
+class IssuerUnavailableError(ServiceError, problem=(503, "issuer-unavailable", "Issuer of tokens unavailable")):
+    message = "the keys of the OpenID Connect issuer could not be fetched; try again later or use an API key"
     retry_after_s = 10
 
-    def __init__(self) -> None:
-        super().__init__(
-            "the keys of the OpenID Connect issuer could not be fetched; try again later or use an API key"
-        )
+
+class UnknownKeyError(ServiceError, problem=(404, "unknown-key", "Unknown API key")):
+    """No API key has this id, or it is in another state than the one that a change needs."""
+
+    message = "no {1}API key has the id '{0:.64}'; list keys with GET /admin/keys"
 
 
-class UnknownKeyError(ServiceError):
-    """No API key has this id, or it cannot be changed any more."""
-
-    def __init__(self, key_id: str, state: str = "") -> None:
-        super().__init__(f"no {state}API key has the id '{key_id[:64]}'; list keys with GET /admin/keys")
-
-
-class ExposedWithoutKeysError(ServiceError):
+class ExposedWithoutKeysError(
+    ServiceError, problem=(403, "exposed-without-keys", "Local requests only without API keys")
+):
     """A request from another machine, or from a page of another site, while API keys are off."""
 
-    def __init__(self, accepted: str, given: str) -> None:
-        super().__init__(
-            f"API keys are off, so only requests {accepted} are answered, not '{given[:100]}'; set LALALOC_API_KEYS, "
-            "LALALOC_ALLOW_ANONYMOUS or LALALOC_ALLOWED_HOSTS"
-        )
+    message = (
+        "API keys are off, so only requests {} are answered, not '{:.100}'; set LALALOC_API_KEYS, "
+        "LALALOC_ALLOW_ANONYMOUS or LALALOC_ALLOWED_HOSTS"
+    )
 
 
-class RateLimitedError(ServiceError):
-    """The API key exceeded its rate limit."""
-
-    def __init__(self, limit: int, period: str, retry_after_s: int) -> None:
-        self.retry_after_s = retry_after_s
-        super().__init__(f"Rate limit exceeded: {limit} requests per {period}. Retry after {retry_after_s} s.")
+class RateLimitedError(ServiceError, problem=(429, "rate-limited", "Too many requests")):
+    message = "Rate limit exceeded: {} requests per {}. Retry after {retry_after_s} s."
 
 
-class TooManyRefusedKeysError(ServiceError):
-    """The client address sent too many invalid API keys."""
-
-    def __init__(self, limit: int, retry_after_s: int) -> None:
-        self.retry_after_s = retry_after_s
-        super().__init__(
-            f"Too many invalid API keys from this address: the limit is {limit} per minute. Retry with a valid key "
-            f"after {retry_after_s} s."
-        )
+class TooManyRefusedKeysError(ServiceError, problem=(429, "too-many-refused-keys", "Too many invalid API keys")):
+    message = (
+        "Too many invalid API keys from this address: the limit is {} per minute. Retry with a valid key after "
+        "{retry_after_s} s."
+    )
 
 
-class OverloadedError(ServiceError):
+class OverloadedError(ServiceError, problem=(503, "overloaded", "Overloaded")):
     """All slots for requests, or all places in a queue, are in use."""
 
-    def __init__(self, limit: int, retry_after_s: int = 1) -> None:
-        self.retry_after_s = retry_after_s
-        super().__init__(f"The service is full: {limit} requests are in progress. Retry after {retry_after_s} s.")
+    message = "The service is full: {} requests are in progress. Retry after {retry_after_s} s."
+    retry_after_s = 1
 
 
-class ShareExceededError(OverloadedError):
+class ShareExceededError(OverloadedError, problem=(503, "overloaded", "Overloaded")):
     """One tenant (without API keys: one client address) uses its whole share of the slots."""
 
-    def __init__(self, held: int, limit: int, retry_after_s: int = 1) -> None:
-        ServiceError.__init__(
-            self,
-            f"{held} of your requests are in progress, and the rest of the {limit} slots is reserved for other tenants."
-            f" Retry after {retry_after_s} s.",
-        )
-        self.retry_after_s = retry_after_s
+    message = (
+        "{} of your requests are in progress, and the rest of the {} slots is reserved for other tenants. Retry after "
+        "{retry_after_s} s."
+    )
 
 
-class ExpectedTooLateError(OverloadedError):
-    """The client's queries in progress leave too little time for one more."""
-
-    def __init__(self, others: int, retry_after_s: int) -> None:
-        ServiceError.__init__(
-            self,
-            f"Beside your {others} queries in progress, one more is expected to miss its deadline. Send fewer at once. "
-            f"Retry after {retry_after_s} s.",
-        )
-        self.retry_after_s = retry_after_s
+class ExpectedTooLateError(OverloadedError, problem=(503, "overloaded", "Overloaded")):
+    message = (
+        "Beside your {} queries in progress, one more is expected to miss its deadline. Send fewer at once. Retry "
+        "after {retry_after_s} s."
+    )
 
 
 class DrawingFailedError(ServiceError):
-    """A drawing made by this service could not be rasterised."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"the picture could not be drawn: {reason}")
+    message = "the picture could not be drawn: {}"
 
 
-class DecoderNotReadyError(ServiceError):
-    """No decoder process will be running before the request's deadline."""
-
+class DecoderNotReadyError(ServiceError, problem=(503, "decoder-not-ready", "Decoder not ready")):
+    message = "no process for decoding photographs is running yet"
     retry_after_s = 2
 
-    def __init__(self) -> None:
-        super().__init__("no process for decoding photographs is running yet")
 
-
-class ConverterNotReadyError(ServiceError):
-    """No converter process will be running before the deadline."""
-
+class ConverterNotReadyError(ServiceError, problem=(503, "converter-not-ready", "Converter not ready")):
+    message = "no process for reading and writing plan files is running yet; the native format needs none"
     retry_after_s = 2
 
-    def __init__(self) -> None:
-        super().__init__("no process for reading and writing plan files is running yet; the native format needs none")
+
+class IndexTooLargeError(ServiceError, problem=(503, "overloaded", "Overloaded")):
+    message = (
+        "the index of {} floor plans exceeds the limit of {} bytes: raise LALALOC_VENUE_CACHE_BYTES, or divide the "
+        "index into more shards"
+    )
 
 
-class IndexTooLargeError(ServiceError):
-    """The index of some plans exceeds the memory for indices."""
-
-    def __init__(self, plans: int, limit: int) -> None:
-        super().__init__(
-            f"the index of {plans} floor plans exceeds the limit of {limit} bytes: raise LALALOC_VENUE_CACHE_BYTES, or "
-            "divide the index into more shards"
-        )
-
-
-class DeadlineExceededError(ServiceError):
-    """The request missed its deadline."""
-
+class DeadlineExceededError(ServiceError, problem=(504, "deadline-exceeded", "Deadline exceeded")):
+    message = "{} within {:g} s"
     retry_after_s = 1
 
     def __init__(self, limit_s: float, what: str = "the query was not answered") -> None:
-        super().__init__(f"{what} within {limit_s:g} s")
+        super().__init__(what, limit_s)
 
 
-class FeaturesRequiredError(ServiceError):
-    """A photograph was sent to a service that takes features only."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "this service takes no photographs (LALALOC_REQUIRE_FEATURES): send the part features instead, which "
-            "`lalaloc encode` or the Python client with on_device=True compute from the photograph"
-        )
-
-
-class UnknownModelFileError(ServiceError):
-    """The model has no such file for devices."""
-
-    def __init__(self, name: str, model: str) -> None:
-        super().__init__(f"model '{model}' has no file '{name[:64]}' for devices")
-
-
-class ChangedModelFileError(ServiceError):
-    """A file of the model was changed or removed while the service runs."""
-
-    retry_after_s = 60
-
-    def __init__(self, name: str) -> None:
-        super().__init__(
-            f"the model's file '{name}' was changed on the disk: restore the bundle, and restart the service"
-        )
-
-
-class RangeError(ServiceError):
-    """The range of bytes lies behind the end of the file."""
-
-    def __init__(self, size_bytes: int) -> None:
-        self.size_bytes = size_bytes
-        super().__init__(f"the file has {size_bytes} bytes; ask for a range within them")
-
-
-class StoppingError(ServiceError):
-    """The service is shutting down."""
-
+class StoppingError(ServiceError, problem=(503, "stopping", "Service stopping")):
+    message = "the service is shutting down"
     retry_after_s = 5
 
-    def __init__(self) -> None:
-        super().__init__("the service is shutting down")
+
+PROBLEMS |= dict.fromkeys((ServiceError, DamagedDataError, DrawingFailedError), INTERNAL)

@@ -94,7 +94,7 @@ FORBIDDEN = {
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
     "uploaded_file capacity.fair_share capacity.cpu_accounts capacity.cores capacity.bounded_cache",
-    "settings errors problem_kinds schemas plan_documents",
+    "settings errors schemas plan_documents",
     "telemetry",
     "capacity",
     # Programs of worker processes, which do not import their supervisors.

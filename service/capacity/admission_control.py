@@ -148,7 +148,7 @@ class Slots:
         """
         begin, others = monotonic(), self._others(client)
         if self._pace.exceeds_deadline(client, others):
-            raise ExpectedTooLateError(others, self._retry_after_s())
+            raise ExpectedTooLateError(others, retry_after_s=self._retry_after_s())
         _AWAY_S.set(0.0)
         try:
             await self._wait(client, deadline)
@@ -208,8 +208,8 @@ class Slots:
 
     def _refusal(self, client: str) -> OverloadedError:
         if self.in_use < self._limit:
-            return ShareExceededError(self._slots.held_by(client), self._limit, self._retry_after_s())
-        return OverloadedError(self._limit, self._retry_after_s())
+            return ShareExceededError(self._slots.held_by(client), self._limit, retry_after_s=self._retry_after_s())
+        return OverloadedError(self._limit, retry_after_s=self._retry_after_s())
 
 
 class BytesInFlight(Shares):
@@ -237,12 +237,12 @@ class BytesInFlight(Shares):
         """
         held, limit = self.held_by(client), self.limit_of(client)
         if count > limit:
-            raise UploadTooLargeError("LALALOC_UPLOAD_TENANT_BYTES", limit, count)
+            raise UploadTooLargeError("upload_tenant_bytes", limit, count)
         if held + count > limit:
-            raise BytesInFlightError(count, held, limit, "LALALOC_UPLOAD_TENANT_BYTES")
+            raise BytesInFlightError(count, "your uploads", held, limit, "LALALOC_UPLOAD_TENANT_BYTES")
         left = self.limit - self.in_use - count
         if left < 0 or (held and held + count > MAX_RATIO * left):
-            raise BytesInFlightError(count, self.in_use, self.limit, "LALALOC_UPLOAD_TOTAL_BYTES")
+            raise BytesInFlightError(count, "all uploads", self.in_use, self.limit, "LALALOC_UPLOAD_TOTAL_BYTES")
         super().take(client, count)
 
 

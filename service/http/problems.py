@@ -12,15 +12,19 @@ from starlette.exceptions import HTTPException
 
 from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError, SeveralLevelsError
 from service.errors import (
+    HTTP_PROBLEMS,
+    INTERNAL,
+    PROBLEMS,
     InvalidRequestError,
+    ProblemKind,
     RangeError,
     ServiceError,
     UnauthenticatedError,
     UnsupportedEncodingError,
     UnsupportedMediaError,
+    problem_kind,
 )
 from service.http.fields import describe_fault
-from service.problem_kinds import HTTP_PROBLEMS, INTERNAL, PROBLEMS, ProblemKind, problem_kind
 from service.schemas.fields import Fault, Problem
 from service.security.access_control import routed_path
 from service.security.permissions import permissions_needed
@@ -88,7 +92,7 @@ def problem_answer(request: Request, error: Exception) -> JSONResponse:
         headers["WWW-Authenticate"] = "Bearer"
     if isinstance(error, UnsupportedEncodingError):
         headers["Accept-Encoding"] = "identity"
-    elif isinstance(error, UnsupportedMediaError):
+    if isinstance(error, UnsupportedMediaError):
         headers["Accept-Post"] = ", ".join(error.accepted)
     return _answer(problem_document(request, error), headers)
 

@@ -91,7 +91,7 @@ class Grounds:
             return
         members = await self.members(where)
         if not members:
-            raise VenueUnsearchableError(where.id, 0)
+            raise VenueUnsearchableError(where.id, "it has no floor plans")
         if isinstance(form, HintFields | SessionDocument):
             VenueHints.from_form(form, where.anchor).check(members)
 
@@ -195,7 +195,7 @@ class VenueSite:
             if len(small) < len(ready):
                 large = f"{len(ready) - len(small)} floor plans have more than {self._max_poses} grid poses"
                 if not small:
-                    raise VenueUnsearchableError(self._where.id, len(ready), large)
+                    raise VenueUnsearchableError(self._where.id, large)
                 ready, warnings = small, [*warnings, f"{large} and were not searched"]
         self.ready, self._warnings = ready, warnings
 

@@ -87,7 +87,7 @@ def get_key(key_id: str, call: Call) -> KeyAnswer:
     """Return an API key without its secret."""
     key = call.store.keys.get(key_id) if is_id(key_id) else None
     if key is None:
-        raise UnknownKeyError(key_id)
+        raise UnknownKeyError(key_id, "")
     return KeyAnswer(**_values(key))
 
 

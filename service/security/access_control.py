@@ -231,7 +231,7 @@ class RateLimits:
         """Count an invalid key of a client address."""
         if not await self._limiter.hit(self._refused, _counter_of(client)):
             retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
-            raise TooManyRefusedKeysError(self._refused.amount, retry_after_s)
+            raise TooManyRefusedKeysError(self._refused.amount, retry_after_s=retry_after_s)
 
     def _limit_of(self, caller: Identity) -> RateLimitItem | None:
         per_minute = self._per_minute if caller.rate_per_minute is None else caller.rate_per_minute
@@ -239,7 +239,7 @@ class RateLimits:
 
     async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:
         if not await self._limiter.hit(limit, key_id, cost=cost):
-            raise RateLimitedError(limit.amount, period, await self._retry_after_s(limit, key_id))
+            raise RateLimitedError(limit.amount, period, retry_after_s=await self._retry_after_s(limit, key_id))
 
     async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
         """Return the whole seconds until the count drops."""

@@ -92,7 +92,7 @@ class IdempotencyKeys:
                 account = self._quota.settle(connection, tenant, StoredBytes(idempotency=size), refuse=False)
                 others = account.used.total - account.used.idempotency
                 if size > min(self._max_bytes, account.limit - others):
-                    raise StorageQuotaError(others, size, account.limit)
+                    raise StorageQuotaError(others, size, account.limit, "LALALOC_MAX_STORED_BYTES")
                 self._make_room(connection, tenant, account, keep=token)
 
     def abandon(self, tenant: str, route: str, key: str, token: str) -> None:

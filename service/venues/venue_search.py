@@ -83,7 +83,8 @@ class VenueSearch:
             if ready:
                 break
             if failed == len(members):
-                raise VenueUnsearchableError(venue_id, len(members))
+                reason = f"all of its {failed} floor plans failed" if failed else "it has no floor plans"
+                raise VenueUnsearchableError(venue_id, reason)
             if context.left_s <= _POLL_INTERVAL_S:
                 raise VenueNotReadyError(venue_id, len(members), monotonic() - begin)
             with self._queries.released(context.client):

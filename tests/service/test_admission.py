@@ -90,7 +90,8 @@ def test_excess_query_is_refused_before_its_upload(small: httpx.Client, sphere: 
 
 
 def test_parallel_queries_of_one_client_are_all_answered(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
-    with start_app(tmp_path, max_queries=4) as client, ThreadPoolExecutor(14) as threads:
+    # The constants of `small` hold for all apps while it runs.
+    with start_app(tmp_path, max_queries=4, max_waiting_queries=16) as client, ThreadPoolExecutor(14) as threads:
         plan_id = upload(client)
         answers = list(threads.map(lambda _: localise(client, plan_id, sphere, refine="none"), range(14)))
         assert [answer.status_code for answer in answers] == [200] * 14

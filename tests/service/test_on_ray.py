@@ -17,8 +17,7 @@ import httpx
 import pytest
 
 from lalaloc_core.errors import ConfigError
-from service.errors import DeadlineExceededError, InvalidRequestError, PlanNotReadyError
-from service.problem_kinds import PROBLEMS, problem_kind
+from service.errors import PROBLEMS, DeadlineExceededError, InvalidRequestError, PlanNotReadyError, problem_kind
 from service.query import QueryContext
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serving, upload, wait_for
