@@ -20,7 +20,6 @@ class PinPlace:
     """Place and direction of a photograph.
 
     Attributes:
-        level: level of the plan in the venue; None in an album of one plan.
         heading_deg: azimuth of the photograph's centre, clockwise from the plan's +y; None where it is unknown.
         probability: that of a suggestion; None for the place of a pin.
     """
@@ -55,12 +54,9 @@ class Pin:
 
     Attributes:
         state: `sure`, `uncertain`, `set_aside` or `corrected`.
-        place: None for a photograph that is set aside.
-        confidence: probability that the room is right.
         within_1m: probability that the position is right within 1 m.
         reason: reason why it is uncertain or set aside.
         suggestions: up to five places, the most probable first.
-        geopose: pose on Earth; None for plans without an anchor.
         moved: change by the latest revision of the plan; None without one.
     """
 
@@ -80,11 +76,7 @@ class AlbumPhotograph:
     """Photograph of an album.
 
     Attributes:
-        number: position in the album, from 1.
-        sha256: digest of the file.
         view: size, time and camera, and what was assumed about the picture.
-        correction: the correction as it was stated; None without one.
-        pin: None until the album is solved with this photograph.
         etag: entity tag, for `if_match`; None in lists.
     """
 
@@ -113,11 +105,7 @@ class AddedPhotograph:
     """Answer to one photograph that was sent to an album.
 
     Attributes:
-        index: number of the photograph, from 0.
         status: 201 for a new photograph, 200 for one that the album had already, else that of the problem.
-        name: name of the photograph's file.
-        photograph: None for a problem.
-        problem: problem document; None if the photograph is in the album.
         retry_after_s: seconds after which it can be sent again; None if that does not help.
     """
 
@@ -146,9 +134,6 @@ class Album:
     Attributes:
         revision: id that changes with the photographs and their corrections.
         state: `empty`, `solving`, `solved`, `failed` or `outdated`.
-        progress: share that is done while it is solved.
-        reason: reason why it could not be solved.
-        photographs: number of photographs.
         solved_revision_number: revision that the pins are of; 0 before the first solution.
         place_revision: revision of the plan or venue that the pins are of; None before, and in lists.
         solution: counts of pins, cameras, scale and warnings; None before the first solution, and in lists.

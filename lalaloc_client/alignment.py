@@ -47,10 +47,6 @@ def align(
             convention of the device (`frames`).
         convention: `opengl` for ARKit, ARCore and WebXR, `unity` for Unity.
         camera_height_m: height of the camera over the floor, of the answer.
-
-    Raises:
-        ValueError: other numbers of poses and cameras, no matrix of a rotation, a camera that looks up or down, or
-            headings or places that do not fit.
     """
     if not poses or len(poses) != len(cameras):
         raise ValueError(f"{len(poses)} poses and {len(cameras)} cameras; give one camera for each pose")
@@ -78,11 +74,7 @@ def plan_point(x_m: float, y_m: float, z_m: float, convention: Convention) -> tu
 
 
 def _on_floor(camera: Matrix, convention: Convention) -> tuple[complex, float]:
-    """Return place (x + iy) and yaw of a camera on the floor of the device's world, seen from above.
-
-    Raises:
-        ValueError: no matrix of a rotation, or a camera that looks up or down.
-    """
+    """Return place (x + iy) and yaw of a camera on the floor of the device's world, seen from above."""
     if len(camera) != 4 or any(len(row) != 4 for row in camera):
         raise ValueError("a camera's matrix must have 4 rows of 4 numbers")
     side = _depth_sign(convention)

@@ -27,10 +27,6 @@ class Candidate:
     Attributes:
         probability: probability that the camera is within 1 m and 25° of this pose, and not at a better candidate; None
             if the model is not calibrated.
-        room_id: the room's id, unique in the plan.
-        floorplan_id: the plan of the pose.
-        level: the plan's level in the searched venue.
-        geopose: the pose on Earth; None without an anchor of plan or venue.
     """
 
     position: Position
@@ -130,11 +126,8 @@ class ReadView:
 
     Attributes:
         projection: `equirectangular`, `perspective`, `cylindrical` or `fisheye`.
-        projection_source: as `AssumedAngle.source`.
-        hfov: horizontal field of view.
         pitch: elevation of the photograph's centre above the horizon.
         roll: clockwise rotation of the camera about its optical axis.
-        camera: camera model; None for full spheres and strips.
         seen: azimuths that the photographs behind the answer show.
         warnings: metadata that were ignored, and estimates to check.
         wall_direction: azimuth of walls relative to the photograph's centre, up to quarter turns; None without lines,
@@ -168,12 +161,9 @@ class NextStep:
     Attributes:
         kind: `turn` (another photograph from the same spot), `door` (one from behind a door), `heading` (state it) or
             `rooms` (choose one of them as a hint).
-        text: the step in words.
         turn_deg: of `turn` and `door`: direction relative to the photograph's centre, clockwise.
-        distance_m: of `door`: distance to it.
         rooms: of `rooms`: ids of the probable rooms, the most probable first.
         expected_bits: expected increase of `View.information_bits`.
-        expected_confidence: expected confidence after the step.
     """
 
     kind: str
@@ -190,7 +180,6 @@ class View(ReadView):
     """Assumptions about a photograph, and how much it could tell. See `ReadView` as well.
 
     Attributes:
-        information_bits: information about the place.
         ruled_out: share of the searched area that this rules out.
         advice: how to photograph the place for a sure answer; None where it is sure.
         room_types: probability of each type of room by recognised objects; None for full spheres, and for services and
@@ -222,21 +211,9 @@ class Localisation:
         heading_confidence: probability that the heading error is below 5°.
         probability_elsewhere: probability that the photograph is of none of the plan's places.
         warnings: options that were not followed, such as a heading that the photograph contradicts.
-        camera_height_m: the best camera height.
-        geopose: the pose on Earth; None without an anchor of plan or venue.
-        room_id: the room's id, unique in the plan.
         stage: the stage that produced the position: `retrieval`, `vdr` or `lpo`.
         covariance_m2: covariance of the position, given an error below 1 m; None unless `stage` is `lpo`.
-        heading_std_deg: standard deviation of a searched heading.
-        candidates: candidates, best first; the first one is the answer.
-        timings_ms: time per stage of the service.
-        floorplan_revision: the searched revision of the plan.
-        venue_id: the searched venue.
-        level: the plan's level in the venue.
-        plans: the most probable plans of the venue, most probable first.
         answer_id: id of the answer for `get_answer`; None if the service does not store it.
-        posterior: probability of every place, if requested.
-        view: assumptions about the photograph; None for services without this field.
     """
 
     floorplan_id: str
@@ -273,11 +250,7 @@ class BatchAnswer:
     """Answer to one photograph of a batch.
 
     Attributes:
-        index: number of the photograph, from 0.
-        status: HTTP status code of the photograph.
         name: name of the photograph's file; `photo` for photographs without one.
-        answer: None if the photograph could not be localised.
-        problem: problem document; None if it could.
         retry_after_s: seconds after which the photograph can be sent again; None if that does not help.
     """
 
@@ -342,7 +315,6 @@ class FilmReading:
     """Reading of a film: frames that were decoded, and that became poses.
 
     Attributes:
-        turned_deg: angle that the camera turned through.
         warnings: faults of the film: the camera walks, shakes or stands still, or nothing can be followed.
     """
 
@@ -359,12 +331,8 @@ class SequenceLocalisation:
     """Poses of the photographs of one visit.
 
     Attributes:
-        poses: one pose per photograph.
         confidence: probability that all position errors are below 1 m.
         warnings: motions that were not followed, and photographs of a turn that do not overlap.
-        stage: `retrieval` or `lpo`.
-        camera_height_m: the best common camera height.
-        film: reading of the film; None for photographs.
     """
 
     floorplan_id: str

@@ -24,11 +24,7 @@ class MalformedAnswerError(ClientError):
 
 
 class FloorPlanFailedError(ClientError):
-    """The service could not prepare the plan.
-
-    Attributes:
-        reason: the service's explanation.
-    """
+    """The service could not prepare the plan."""
 
     def __init__(self, floorplan_id: str, reason: str | None) -> None:
         self.reason = reason
@@ -36,11 +32,7 @@ class FloorPlanFailedError(ClientError):
 
 
 class AlbumFailedError(ClientError):
-    """The service could not solve the album.
-
-    Attributes:
-        reason: the service's explanation.
-    """
+    """The service could not solve the album."""
 
     def __init__(self, album_id: str, reason: str | None) -> None:
         self.reason = reason
@@ -63,7 +55,6 @@ class ProblemError(ClientError):
 
     Attributes:
         type: stable identifier of the kind of problem; `about:blank` if the answer has none.
-        status: HTTP status code.
         detail: explanation with value and limit.
         request_id: id of the request in the service's log.
         faults: (field, message) of every invalid field.

@@ -105,10 +105,6 @@ def world_from_plan(
         plan_m: at least two places of the camera in the plan, such as those of two photographs.
         world_m: the same places in the device's frame: two axes of its floor, such as (x, -z) of ARKit and ARCore.
         mirrored: whether the axes of the device's floor are left-handed seen from above, as (x, z) of ARKit are.
-
-    Raises:
-        ValueError: fewer than two places, all of them closer than 0.5 m, or places that do not fit: other units, other
-            distances, or axes of the other handedness.
     """
     if len(plan_m) != len(world_m) or len(plan_m) < 2:
         raise ValueError(f"{len(plan_m)} places in the plan and {len(world_m)} in the world; give at least two of both")
@@ -143,11 +139,7 @@ def misfit_m(
 
 
 def _check_fit(own: Sequence[complex], other: Sequence[complex]) -> None:
-    """Refuse places, relative to their means, that no turn makes fit.
-
-    Raises:
-        ValueError: names the misfit and the remedy.
-    """
+    """Refuse places, relative to their means, that no turn makes fit."""
     size_m, other_m = (math.sqrt(sum(abs(point) ** 2 for point in points)) for points in (own, other))
     scale = other_m / size_m
     if not 1.0 / _MAX_SCALE <= scale <= _MAX_SCALE:

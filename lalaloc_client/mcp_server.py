@@ -54,13 +54,8 @@ CameraHeight = Annotated[float | None, Field(description="Camera height above th
 def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool) -> MCPServer[Any]:
     """Return a server whose tools call the service at an address.
 
-    Args:
-        base_url: address of the service.
-        api_key: key of a caller that sends none, as over stdio; None for none.
-        reads_paths: tools read files of this machine, as is right only if the caller owns it.
-
-    Raises:
-        ValueError: the address or the key is invalid.
+    The key is for callers that send none, as over stdio. Tools read files of this machine if `reads_paths`, as is right
+    only if the caller owns it.
     """
     http_options(base_url, api_key, _TIMEOUT_S)
     tools = _Tools(base_url, api_key, reads_paths=reads_paths)
@@ -78,11 +73,7 @@ def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool)
 
 
 def serve(base_url: str, api_key: str | None = None, *, address: tuple[str, int] | None = None) -> None:
-    """Serve on stdio, or over streamable HTTP at an address (host, port), path `/mcp`, until interrupted.
-
-    Raises:
-        ValueError: the address of the service or the key is invalid.
-    """
+    """Serve on stdio, or over streamable HTTP at an address (host, port), path `/mcp`, until interrupted."""
     # One line for each request is too much beside the protocol.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     if address is None:
@@ -230,11 +221,7 @@ class _Tools:
             return answer
 
     def _folder(self, folder: str | None, photographs: list[str] | None) -> list[bytes | Path]:
-        """Return the photographs of a folder by name, or those that are given.
-
-        Raises:
-            ToolError: both or none are given, none or too many are found, or the folder is not read.
-        """
+        """Return the photographs of a folder by name, or those that are given."""
         if (folder is None) == (photographs is None):
             raise ToolError("give either folder or photographs")
         if folder is None:
@@ -285,11 +272,7 @@ class _Tools:
             raise ToolError(str(error)) from error
 
     def _file(self, text: str) -> bytes | Path:
-        """Return the content of a data URL, or the path of a file.
-
-        Raises:
-            ToolError: neither, or paths are not read.
-        """
+        """Return the content of a data URL, or the path of a file."""
         if text.startswith(_DATA):
             _, separator, encoded = text.partition(_BASE64)
             if not separator:

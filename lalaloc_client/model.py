@@ -56,11 +56,9 @@ class FloorPlan:
     Attributes:
         status: `preparing`, then `ready` or `failed`.
         progress: computed share of its pose grid, 0 to 1.
-        reason: reason of a failure, else None.
         warnings: oddities that do not prevent its use.
         revision: id of the uploaded revision, as in `Localisation.floorplan_revision`.
         revision_number: number of uploads up to this revision.
-        created_at: time of the first upload.
         updated_at: time of this revision's upload.
         etag: entity tag of this revision, for `replace_floorplan(..., if_match=...)`.
         plan: the plan in the native format.
@@ -131,11 +129,6 @@ class VenuePlan:
     Attributes:
         level: number of its level, 0 for the ground floor.
         name: its name in the venue. Default when sent: the plan's own name.
-        status: as in `FloorPlan`, filled in by the service like all fields below.
-        progress: as in `FloorPlan`.
-        rooms: number of rooms.
-        area_m2: as in `FloorPlan`.
-        revision: as in `FloorPlan`.
     """
 
     floorplan_id: str
@@ -158,7 +151,6 @@ class Venue:
 
     Attributes:
         revision: id that changes with the name, the anchor and the set of plans.
-        plans: number of floor plans.
         plans_ready: number of plans that can be searched; None in listings.
         plans_failed: number of plans that could not be prepared; None in listings.
         etag: entity tag of this revision, for `if_match`.
@@ -200,7 +192,6 @@ class ImportStep:
     Attributes:
         step: what the service does, such as "reading texts".
         done: levels of the file that are done; None for a step that is not about one level of several.
-        total: levels of the file; None as `done`.
     """
 
     step: str
@@ -216,7 +207,6 @@ class PlanEvent:
         status: `preparing`, then `ready`, `failed` or `deleted`, which is the last event.
         progress: computed share of its pose grid, 0 to 1; None after deletion.
         revision: the current revision, which may change in between.
-        reason: reason of a failure.
     """
 
     status: str
@@ -235,7 +225,6 @@ class OpeningPiece:
     """A piece of a wall that is an opening.
 
     Attributes:
-        wall: index in the room's `walls_m`.
         start: start of the piece as a share of the wall, 0 to 1.
         end: end of the piece as a share of the wall, 0 to 1.
         sill_m: height of the lower edge over the floor, None if unknown.
@@ -303,14 +292,10 @@ class Localisability:
     Attributes:
         spacing_m: distance of the poses that are compared; an answer within 1 m, or within this distance if it is
             longer, counts as found.
-        probability: mean over the plan's area.
-        rooms: all rooms.
-        places: places spread over the plan.
         confused: pairs of rooms, the most confused first.
         gains: increase of the probability of phone photographs with unknown heading by remedy: `heading`,
             `three_photographs`, `sphere`, `room_hint`, and `doors`, which is that of the openings of the plan.
         advice: sentences about confused rooms and what helps most.
-        coarse: the prediction is rough, without advice.
     """
 
     floorplan_id: str

@@ -31,9 +31,6 @@ class TurnFeatures:
     Attributes:
         features: a file for each photograph, or frame that was kept.
         relative_heading_deg: headings relative to the first photograph, None where unknown; None if none is known.
-        relative_heading_std_deg: their standard deviation.
-        times_s: times of the frames; None for photographs.
-        film: reading of the film; None for photographs.
     """
 
     features: list[bytes]
@@ -50,11 +47,7 @@ class OnDeviceModel:
     """
 
     def __init__(self, manifest: bytes) -> None:
-        """Read the manifest that the service sent.
-
-        Raises:
-            OnDeviceError: the extra is not installed, or the service sent no manifest of a model.
-        """
+        """Read the manifest that the service sent."""
         try:
             from lalaloc_core.bundle import MANIFEST_NAME, Bundle, Manifest
             from lalaloc_core.errors import BundleError
@@ -85,11 +78,7 @@ class OnDeviceModel:
         return missing
 
     def store(self, name: str, content: bytes) -> None:
-        """Write a file to the cache, whole or not at all.
-
-        Raises:
-            OnDeviceError: the content has another digest than the manifest states, or cannot be written.
-        """
+        """Write a file to the cache, whole or not at all."""
         expected = self._bundle.manifest.files[name].sha256
         if (digest := hashlib.sha256(content).hexdigest()) != expected:
             raise OnDeviceError(f"the service sent '{name}' with the SHA-256 {digest}; its manifest states {expected}")
@@ -109,11 +98,7 @@ class OnDeviceModel:
             raise OnDeviceError(f"'{folder / name}' cannot be written: {error.strerror}") from error
 
     def load(self) -> None:
-        """Load the networks.
-
-        Raises:
-            OnDeviceError: a file is missing or altered, or the model gives no features.
-        """
+        """Load the networks."""
         from lalaloc_core.errors import BundleError
         from lalaloc_core.localise.encode.features import FeatureEncoder
 
@@ -123,11 +108,7 @@ class OnDeviceModel:
             raise OnDeviceError(str(error)) from error
 
     def features(self, photograph: Photograph, options: Mapping[str, Any]) -> bytes:
-        """Return the features of a photograph, given options about its camera; `load` comes first.
-
-        Raises:
-            OnDeviceError: the photograph cannot be read, or the model gives no features of such photographs.
-        """
+        """Return the features of a photograph, given options about its camera; `load` comes first."""
         from lalaloc_core.errors import InvalidPhotographError
         from lalaloc_core.localise.encode.features import is_features
         from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
@@ -153,9 +134,6 @@ class OnDeviceModel:
         """Return the features of a film of a turn, or of its photographs in order; `load` comes first.
 
         Photographs of which one is a sphere, or is features already, have no angles.
-
-        Raises:
-            OnDeviceError: the film or a photograph cannot be read, or the model gives no features of such photographs.
         """
         from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 

@@ -13,11 +13,7 @@ T = TypeVar("T")
 
 
 def parse(kind: type[T], content: bytes | str, name: str = "answer") -> T:
-    """Return JSON content as an instance of `kind`.
-
-    Raises:
-        MalformedAnswerError: the content is not JSON, or a field is missing or has another type.
-    """
+    """Return JSON content as an instance of `kind`."""
     try:
         return _adapter(kind).validate_json(content, strict=True)
     except ValidationError as error:

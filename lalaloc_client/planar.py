@@ -38,7 +38,6 @@ class FloorTransform:
     """Pose on the floor, which is also the transform from its own frame to the one it is stated in.
 
     Attributes:
-        x_m, y_m: position (m).
         yaw: direction of its x axis (radians, counter-clockwise from x).
     """
 
@@ -74,11 +73,7 @@ def of_answer(pose: Placed) -> FloorTransform:
 
 
 def of_ros(x_m: float, y_m: float, orientation: Quaternion) -> FloorTransform:
-    """Return the pose of a robot on the floor from its position and quaternion (x, y, z, w), as odometry states them.
-
-    Raises:
-        ValueError: the quaternion is not one of a rotation, or tilts the robot by more than 30°.
-    """
+    """Return the pose of a robot on the floor from its position and quaternion (x, y, z, w)."""
     x, y, z, w = orientation
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if not 0.9 < norm < 1.1:
@@ -101,10 +96,7 @@ def map_from_base(pose: Placed, base_from_camera: FloorTransform) -> FloorTransf
 def map_from_odom(pose: Placed, base_from_camera: FloorTransform, odom_from_base: FloorTransform) -> FloorTransform:
     """Return the transform `map -> odom` of REP 105, which corrects the drift of odometry.
 
-    Args:
-        pose: answer to a photograph.
-        base_from_camera: mount of the camera.
-        odom_from_base: pose of the base by odometry at the time of the photograph, not at that of the answer.
+    `odom_from_base` is the pose of the base by odometry at the time of the photograph, not at that of the answer.
     """
     return map_from_base(pose, base_from_camera) @ odom_from_base.inverse()
 

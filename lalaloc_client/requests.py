@@ -61,11 +61,7 @@ class Request:
 
 
 def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[str, Any]:
-    """Return the options of an httpx client.
-
-    Raises:
-        ValueError: an argument is out of range.
-    """
+    """Return the options of an httpx client."""
     address = httpx.URL(base_url)
     if address.scheme not in ("http", "https") or not address.host:
         raise ValueError(f"base_url is '{base_url}'; it must begin with http:// or https:// and name a host")
@@ -84,11 +80,7 @@ Collection = Literal["floorplans", "venues", "answers", "sessions", "albums", "p
 
 
 def resource_path(collection: Collection, resource_id: str) -> str:
-    """Return the path of a resource.
-
-    Raises:
-        ValueError: `resource_id` cannot be an id.
-    """
+    """Return the path of a resource."""
     # Quoting does not keep other characters from naming another route: servers unquote before they route.
     if not _ID.fullmatch(resource_id):
         raise ValueError(f"{collection[:-1]}_id is {resource_id!r:.100}; it must be 1 to 128 letters, digits, _ or -")
@@ -96,11 +88,7 @@ def resource_path(collection: Collection, resource_id: str) -> str:
 
 
 def text_values(values: Mapping[str, object]) -> dict[str, Any]:
-    """Return values as texts, lists and mappings as JSON; leave out None.
-
-    Raises:
-        ValueError: a number is not finite.
-    """
+    """Return values as texts, lists and mappings as JSON; leave out None."""
     for name, value in values.items():
         _check_finite(name, value)
     return {name: _text(value) for name, value in values.items() if value is not None}
@@ -165,12 +153,7 @@ def query_request(
     accept: str = JSON,
     streamed: bool = False,
 ) -> Request:
-    """Return a query; repeating it is safe, as it stores nothing. Streamed queries state the names of the files.
-
-    Raises:
-        TypeError: an option is unknown.
-        ValueError: a number is not finite, or photographs and features are mixed.
-    """
+    """Return a query; repeating it is safe, as it stores nothing. Streamed queries state the names of the files."""
     known = dict(options or {})
     _check_known(known, SequenceOptions if path.endswith("/sequence") else QueryOptions)
     if isinstance(rooms := known.get("rooms"), str):
@@ -188,12 +171,7 @@ def query_request(
 def film_request(
     path: str, film: bytes | str | os.PathLike[str], values: Mapping[str, object], options: FilmOptions | ViewOptions
 ) -> Request:
-    """Return a query about a film.
-
-    Raises:
-        TypeError: an option is unknown.
-        ValueError: a number is not finite.
-    """
+    """Return a query about a film."""
     _check_known(options, FilmOptions)
     content = film if isinstance(film, bytes) else Path(film).read_bytes()
     media, body = _form("film", [("film", content)], {**values, **options})
@@ -203,12 +181,7 @@ def film_request(
 def preview_params(
     x_m: float | None, y_m: float | None, heading_deg: float | None, covariance_m2: Covariance | None
 ) -> dict[str, Any]:
-    """Return the parameters of a plan's drawing.
-
-    Raises:
-        ValueError: only one of x_m and y_m is given, a heading or covariance is given without them, or a number is not
-            finite.
-    """
+    """Return the parameters of a plan's drawing."""
     if (x_m is None) != (y_m is None):
         raise ValueError(f"x_m is {x_m} and y_m is {y_m}; give both or neither")
     if x_m is None and not (heading_deg is None and covariance_m2 is None):

@@ -92,9 +92,6 @@ class TrackedPose:
         candidates: possible poses, most probable first.
         motion_contradicted: components of the motion that the photographs contradict.
         warnings: these, and odometry that is wrong again and again.
-        view: assumptions about the photograph; None for services without this field.
-        floorplan_id: plan in whose frame the pose is; None for services without this field.
-        level: level of this plan in the venue; None for a session in one plan.
     """
 
     number: int
@@ -121,7 +118,6 @@ class Session:
     Attributes:
         mode: `searching`, `tracking` or `lost`.
         floorplan_id, floorplan_revision: the plan; None for a session in a venue.
-        pose: pose of the last photograph; None before the first.
         path: poses of the last 200 photographs.
         venue_id, venue_revision: the venue; None for a session in one plan.
     """

@@ -24,20 +24,12 @@ class AsyncDevice:
         self._model = None
 
     async def features(self, photographs: Sequence[Photograph], options: Mapping[str, Any]) -> list[bytes]:
-        """Return the features of photographs, given options about their camera.
-
-        Raises:
-            OnDeviceError: see `OnDeviceModel`.
-        """
+        """Return the features of photographs, given options about their camera."""
         model = await self._current()
         return [await run_blocking(model.features, photograph, options) for photograph in photographs]
 
     async def turn(self, turn: Film | Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
-        """Return the features of a turn, and its angles, given options about its camera.
-
-        Raises:
-            OnDeviceError: see `OnDeviceModel`.
-        """
+        """Return the features of a turn, and its angles, given options about its camera."""
         model = await self._current()
         return await run_blocking(model.turn, turn, options)
 

@@ -258,13 +258,8 @@ class AsyncPlans(AsyncAlbums):
     ) -> Venue:
         """Store a plan of every level of a file, and a venue of these plans; see `venue_plans`.
 
-        Args:
-            file: as for `upload_floorplan`.
-            name: name of the venue, which also begins the names of several plans: "Duplex – Level 1". Default: the name
-                of the file.
-            options: import options, as for `upload_floorplan`, without `level`.
-            idempotency_key: as for `upload_floorplan`.
-            on_step: as for `upload_floorplan`.
+        The name of the venue also begins the names of several plans: "Duplex – Level 1". Default: the name of the file.
+        All else is as for `upload_floorplan`; the options have no `level`.
         """
         key = idempotency_key or uuid.uuid4().hex
         values = dict(options or {}, name=name)
@@ -329,12 +324,7 @@ class AsyncPlans(AsyncAlbums):
         A document `{"plans": [...]}` has up to 200 plans in the native format, each with an optional `level`: a venue
         of thousands of plans is uploaded in a fraction of the time that single uploads take.
 
-        Args:
-            venue_id: id of the venue.
-            file: as for `upload_floorplan`.
-            options: as for `upload_venue`; `name` begins the names of several plans instead of that of the venue.
-            idempotency_key: as for `upload_floorplan`.
-            if_match: as for `change_venue`.
+        Options are as for `upload_venue`; their `name` begins the names of several plans instead of that of the venue.
         """
         key = idempotency_key or uuid.uuid4().hex
         path, values = resource_path("venues", venue_id), {"name": None, **(options or {})}

@@ -69,13 +69,8 @@ class AsyncTracker:
     ) -> Session:
         """Send the next photograph; return the session with its pose.
 
-        Args:
-            photograph: as for `localise`.
-            motion: motion since the photograph before; None if it was not measured.
-            heading_deg: azimuth of the photograph's centre, if it is known.
-            heading_tolerance_deg: its largest error. Default: 0.
-            on_device: as for `localise`.
-            options: the camera; see `ViewOptions`. An app that knows gravity gives `pitch_deg` and `roll_deg`.
+        The motion is that since the photograph before, if it was measured. The default of the tolerance is 0.
+        An app that knows gravity gives `pitch_deg` and `roll_deg`. All else is as for `localise`.
         """
         number = self.session.photographs + 1
         values = {"number": number, "heading_deg": heading_deg, "heading_tolerance_deg": heading_tolerance_deg}

@@ -161,11 +161,7 @@ class AsyncTransport:
                 return
 
     async def _lines(self, kind: type[LineT], request: Request) -> AsyncGenerator[LineT]:
-        """Send a streamed request, and yield the lines of its answer as they arrive.
-
-        Raises:
-            ConnectionFailedError: the connection broke off before the last line.
-        """
+        """Send a streamed request, and yield the lines of its answer as they arrive."""
         async with aclosing(await self._send(request)) as response:
             try:
                 async for line in response.aiter_lines():
@@ -180,14 +176,7 @@ class AsyncTransport:
         return (await self._send(request)).content
 
     async def _send(self, request: Request, retry: RetryPolicy | None = None) -> httpx.Response:
-        """Send a request, repeatedly if necessary and safe.
-
-        `retry` replaces the client's own policy. The answer is read completely unless the request is streamed.
-
-        Raises:
-            ConnectionFailedError: no attempt was answered.
-            ProblemError: the answer is a problem.
-        """
+        """Send a request, repeatedly if necessary and safe."""
         retry = retry or self._retry
         begin_s, attempt, maybe_done = monotonic(), 0, False
         while True:

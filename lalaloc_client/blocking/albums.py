@@ -43,16 +43,9 @@ class Albums(Transport):
         idempotency_key: str | None = None,
         **options: Unpack[ViewOptions],
     ) -> Album:
-        """Create an album, whose photographs are pinned together.
+        """Create an album, whose photographs are pinned together to a plan, or to the plans of a venue.
 
-        Args:
-            floorplan_id: id of the plan; None with `venue_id`.
-            venue_id: id of a venue instead, with all its plans.
-            name: name of the album.
-            camera_height_m: camera height, as in `QueryOptions`.
-            camera_height_std_m: its standard deviation, as in `QueryOptions`.
-            idempotency_key: as for `upload_floorplan`.
-            **options: camera of all photographs, see `ViewOptions`.
+        The camera is that of all photographs: `camera_height_m` and its deviation as in `QueryOptions`, and `options`.
         """
         given = {
             "floorplan_id": floorplan_id,
@@ -136,10 +129,8 @@ class Albums(Transport):
     def album_file(self, album_id: str, album_format: AlbumFormat, *, floorplan_id: str | None = None) -> bytes:
         """Return the pins of an album as a file.
 
-        Args:
-            album_id: id of the album.
-            album_format: `geojson`, for plans with an anchor; `csv`; `svg`, a drawing of the plan.
-            floorplan_id: plan of a venue whose pins are wanted; a drawing needs it.
+        The format is `geojson`, for plans with an anchor; `csv`; or `svg`, a drawing of the plan, which in a venue
+        needs the `floorplan_id` of the plan whose pins are wanted.
         """
         if album_format not in FORMAT_MEDIA:
             raise ValueError(f"album_format is {album_format!r}; it must be one of {', '.join(FORMAT_MEDIA)}")
@@ -152,12 +143,9 @@ class Albums(Transport):
     ) -> AlbumPhotograph:
         """State where a photograph was taken; the rest of the album is then solved again.
 
-        Args:
-            album_id: id of the album.
-            photograph_id: id of the photograph.
-            correction: {"room_id": ...}, {"position": {"x_m": 3.5, "y_m": 2.0}, "heading_deg": 90},
-                {"elsewhere": True} or {"confirmed": True}; None undoes it. In a venue with `floorplan_id` as well.
-            if_match: `etag` that the photograph must have.
+        The correction is {"room_id": ...}, {"position": {"x_m": 3.5, "y_m": 2.0}, "heading_deg": 90}, {"elsewhere":
+        True} or {"confirmed": True}; None undoes it. In a venue with `floorplan_id` as well. `if_match` is the `etag`
+        that the photograph must have.
         """
         path = _photograph_path(album_id, photograph_id)
         return self._stored(AlbumPhotograph, json_request("PATCH", path, {"correction": correction}, if_match=if_match))

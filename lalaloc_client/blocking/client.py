@@ -86,13 +86,8 @@ class Client(Plans):
     ) -> Localisation:
         """Localise a photograph in the plans of a venue.
 
-        Args:
-            venue_id: id of the venue.
-            photograph: as for `localise`.
-            level: level of the camera; a hint unless `strict` is set.
-            on_device: as for `localise`.
-            **options: see `QueryOptions`; `near` is a latitude and longitude, or, if the venue has an anchor, a point
-                in the common frame of its plans.
+        All is as for `localise`; `level` is that of the camera, a hint unless `strict` is set. `near` is a latitude and
+        longitude, or, if the venue has an anchor, a point in the common frame of its plans.
         """
         values = {"venue_id": venue_id, "level": level}
         content = self.localise_query("/localise", [photograph], values, options, on_device=on_device)
@@ -106,10 +101,7 @@ class Client(Plans):
 
         A photograph that cannot be localised does not stop the others; `BatchAnswer.result` raises its error.
 
-        Args:
-            floorplan_id: id of the plan.
-            photographs: photographs, each as for `localise`, at most the service's `max_batch_photographs`.
-            **options: see `QueryOptions`; they hold for all photographs.
+        There are at most the service's `max_batch_photographs`; the options hold for all of them.
 
         Raises:
             ConnectionFailedError: the connection broke off before the last answer.
@@ -134,12 +126,9 @@ class Client(Plans):
     ) -> SequenceLocalisation:
         """Localise several photographs of one turn together, with `motion="turn"`.
 
-        Args:
-            floorplan_id: id of the plan; None with `venue_id`.
-            photographs: photographs in the order in which they were taken, each as for `localise`.
-            venue_id: id of a venue, to search all its plans; poses have `floorplan_id` and `level`.
-            on_device: as for `localise`; the angles of a turn are computed on this device, too.
-            **options: see `SequenceOptions`.
+        The photographs are in the order in which they were taken. With `venue_id` instead of the plan, all plans of the
+        venue are searched; poses have `floorplan_id` and `level`. With `on_device`, as for `localise`, the angles are
+        computed on this device, too.
         """
         values = {"floorplan_id": floorplan_id, "venue_id": venue_id}
         if on_device and options.get("relative_heading_deg") is None:
@@ -159,14 +148,9 @@ class Client(Plans):
     ) -> SequenceLocalisation:
         """Localise a film of one slow turn, once around on the spot.
 
-        Args:
-            floorplan_id: id of the plan; None with `venue_id`.
-            film: content or path of an MP4, MOV or WebM file. The frames that the service keeps become poses, with
-                `time_s`; `film` of the answer tells how it was read.
-            venue_id: id of a venue, to search all its plans.
-            on_device: read the film on this device, and send the features of its frames and their angles alone; as for
-                `localise`.
-            **options: see `FilmOptions`.
+        The film is the content or path of an MP4, MOV or WebM file. The frames that the service keeps become poses with
+        `time_s`; `film` of the answer tells how it was read. With `on_device`, as for `localise`, it is read on this
+        device, and the features of its frames and their angles alone are sent.
         """
         values = {"floorplan_id": floorplan_id, "venue_id": venue_id, "motion": "turn"}
         if on_device:
@@ -184,7 +168,6 @@ class Client(Plans):
 
         Args:
             turn: content or path of a film as for `localise_film`, or a list of photographs as for `localise_sequence`.
-            **options: the camera, see `ViewOptions`.
 
         Raises:
             OnDeviceError: the extra `onnx` is missing, or the turn cannot be read.
@@ -194,13 +177,7 @@ class Client(Plans):
     def track(
         self, floorplan_id: str | None = None, *, venue_id: str | None = None, **options: Unpack[SessionOptions]
     ) -> Tracker:
-        """Return a tracker, which follows a camera from photograph to photograph.
-
-        Args:
-            floorplan_id: id of the plan.
-            venue_id: id of a venue instead, between whose plans the camera can move.
-            **options: see `SessionOptions`.
-        """
+        """Return a tracker, which follows a camera from photograph to photograph."""
         return Tracker(self, floorplan_id, venue_id, options)
 
     @earlier_name("panorama", "photograph")
@@ -215,13 +192,8 @@ class Client(Plans):
     ) -> bytes:
         """Localise a photograph in a plan and return the answer as a picture 1600 pixels wide.
 
-        Args:
-            floorplan_id: id of the plan.
-            photograph: as for `localise`.
-            picture: `plan` with the posterior as a heat map, the answer and the other candidates, `photograph` with
-                the layout drawn over it, or `both`.
-            picture_format: `png` or `svg`.
-            **options: see `QueryOptions`.
+        The picture is that of the `plan` with the posterior as a heat map, the answer and the other candidates, that of
+        the `photograph` with the layout drawn over it, or `both`.
         """
         if picture_format not in PICTURE_MEDIA:
             raise ValueError(f"picture_format is {picture_format!r}; it must be one of {', '.join(PICTURE_MEDIA)}")

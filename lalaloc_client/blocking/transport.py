@@ -162,11 +162,7 @@ class Transport:
                 return
 
     def _lines(self, kind: type[LineT], request: Request) -> Generator[LineT]:
-        """Send a streamed request, and yield the lines of its answer as they arrive.
-
-        Raises:
-            ConnectionFailedError: the connection broke off before the last line.
-        """
+        """Send a streamed request, and yield the lines of its answer as they arrive."""
         with closing(self._send(request)) as response:
             try:
                 for line in response.iter_lines():
@@ -181,14 +177,7 @@ class Transport:
         return (self._send(request)).content
 
     def _send(self, request: Request, retry: RetryPolicy | None = None) -> httpx.Response:
-        """Send a request, repeatedly if necessary and safe.
-
-        `retry` replaces the client's own policy. The answer is read completely unless the request is streamed.
-
-        Raises:
-            ConnectionFailedError: no attempt was answered.
-            ProblemError: the answer is a problem.
-        """
+        """Send a request, repeatedly if necessary and safe."""
         retry = retry or self._retry
         begin_s, attempt, maybe_done = monotonic(), 0, False
         while True:

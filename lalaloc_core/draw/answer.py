@@ -53,10 +53,8 @@ class DrawnAnswer:
 
     Attributes:
         camera: the predicted pose, with its covariance if known.
-        heading_source: origin of the heading, one or two words.
         confidence: probability that the position is correct; None if unknown.
         heat: map of the posterior; None leaves the floors white.
-        photograph: the decoded photograph; None for a full sphere.
     """
 
     plan: FloorPlan

@@ -41,13 +41,7 @@ class DrawnText:
 
 
 def write_pdf(pages: Iterable[str], path: Path, dpi: int) -> None:
-    """Write SVG drawings as pages of a PDF, whose text can be selected.
-
-    Args:
-        pages: the drawings; only one is rasterised at a time.
-        path: the file.
-        dpi: pixels of the drawings per inch.
-    """
+    """Write SVG drawings as pages of a PDF, whose text can be selected."""
     document = pypdfium2.PdfDocument.new()
     try:
         layer = _TextLayer(document)

@@ -100,11 +100,7 @@ class ReportRow:
     """A photograph of the report.
 
     Attributes:
-        number: its number in the report.
-        name: name of the file.
-        date: when it was taken; empty if unknown.
         plan: number of its plan; None if it is set aside.
-        pin: its pin; None if it is set aside.
         room: name of its room, and `room_key`, by which rooms are told apart.
         note: probability of the room, or why it is set aside.
         picture: returns its pixels, no larger than `THUMBNAIL`; None if they cannot be read.

@@ -126,7 +126,6 @@ class SeenRoom:
         distance_m: (w,) most probable distance of the wall.
         seen: (w,) azimuths that the photograph shows.
         kind: (w,) most probable opening class, as in `conventions.OPENING_CLASSES`.
-        ceiling_m: height of the ceiling above the floor.
         types: probabilities of the room types, the most probable first.
     """
 

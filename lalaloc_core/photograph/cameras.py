@@ -57,12 +57,7 @@ class _Lens:
 
 @dataclass(frozen=True, kw_only=True)
 class Perspective(_Lens):
-    """Pinhole camera with OpenCV's radial and tangential distortion.
-
-    Attributes:
-        radial: coefficients k1, k2, k3.
-        tangential: coefficients p1, p2.
-    """
+    """Pinhole camera with OpenCV's radial and tangential distortion."""
 
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
@@ -134,7 +129,6 @@ class Fisheye(_Lens):
     """OpenCV's fisheye camera: the angle θ from the axis lies at f θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸).
 
     Attributes:
-        radial: coefficients k1 to k4.
         max_angle: largest angle from the axis that the lens shows, radians.
     """
 

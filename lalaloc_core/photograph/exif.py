@@ -71,11 +71,9 @@ class ExifLens:
 
     Attributes:
         focal: focal length, pixels of the full picture; None if unknown.
-        focal_sd: relative standard deviation of `focal`.
         strip: the picture is a strip of a phone's panorama mode.
         fisheye: angle (radians) across the longer side, if the camera's wide lens is a fisheye; else None.
         camera: maker and model, if `fisheye` is known.
-        warnings: values that were ignored, and why.
     """
 
     focal: float | None = None
@@ -92,7 +90,6 @@ class Taken:
 
     Attributes:
         at: time by the camera's clock, without a time zone.
-        make, model: maker and model of the camera.
         width, height: size of the upright picture, pixels.
     """
 

@@ -62,14 +62,7 @@ class Film:
     """Frames of a turn that were kept of a film.
 
     Attributes:
-        photographs: the frames as photographs, in the order of the film.
-        times_s: their times.
-        angles: their angles.
-        frames: number of frames that were read.
-        dropped: numbers of frames that were not kept, by reason.
-        duration_s: time of the last frame.
         turned: angle (radians) that the camera turned through.
-        warnings: faults of the film.
     """
 
     photographs: tuple[Photograph, ...]
@@ -123,17 +116,10 @@ def read_film(
     patch_size: PatchSize | None = None,
     limits: FilmLimits | None = None,
 ) -> Film:
-    """Read a film of a turn on one spot.
-
-    Args:
-        content: the file: MP4, MOV or WebM with H.264, HEVC, VP8 or VP9.
-        stated: the caller's statements about the camera.
-        patch_size: size of the patches of its frames.
-        limits: limits of the film.
+    """Read a film of a turn on one spot: MP4, MOV or WebM with H.264, HEVC, VP8 or VP9.
 
     Raises:
         InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
-        InvalidPhotographError: a statement is invalid.
     """
     stated, limits, size = stated or StatedCamera(), limits or FilmLimits(), patch_size or PatchSize()
     stated.check()
@@ -170,10 +156,7 @@ def read_film(
 def _turned(
     kept: Sequence[_Sample], full_size: tuple[int, int], stated: StatedCamera, size: PatchSize, tracker: FlowTracker
 ) -> tuple[list[Photograph], list[TurnAngles]]:
-    """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles.
-
-    Frames that do not overlap are joined by the turns that the tracker tells.
-    """
+    """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
     photographs = [photograph_of_picture(sample.picture, full_size, lens, stated, size, "turn") for sample in kept]
     views = turn_views(photographs)
@@ -356,14 +339,7 @@ def _field(stated: StatedCamera) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class FilmLimits:
-    """Limits of films.
-
-    Attributes:
-        max_bytes: size of the file.
-        max_s: duration.
-        max_pixels: width times height.
-        max_cpu_s: CPU time of decoding.
-    """
+    """Limits of films."""
 
     max_bytes: int = 100 * 2**20
     max_s: float = 60.0

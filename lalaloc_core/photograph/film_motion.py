@@ -156,10 +156,8 @@ def _gradient(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def _edges_shift(before: Float[np.ndarray, "h w"], after: Float[np.ndarray, "h w"]) -> float | None:
-    """Return the shift (pixels to the right) of upright edges by their gradients; None if nothing tells it.
-
-    Edges of plain walls have no corners. The means of columns are compared.
-    """
+    """Return the shift (pixels to the right) of upright edges by their gradients; None if nothing tells it."""
+    # Edges of plain walls have no corners, so the means of columns are compared.
     one, other = before.mean(axis=0), after.mean(axis=0)
     if np.abs(one).max() < _EDGE:
         return None

@@ -97,7 +97,6 @@ class Attitude:
     Attributes:
         pitch: elevation of the optical axis, radians.
         roll: clockwise rotation about it, radians.
-        pitch_sd, roll_sd: standard deviations, radians.
         yaw: azimuth of one of the two horizontal directions relative to the optical axis, radians; repeats by 90°.
         yaw_sd: its standard deviation; infinite without lines.
     """
@@ -112,13 +111,7 @@ class Attitude:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Field of view and tilt of a camera about which nothing is known.
-
-    Attributes:
-        hfov: horizontal field of view, radians.
-        focal_sd: relative standard deviation of the focal length.
-        attitude: the tilt.
-    """
+    """Field of view and tilt of a camera about which nothing is known."""
 
     hfov: float
     focal_sd: float
@@ -165,13 +158,7 @@ def estimate_attitude(lines: Lines) -> Attitude:
 
 
 def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, height: int) -> Calibration:
-    """Return the most probable field of view and tilt of a perspective camera without distortion.
-
-    Args:
-        segments: segments of `find_segments`.
-        width: columns of the picture.
-        height: rows of the picture.
-    """
+    """Return the most probable field of view and tilt of a perspective camera without distortion."""
     focals = 0.5 * max(width, height) / np.tan(0.5 * _LONG_FOVS)
     modes: list[_Mode] = []
     for focal in focals:
@@ -212,10 +199,7 @@ def _attitude(modes: Sequence[_Mode]) -> Attitude:
 
 
 def _directions(angles: Float[np.ndarray, "*a 3"]) -> Float[np.ndarray, "*a 3 3"]:
-    """Return the vertical and the two horizontal directions in the camera's frame, one per row.
-
-    They are those of a level frame, turned by the transpose of `camera_axes`.
-    """
+    """Return the vertical and the two horizontal directions in the camera's frame, one per row."""
     (sin_pitch, sin_roll, sin_yaw), (cos_pitch, cos_roll, cos_yaw) = (
         np.moveaxis(part, -1, 0) for part in (np.sin(angles), np.cos(angles))
     )
@@ -347,10 +331,8 @@ def measure_bend(segments: Float[np.ndarray, "n 4"], *, width: int, height: int)
 
 
 def _chains(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[tuple[float, float, float, float]]:
-    """Return the coefficient -k of the division model that straightens each chain, its weight, and its side (x, y).
-
-    Lengths are in halves of the picture's diagonal, from its centre; the side is the direction from there.
-    """
+    """Return the coefficient -k of the division model that straightens each chain, its weight, and its side (x, y)."""
+    # Lengths are in halves of the picture's diagonal, from its centre; the side is the direction from there.
     chains = [pieces[chain] for chain in _joined(pieces, side)]
     # Most chains are a piece or two, and too short in any direction.
     long = [chain for chain in chains if np.hypot(*np.ptp(chain.reshape(-1, 2), axis=0)) >= _SHORTEST]

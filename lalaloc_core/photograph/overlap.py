@@ -76,7 +76,6 @@ class Link:
     """Matches of two photographs that a rotation explains.
 
     Attributes:
-        first, second: numbers of the photographs.
         rays: (2, m, 3) rays of the matches, in the frame of each camera.
         turn: heading of the second photograph minus that of the first, about, radians.
     """

@@ -38,9 +38,6 @@ class PatchSize:
     """Size of a patch: equirectangular, with as many pixels per degree of azimuth as of elevation.
 
     Attributes:
-        height, width: pixels.
-        hfov_deg: range of azimuths.
-        top_deg: elevation of the upper border.
         step_deg: azimuths of patches are multiples of this, a column of the network's predictions.
     """
 
@@ -72,7 +69,6 @@ class Patch:
 
     Attributes:
         pixels: (h, w, 3) RGB; `UNSEEN` where the photograph shows nothing.
-        seen: (h, w) pixels that the photograph shows.
         azimuth_rad: azimuth of the centre column relative to the photograph's centre, clockwise.
     """
 
@@ -89,15 +85,7 @@ class Patch:
 def cut_patches(
     picture: UInt8[np.ndarray, "h w 3"], camera: Camera, *, pitch: float, roll: float, size: PatchSize
 ) -> tuple[Patch, ...]:
-    """Cut the patches that cover a photograph, from left to right.
-
-    Args:
-        picture: the photograph, of the camera's size.
-        camera: its camera.
-        pitch: elevation of the optical axis, radians.
-        roll: clockwise rotation of the camera about it, radians.
-        size: size of the patches.
-    """
+    """Cut the patches that cover a photograph, from left to right; angles in radians."""
     picture, camera = reduced(picture, camera, size)
     axes = camera_axes(pitch=pitch, roll=roll).astype(np.float32)
     return tuple(_patch(picture, camera, axes, azimuth, size) for azimuth in patch_azimuths(camera.hfov, size))
@@ -120,10 +108,8 @@ def patch_azimuths(hfov: float, size: PatchSize) -> list[float]:
 def joined_patches(placed: Sequence[tuple[Patch, float]], size: PatchSize) -> list[Patch]:
     """Return patches of what photographs show together once around; none if they leave a part of the horizon unseen.
 
-    Args:
-        placed: patches of the photographs, with the azimuths (radians) of their centres relative to the first
-            photograph; where they overlap, the nearer centre counts.
-        size: of the patches.
+    `placed` are patches of the photographs, with the azimuths (radians) of their centres relative to the first
+    photograph; where they overlap, the nearer centre counts.
     """
     columns = round(TWO_PI * size.resolution)
     ring = np.full((size.height, columns, 3), UNSEEN, np.uint8)

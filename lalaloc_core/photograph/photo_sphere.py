@@ -68,11 +68,9 @@ class PhotoSphere:
         part: visible part of the sphere, None for all of it or if unknown.
         fault: problem with the metadata of `part`, None if they are valid or missing.
         refusal: reason that the metadata rule the picture out as a sphere, None if they do not.
-        declared: the metadata state that the picture shows a sphere or a part of it.
         cylinder: horizontal field of view of a picture that the metadata state to be cylindrical; None if they do not.
         roll: clockwise rotation of the camera about its viewing direction; the horizon rotates counterclockwise.
         compass_heading: azimuth of the full sphere's centre, clockwise from true north; None if missing.
-        warnings: values that were ignored, and why.
     """
 
     part: SpherePart | None = None

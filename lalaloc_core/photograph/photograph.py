@@ -101,9 +101,6 @@ class Photograph:
     """A photograph as the encoders expect it, and what was assumed about it.
 
     Attributes:
-        projection: the projection.
-        projection_source: its origin.
-        hfov: horizontal field of view.
         pitch: elevation of the centre of the picture.
         roll: clockwise rotation of the camera about its optical axis.
         wall_direction: azimuth of walls relative to the photograph's centre, up to quarter turns, by straight lines;
@@ -111,14 +108,11 @@ class Photograph:
         azimuths: first and last azimuth (radians) that the photograph shows, relative to its centre, clockwise.
         patches: level patches that cover the photograph; empty for a full sphere.
         sphere: (h, w, 3) pixels of the level full sphere; None for other photographs.
-        features: outputs of the image encoder, if they were sent instead of the pixels; see `localise.encode.features`.
         thumbnail: (h, w, 3) pixels of the whole upright picture, small; None for a full sphere.
         camera: camera of the full upright picture; None for a full sphere.
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
-        taken: time and camera by the metadata; None without a file.
         overview: parts that tell its angles to photographs that overlap it, in albums and turns.
-        warnings: metadata that were ignored, and estimates to be checked.
     """
 
     projection: Projection
@@ -167,11 +161,7 @@ class Photograph:
 def open_picture(
     content: bytes, *, max_size: tuple[int, int], limits: PhotographLimits | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Decode the upright picture of a photograph, no wider and higher than `max_size` (pixels), to be shown.
-
-    Raises:
-        InvalidPhotographError: the file is not readable or too large.
-    """
+    """Decode the upright picture of a photograph, no wider and higher than `max_size` (pixels), to be shown."""
     with opened_picture(content, limits or PhotographLimits()) as file:
         width, height = file.upright_size
         share = min(max_size[0] / width, max_size[1] / height)
@@ -203,14 +193,9 @@ def open_photograph(
 ) -> Photograph:
     """Decode a JPEG, PNG, WebP or HEIC photograph of any projection.
 
-    Args:
-        content: the file.
-        sphere_size: height and width (pixels) that a full sphere is scaled to.
-        stated: the caller's statements; None for none.
-        patch_size: size of the patches of other photographs.
-        limits: limits of the file.
-        purpose: its use; photographs of albums and turns get an overview, and those of turns no patches.
-        refuse_drawings: refuse a plan or a page of text; an overexposed white wall can be taken for one.
+    A full sphere is scaled to `sphere_size` (height, width in pixels). Photographs of albums and turns get an overview,
+    and those of turns no patches. A plan or a page of text is refused if `refuse_drawings`; an overexposed white wall
+    can be taken for one.
 
     Raises:
         InvalidPhotographError: the file is not readable or too large, a statement is invalid, or nothing says what the

@@ -43,7 +43,6 @@ class Place:
     Attributes:
         latitude, longitude: degrees (WGS 84); None where unknown.
         direction_deg: azimuth of the photograph's centre, clockwise from true north; None where unknown.
-        room, level: names of the room and of the level or plan.
     """
 
     room: str

@@ -58,12 +58,7 @@ class Lens:
     """Projection of a photograph.
 
     Attributes:
-        projection: the projection.
-        projection_source: its origin.
         camera: camera of the full upright picture; None if the field of view is to be estimated.
-        hfov_source: origin of the field of view.
-        focal_sd: relative standard deviation of the focal length.
-        warnings: metadata that were ignored.
     """
 
     projection: Projection
@@ -92,15 +87,8 @@ def find_lens(
 ) -> Lens:
     """Return the projection of a picture: as stated, by GPano, by the picture itself, or by its EXIF focal length.
 
-    Args:
-        width: columns of the upright picture.
-        height: rows of the upright picture.
-        stated: the caller's statements.
-        sphere: GPano metadata.
-        exif: EXIF metadata.
-        looks_spherical: `is_sphere` of the picture; called only if nothing else decides.
-        orientation: Exif orientation of the stored picture.
-        closes: `is_closed` of the picture; called only for a strip whose metadata state 360°.
+    `looks_spherical` is `is_sphere` of the picture, called only if nothing else decides; `closes` is `is_closed` of it,
+    called only for a strip whose metadata state 360°.
     """
     stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)

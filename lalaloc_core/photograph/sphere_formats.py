@@ -48,7 +48,6 @@ class SphereFormat:
     """Format of a picture that holds a sphere.
 
     Attributes:
-        text: its name, the reason for it, and what is done or to be done about it.
         box: part of the picture with the sphere, as shares (left, top, right, bottom); None if it is refused.
         is_stored: `box` is one of the stored picture, before its Exif orientation is applied.
     """

@@ -29,12 +29,7 @@ _ROWS = 64
 def read_sphere(
     content: bytes, *, height: int, width: int, limits: PhotographLimits | None = None
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Decode an equirectangular JPEG, PNG or WebP (the first picture of several) and scale it to `height` x `width`.
-
-    Raises:
-        InvalidPhotographError: the file is not readable or too large, or neither the full sphere nor a part of it that
-            the metadata describe.
-    """
+    """Decode an equirectangular JPEG, PNG or WebP (the first picture of several) and scale it to `height` x `width`."""
     limits = limits or PhotographLimits()
     with opened_picture(content, limits) as file:
         columns, rows = file.upright_size

@@ -47,7 +47,6 @@ class Intrinsics:
     """Camera matrix and distortion as OpenCV's calibration prints them, for the upright picture at its full size.
 
     Attributes:
-        fx, fy: focal lengths, pixels.
         cx, cy: optical centre, pixels from the centre of the top left pixel; None for the picture's centre.
         k1, k2, k3: radial distortion, of the fisheye model for projection "fisheye".
         k4: radial distortion of the fisheye model.
@@ -71,7 +70,6 @@ class StatedCamera:
     """Caller's statements about one photograph; None for unknown values. Degrees, as in requests.
 
     Attributes:
-        projection: one of `PROJECTIONS`, or "auto".
         hfov_deg: horizontal field of view of the upright picture.
         intrinsics: camera matrix and distortion, instead of `hfov_deg`.
         pitch_deg: elevation of the picture's centre above the horizon; of its whole middle row, if it is cylindrical.
@@ -85,11 +83,7 @@ class StatedCamera:
     roll_deg: float | None = None
 
     def check(self) -> None:
-        """Check all values that do not depend on the picture.
-
-        Raises:
-            InvalidPhotographError: a value is unknown, not finite or out of range, or two values exclude each other.
-        """
+        """Check all values that do not depend on the picture."""
         if self.projection not in HFOV_RANGE_DEG:
             raise InvalidPhotographError(
                 f"projection is '{str(self.projection)[:50]}'; it must be one of {', '.join(HFOV_RANGE_DEG)}"
@@ -201,14 +195,7 @@ def _check_range(name: str, value: float | None, low: float, high: float) -> Non
 
 
 def fit_intrinsics(stated: Intrinsics, width: int, height: int, orientation: int) -> tuple[Intrinsics, tuple[str, ...]]:
-    """Return the intrinsics of the upright picture, and a warning if they were changed or do not fit.
-
-    Args:
-        stated: checked intrinsics of a request.
-        width: columns of the upright picture.
-        height: rows of the upright picture.
-        orientation: Exif orientation of the stored picture.
-    """
+    """Return the intrinsics of the upright picture, and a warning if they were changed or do not fit."""
     if stated.cx is None or stated.cy is None:
         return stated, ()
     x, y = stated.cx + _HALF_PIXEL, stated.cy + _HALF_PIXEL

@@ -62,7 +62,6 @@ class Overview:
     """Parts of a picture that tell its angles: its features and straight lines.
 
     Attributes:
-        features: its features.
         segments: (n, 4) ends of its straight lines, as shares of width and height.
         attitude: tilt by these lines, with the photograph's own camera; None to estimate it with another.
         picture: (h, w, 3) the upright picture, small, that patches are still to be cut from; None if they were cut.
@@ -79,8 +78,6 @@ class TurnView:
     """Photograph of a turn.
 
     Attributes:
-        overview: its features and lines.
-        camera: its camera.
         focal_sd: relative standard deviation of the camera's focal length; 0: it is kept.
         pitch, roll: stated tilt, radians; None if unknown.
     """
@@ -99,8 +96,6 @@ class TurnAngles:
     Attributes:
         group: number of the group of photographs that overlap, directly or by others.
         heading: heading minus that of the first photograph of the group.
-        heading_sd: standard deviation of `heading`.
-        attitude: tilt.
         focal_factor: factor of the camera's focal length.
         focal_sd: relative standard deviation of the resulting focal length.
         is_assumed: the heading does not follow from overlap with the most photographs of the group, but from the order.
@@ -236,10 +231,8 @@ class _Fit:
         return np.concatenate([angles.ravel(), [0.0, _NEARNESS[0], walls]])
 
     def _minimised(self, values: Float[np.ndarray, "p"]) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p p"]]:
-        """Return the values of least cost near some values, and the information about them (Levenberg-Marquardt).
-
-        scipy's solvers of sparse problems stop far from the minimum here, and those of dense ones take minutes.
-        """
+        """Return the values of least cost near some values, and the information about them (Levenberg-Marquardt)."""
+        # scipy's solvers of sparse problems stop far from the minimum here, and those of dense ones take minutes.
         damping, cost, information = _FIRST_DAMPING, self._cost(values), np.eye(len(values))
         for _ in range(_MAX_STEPS):
             residuals, slopes = self._residuals(values), self._jacobian(values)

@@ -23,14 +23,7 @@ from service.schemas.query_fields import PlanPoint
 def stored_correction(
     document: CorrectionDocument, plan_id: str | None, plan: FloorPlan | None, pin: PinAnswer | None
 ) -> str:
-    """Return a correction as JSON of the core.
-
-    Args:
-        document: the correction.
-        plan_id: plan of the room or position; None where it is unknown.
-        plan: that plan.
-        pin: the pin of the photograph; None before the first solution.
-    """
+    """Return a correction as JSON of the core; the plan is that of its room or position, None where it is unknown."""
     if document.elsewhere:
         return _text(Correction(kind="elsewhere"))
     if document.confirmed:

@@ -40,8 +40,6 @@ class ImportJob:
     """Uploaded plan file, and the options of its import.
 
     Attributes:
-        content: the file.
-        options: the options.
         step_m: grid step of descriptions.
         every_level: import all levels of the file, not the only one.
         building: name for plans that have none, and for those of several levels, see `import_plans`.
@@ -68,11 +66,6 @@ class Imported:
     """Plan of a level of a file.
 
     Attributes:
-        plan: the plan, validated under the service's limits.
-        level: the level, if the file has levels.
-        document: its stored form.
-        report: the import report as JSON text.
-        media_type: media type of the file.
         description: result of `describe_content` for a large plan; None for others.
     """
 
@@ -89,9 +82,6 @@ class ConversionRefusal:
     """Reason why a file cannot be read as a plan, or a plan cannot be written.
 
     Attributes:
-        reason: text of the error.
-        kind: class of the error.
-        room: room that the error is about.
         names: names of levels, or purpose and name of a missing extra.
     """
 

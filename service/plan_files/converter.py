@@ -87,15 +87,6 @@ class Converter:
 
         `building` names plans that have no name, and those of several levels. `on_step` is called with steps of the
         import as they begin, on another thread, and returns at once.
-
-        Raises:
-            InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.
-            SeveralLevelsError: the file has several storeys, without `level` or `every_level`.
-            MissingExtraError: a library of its format is not installed.
-            OverloadedError: the queue is full.
-            DeadlineExceededError: the import did not finish in time.
-            ConverterNotReadyError: no worker is running.
-            StoppingError: the service is shutting down.
         """
         step_m, limit_s = self._settings.grids.grid_step_m, self._settings.plans.import_deadline_s
         job = ImportJob(content, options, step_m, every_level, building, tells_steps=on_step is not None)

@@ -32,16 +32,7 @@ from service.uploaded_file import UploadedFile
 
 @dataclass(frozen=True)
 class PlanFile:
-    """Plan of an uploaded file.
-
-    Attributes:
-        plan: plan, validated under the service's limits.
-        level: level of the plan, if the file has levels.
-        report: report of the import as JSON text.
-        media_type: media type of the file, detected from its content.
-        document: stored form of the plan; None if it is to be made.
-        description: result of `describe_content`; None if it is to be made.
-    """
+    """Plan of an uploaded file."""
 
     plan: FloorPlan
     report: str
@@ -64,14 +55,7 @@ class PlanReader:
     """Reader of an uploaded plan file; its calls block.
 
     Attributes:
-        content: the file.
-        options: options of its import.
         is_native: result of `seems_native`; a worker still reads JSON of other formats.
-        client: client whose file it is.
-        converter: workers for files that are not in the native format.
-        settings: the settings.
-        cores: cores to compute in this process.
-        on_step: as for `Converter.read`.
     """
 
     content: bytes
@@ -84,17 +68,7 @@ class PlanReader:
     on_step: OnStep | None = None
 
     def read(self, name: str | None) -> PlanFile:
-        """Return the only plan of the file; `name` is for a plan without.
-
-        Raises:
-            InvalidFloorPlanError: the file is invalid or exceeds a limit.
-            SeveralLevelsError: the file has several storeys and no `level` is set.
-            MissingExtraError: a library of its format is not installed.
-            OverloadedError: the queue of the workers is full.
-            DeadlineExceededError: the import did not finish in time.
-            ConverterNotReadyError: no worker is running.
-            StoppingError: the service is shutting down.
-        """
+        """Return the only plan of the file; `name` is for a plan without."""
         (plan,) = self._read(name, every_level=False)
         return plan
 

@@ -90,17 +90,7 @@ class RenditionCache:
         self._cache.put((revision_id, kind), made)
 
     async def get(self, plan_id: str, revision_id: str, kind: RenditionKind, client: str) -> Rendition:
-        """Return a file of a stored plan, regardless of tenant. Callers check access first.
-
-        Raises:
-            UnknownFloorPlanError: the plan or revision was deleted.
-            DamagedDataError: the stored document is damaged.
-            OverloadedError: too many files are being made, in all or for the client.
-            InvalidFloorPlanError, MissingExtraError: see `make_rendition`.
-            UnmeasuredModelError: localisability of a model without measured errors.
-            DeadlineExceededError, ConverterNotReadyError, StoppingError: see `Converter.read`.
-            StoreUnavailableError: the database is away.
-        """
+        """Return a file of a stored plan, regardless of tenant. Callers check access first."""
         key = (revision_id, kind)
         if (cached := self._cache.get(key)) is not None:
             return cached

@@ -31,13 +31,7 @@ from service.schemas.stored_plans import (
 
 
 def make_rendition(job: RenditionJob) -> Rendition:
-    """Make a file from a stored plan.
-
-    Raises:
-        DamagedDataError: the stored document is damaged.
-        InvalidFloorPlanError: the plan lacks something that an export requires.
-        MissingExtraError: a library of an export is not installed.
-    """
+    """Make a file from a stored plan."""
     stored = job.stored
     plan = stored.document.plan()
     if plan is None:

@@ -33,13 +33,8 @@ def compose_outcome(
 ) -> AlbumOutcome:
     """Return a solution as JSON.
 
-    Args:
-        album: the solution.
-        ground: the plans that were searched.
-        before: pins of the solution before as JSON, by photograph.
-        dropped: why corrections were left out, by photograph.
-        default_height_m: camera height (m) of poses on Earth, if the album tells none.
-        is_same_place: the pins before are of this revision of the plan or venue.
+    By photograph there are the pins `before` as JSON, of this revision of the plan or venue if `is_same_place`, and why
+    corrections were left out (`dropped`). The default height is for poses on Earth, if the album tells none.
     """
     height_m = album.camera_height_m if album.camera_height_m is not None else default_height_m
     places = _Places(ground, height_m, is_same_place=is_same_place)

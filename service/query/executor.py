@@ -112,13 +112,7 @@ class StepRunner:
         self._telemetry = telemetry
 
     def next(self, steps: SearchSteps[T], result: object, timeout_s: Callable[[], float]) -> RefinementJob | T | None:
-        """Continue a search.
-
-        Args:
-            steps: the search.
-            result: of its last job; None at first, and if there is none.
-            timeout_s: returns the time (s) left for pose refinement.
-        """
+        """Continue a search after the result of its last job; `timeout_s` returns the time left for refinement."""
         step = next_step(steps, result)
         # Without workers LPO is off.
         while isinstance(step, RefinementJob) and refined_by_walls(step) and self._optimiser.state.workers:

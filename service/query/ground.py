@@ -28,14 +28,7 @@ _TIED = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedCandidate(Placed):
-    """A candidate in the frame of its stored plan.
-
-    Attributes:
-        plan_id: id of the plan.
-        revision_id: id of the plan's revision.
-        anchor: place of the plan on Earth; None where unknown.
-        level: level of the plan in its venue; None outside of venues.
-    """
+    """A candidate in the frame of its stored plan."""
 
     plan_id: str
     revision_id: str
@@ -48,11 +41,7 @@ class Ground(answers.Ground):
     """Places that a photograph is compared with.
 
     Attributes:
-        records: the stored plans.
-        anchors: their places on Earth.
-        levels: their levels; None outside of venues.
         hints: hints in the frame of `plan`.
-        warnings: warnings about plans that are not searched.
         merged: the plans side by side; None for one plan outside of venues.
         venue_plans: the plans of the venue; None for one plan outside of venues.
         venue_hints: hints of the request about the venue; None outside of venues.

@@ -65,25 +65,14 @@ class Grounds:
         *,
         max_poses: int | None = None,
     ) -> Site:
-        """Return the site of a query.
-
-        Args:
-            where: the plan or venue.
-            form: the stated camera height.
-            hinted: the stated hints; None for none.
-            max_poses: limit of the grid poses of a plan of a venue; None for no limit.
-        """
+        """Return the site of a query; `max_poses` limits the grid poses of a plan of a venue."""
         if isinstance(where, PlanRecord):
             return PlanSite(self, where, form, hinted)
         hints = VenueHints(anchor=where.anchor) if hinted is None else VenueHints.from_form(hinted, where.anchor)
         return VenueSite(self, where, form, hints, max_poses)
 
     async def check(self, where: PlanRecord | VenueRecord, form: HeightFields) -> None:
-        """Check what a request states about a plan or a venue.
-
-        Raises:
-            InvalidHintError: the hints do not match the plan or venue.
-        """
+        """Check what a request states about a plan or a venue."""
         if isinstance(where, PlanRecord):
             stated_height(form, where)
             if isinstance(form, HintFields | SessionDocument):
@@ -100,14 +89,7 @@ class Grounds:
         return await self._plans.members(venue.tenant, venue.id)
 
     async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
-        """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline.
-
-        Raises:
-            PlanFailedError: the plan's pose grid could not be computed.
-            PlanNotReadyError: the pose grid was not ready by the deadline.
-            StoreUnavailableError: the pose grid is not in memory, and the database cannot be reached.
-            OverloadedError: too many pose grids are computed on demand.
-        """
+        """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline."""
         with context.clock.stage("grid"):
             height_m = grid_height_m(record, height.height_m, latents_alone=self._latents_alone)
             key = self._grids.key(record.revision_id, height_m)
@@ -135,7 +117,6 @@ class PlanSite:
 
     Attributes:
         north: azimuth of true north (radians) in the plan; None where unknown.
-        height: the stated camera height.
     """
 
     def __init__(
@@ -162,9 +143,7 @@ class VenueSite:
     """Plans of a venue that a query is about.
 
     Attributes:
-        id: id of the venue.
         north: azimuth of true north (radians) in the venue's frame; None where unknown.
-        ready: the plans that are ready, after `wait`.
     """
 
     def __init__(

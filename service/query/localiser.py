@@ -29,11 +29,7 @@ AnswerT = TypeVar("AnswerT")
 
 
 class Localiser(Protocol):
-    """Localisation of photographs in stored plans and venues.
-
-    Attributes:
-        model: name, version and digest of the model.
-    """
+    """Localisation of photographs in stored plans and venues."""
 
     model: ModelAnswer
 
@@ -42,11 +38,7 @@ class Localiser(Protocol):
         ...
 
     async def check(self, where: Where, form: HeightFields) -> None:
-        """Check what a request states about a plan or a venue.
-
-        Raises:
-            InvalidHintError: the hints do not match the plan or venue.
-        """
+        """Check what a request states about a plan or a venue."""
         ...
 
 

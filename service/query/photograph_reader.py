@@ -41,11 +41,7 @@ class PhotographReader:
     async def decode(
         self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
     ) -> list[Photograph]:
-        """Decode photographs, in their order.
-
-        Raises:
-            InvalidPhotographError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
-        """
+        """Decode photographs, in their order."""
         with context.clock.stage("decode"):
             return await self._decode_all(contents, stated, context)
 
@@ -112,12 +108,7 @@ class PhotographReader:
         heights: Sequence[CameraHeight],
         context: QueryContext,
     ) -> list[Query]:
-        """Encode photographs with their known headings one at a time, so that queries of others come in between.
-
-        Raises:
-            InvalidPhotographError: a photograph is no sphere, and the model has no encoder of views.
-            DeadlineExceededError: the deadline passed.
-        """
+        """Encode photographs with their known headings one at a time, so that queries of others come in between."""
         with context.clock.stage("encode"):
             return [
                 await self._executor.compute(context, partial(self._encode, spot, heading, height))

@@ -43,9 +43,7 @@ class PhotographQuery(AnyQuery[LocaliseAnswer]):
     """Query about one photograph.
 
     Attributes:
-        form: the validated form fields.
         content: the uploaded picture file, or what was read of its features.
-        context: client, deadline and clock.
     """
 
     form: LocaliseForm
@@ -55,16 +53,7 @@ class PhotographQuery(AnyQuery[LocaliseAnswer]):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PictureQuery(AnyQuery[tuple[LocaliseAnswer, bytes]]):
-    """Query about one photograph in a plan, whose answer is also drawn, as a PNG or SVG file.
-
-    Attributes:
-        form: the validated form fields.
-        content: the uploaded picture file, or what was read of its features.
-        context: client, deadline and clock.
-        picture: plan, photograph or both.
-        as_png: PNG; else SVG.
-        rooms: the plan's rooms as drawn by `lalaloc_core.draw.plan.draw_rooms`.
-    """
+    """Query about one photograph in a plan, whose answer is also drawn, as a PNG or SVG file."""
 
     form: LocaliseForm
     content: Content
@@ -79,11 +68,8 @@ class SequenceQuery(AnyQuery[SequenceAnswer]):
     """Query about several photographs of one visit.
 
     Attributes:
-        form: the validated form fields.
         contents: the uploaded picture files, or what was read of their features, in the order in which they were taken;
             none if there is a film.
-        context: client, deadline and clock.
-        film: the uploaded film of a turn.
     """
 
     form: SequenceForm
@@ -105,12 +91,8 @@ class TrackQuery(AnyQuery[TrackOutcome]):
     """Photograph of a session.
 
     Attributes:
-        session_id: id of the session.
         document: the request that began the session.
         state: state after the photographs before; None for the first.
-        form: the validated form fields.
-        content: the uploaded picture file, or what was read of its features.
-        context: client, deadline and clock.
     """
 
     session_id: str
@@ -135,9 +117,7 @@ class AlbumPhotographQuery(AnyQuery[AlbumEntry]):
 
     Attributes:
         document: the request that created the album.
-        content: the uploaded picture file, or what was read of its features.
         sha256: digest of the uploaded file.
-        context: client, deadline and clock.
     """
 
     document: AlbumDocument
@@ -167,12 +147,7 @@ class AlbumQuery(AnyQuery[AlbumOutcome]):
     """Album that is solved.
 
     Attributes:
-        album_id: id of the album.
-        document: the request that created it.
-        photographs: its photographs, with corrections and earlier pins.
         is_same_place: the earlier pins are of this revision of the plan or venue.
-        context: client, deadline of the preparation, and clock.
-        progress: progress of the solve.
     """
 
     album_id: str

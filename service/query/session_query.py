@@ -134,10 +134,7 @@ class SessionSearch:
 def _favour_of(
     site: VenueSite, by_plan: Mapping[str, float], session_id: str
 ) -> Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]]:
-    """Return a function of the log factors by which a session prefers plans.
-
-    These are the plans of its belief (`by_plan`, by revision), and those one level from them.
-    """
+    """Return a function of the log factors by which a session prefers plans."""
     if not by_plan.keys() <= {row.revision_id for row in site.ready}:
         raise SessionOutdatedError(session_id, f"a floor plan of venue '{site.id}' was replaced")
     levels = np.unique([row.level for row in site.ready])

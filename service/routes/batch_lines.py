@@ -46,9 +46,7 @@ class BatchLines(Generic[T]):
     """Answers to the photographs of one request, as lines in their order.
 
     Args:
-        call: the request.
         answer: answers the photograph of a number; called again while the tenant's other queries have all slots.
-        line: makes the line of a photograph, see `LineOf`.
     """
 
     def __init__(

@@ -93,8 +93,6 @@ class ApiCall:
     """Request with the running service and its caller.
 
     Attributes:
-        request: the request.
-        runtime: the running service.
         tenant: tenant whose data the caller can see.
         client: tenant or client address that the request's share of slots counts for; see
             `service.capacity.fair_share`.
@@ -120,11 +118,7 @@ class ApiCall:
         add_log_fields(self.request, **fields)
 
     def idempotent(self, media: str = JSON) -> IdempotentRequest:
-        """Return the request with its idempotency key, if it has one.
-
-        Args:
-            media: media type of the answer.
-        """
+        """Return the request with its idempotency key, if it has one."""
         if media != JSON and HEADER in self.request.headers:
             raise InvalidRequestError([(HEADER, "works for answers in application/json only")])
         return IdempotentRequest(self.store.idempotency_keys, self.request, self.tenant)
@@ -147,12 +141,7 @@ class ApiCall:
         return reading(self.request.scope)
 
     def plan(self, floorplan_id: str) -> PlanSummary:
-        """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted. Blocks.
-
-        Raises:
-            UnknownFloorPlanError: no such plan.
-            StoreUnavailableError: the database is away.
-        """
+        """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted. Blocks."""
         summary = self.store.plans.summary(self.tenant, floorplan_id) if is_id(floorplan_id) else None
         if summary is None:
             raise UnknownFloorPlanError(floorplan_id)
@@ -160,11 +149,7 @@ class ApiCall:
         return summary
 
     def plan_at_revision(self, floorplan_id: str, revision_id: str | None) -> tuple[PlanSummary, bool]:
-        """Return a stored plan at one of its revisions, and True for an old one; None names the current one. Blocks.
-
-        Raises:
-            UnknownRevisionError: no such revision is kept.
-        """
+        """Return a stored plan at one of its revisions, and True for an old one; None names the current one. Blocks."""
         current = self.plan(floorplan_id)
         if revision_id is None or revision_id == current.revision_id:
             return current, False

@@ -81,8 +81,6 @@ class PlanUpload:
     """Uploaded file with its options.
 
     Attributes:
-        file: the file.
-        options: options of its import.
         parts: the parts that identify the request for idempotency.
         is_native: see `PlanReader`.
     """

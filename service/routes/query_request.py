@@ -47,14 +47,7 @@ Answer = TypeVar("Answer", LocaliseAnswer, SequenceAnswer)
 def body_schema(
     form: type[BaseModel], photo: Mapping[str, Any], *, film: Mapping[str, Any] | None = None, idempotent: bool = True
 ) -> dict[str, Any]:
-    """Return the description of a query's body, and of its idempotency key.
-
-    Args:
-        form: fields of the body.
-        photo: schema of its photographs.
-        film: schema of a film that can be sent instead.
-        idempotent: tells whether the route takes an idempotency key.
-    """
+    """Return the description of a query's body, and of its idempotency key."""
     schema = form.model_json_schema(ref_template="#/components/schemas/{model}")
     # `http.api_description` adds these schemas.
     schema.pop("$defs", None)
@@ -100,14 +93,6 @@ async def read_files(
     film: bool = False,
 ) -> tuple[AnyForm, Parts, QueryContext]:
     """Read a form with photographs and start the clock of its deadline.
-
-    Args:
-        call: the request.
-        form_type: model of the form.
-        limit: name of the setting that limits the body.
-        files: see `read_parts`.
-        repeated: see `read_parts`.
-        film: a film can be sent instead of photographs.
 
     Returns:
         the form, all parts, and the context of the query.
@@ -166,13 +151,7 @@ def check_anchor(place: PlanRecord | VenueRecord, media: str) -> None:
 
 
 def answer_as(answer: Answer, media: str, on_earth: Mapping[str, Callable[[Answer], Any]]) -> Response:
-    """Return an answer as JSON, or in a form on Earth.
-
-    Args:
-        answer: the answer.
-        media: media type of the form.
-        on_earth: by media type, functions that return an answer in latitude and longitude, None without an anchor.
-    """
+    """Return an answer as JSON, or in a form on Earth: the functions return None without an anchor."""
     if media == JSON:
         return Response(answer.model_dump_json(), headers=VARY, media_type=JSON)
     document = on_earth[media](answer)

@@ -53,8 +53,6 @@ class NextStep:
     Attributes:
         kind: `turn` (another photograph from the same spot), `door` (another photograph from behind a door), `heading`
             (state it) or `rooms` (choose one).
-        bits: expected information about the place, in bits.
-        confidence: expected confidence after the step.
         turn: of `turn` and `door`: direction (radians) relative to the photograph's centre, clockwise.
         distance_m: of `door`: distance to it.
         rooms: of `rooms`: numbers of the probable rooms, the most probable first.
@@ -78,10 +76,6 @@ class Known:
         answer: share of the posterior within 1 m of the answer.
         arcs: azimuths (radians, first and last) that were seen, relative to the photograph's centre.
         field: horizontal field of view (radians) of another photograph; 2π for spheres.
-        height_m: the camera height.
-        is_view: whether the encoder of views reads the photographs.
-        heading: whether the heading was known.
-        rooms: whether the request names rooms.
     """
 
     support: Support

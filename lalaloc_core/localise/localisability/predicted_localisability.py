@@ -68,12 +68,9 @@ class Localisability:
     """Probabilities that photographs are found within 1 m, or within the spacing if that is more.
 
     Attributes:
-        spacing_m: step of the pose grid.
-        places: the places.
         found: (p,) probability at each place by condition, see `CONDITIONS`.
         rooms: (r,) means of the rooms' places by condition; NaN for rooms without a place.
         plan: mean over the plan's area by condition.
-        confused: pairs of rooms that are confused, the most confused first.
         gains: increase of the plan's mean of `HARDEST` by remedy: "heading", "three_photographs", "sphere",
             "room_hint", and "doors", which is that of the openings that the plan shows; None if it shows none.
     """
@@ -91,7 +88,6 @@ class Draw(NamedTuple):
     """Outcome of a drawn photograph.
 
     Attributes:
-        found: probability that the answer is right.
         found_in_room: the same with a hint of the room.
         mistaken: probability of an answer in each of the other rooms.
     """
@@ -106,11 +102,7 @@ _Outcomes = dict[Condition, list[list[Draw]]]
 
 
 def errors_of(manifest: Manifest) -> Errors:
-    """Return the measured errors of a model.
-
-    Raises:
-        InvalidInputError: they were not measured.
-    """
+    """Return the measured errors of a model, or raise InvalidInputError if they were not measured."""
     view = manifest.view
     if manifest.errors is None or view is None or view.errors is None:
         raise InvalidInputError(
@@ -235,11 +227,8 @@ def _directions(
 def _as_built(
     kind: UInt8[np.ndarray, "n w"], opening_trust: Mapping[str, float], rng: np.random.Generator
 ) -> UInt8[np.ndarray, "n w"]:
-    """Return opening codes by place and azimuth as they may be where a plan draws a share of the openings.
-
-    With a trust of t, a drawn opening does not exist with a probability of 1 - t, and as many exist that are not drawn,
-    as wide as those that are, in other directions.
-    """
+    """Return opening codes by place and azimuth as they may be where a plan draws a share of the openings."""
+    # With a trust of t, a drawn opening does not exist with a probability of 1 - t, and as many undrawn ones do.
     built = kind.copy()
     for code, name in enumerate(OPENING_CLASSES):
         trust = opening_trust.get(name, 0.0)

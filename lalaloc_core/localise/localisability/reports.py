@@ -129,12 +129,8 @@ class AdvisedStep:
     Attributes:
         kind: "turn": take another photograph from the same spot; "door": take one from behind a door; "heading": state
             the heading; "rooms": choose one of `rooms` as a hint.
-        text: the step in words.
         turn_deg: direction of "turn" and "door" relative to the photograph's centre, clockwise.
-        distance_m: distance to the door.
         rooms: ids of the probable rooms, the most probable first.
-        expected_bits: expected increase of the information.
-        expected_confidence: expected confidence after the step.
     """
 
     kind: StepKind
@@ -159,15 +155,8 @@ def step_after(
 ) -> AdvisedStep | None:
     """Return the next step after an answer; None without a confidence, or a step.
 
-    Args:
-        plan: the plan that was searched.
-        manifest: of the model.
-        found: result of the search.
-        confidence: its confidence; None for a model without.
-        arcs: azimuths (radians) that were seen, relative to the photograph's centre.
-        field: horizontal field of view (radians) of the photograph.
-        step_m: step of the pose grid.
-        rooms_known: whether rooms need not be asked for.
+    `arcs` are azimuths (radians) that were seen, relative to the photograph's centre; `field` is its horizontal field
+    of view (radians).
     """
     if confidence is None:
         return None
