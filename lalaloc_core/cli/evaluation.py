@@ -54,7 +54,7 @@ class Evaluate:
 
     bundle: Path = field(default_factory=default_bundle)
     method: Literal["lalaloc", "oracle", "icp", "explicit", "decode"] = "lalaloc"
-    kind: Literal["layout", "photograph"] = "sphere"
+    kind: Literal["layout", "photograph"] = "photograph"
     data: Path | None = None
     dataset: Literal["structured3d", "zind", "own", "annotated"] | None = None
     generator: Literal["synth", "heldout"] = "synth"

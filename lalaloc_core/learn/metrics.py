@@ -62,7 +62,6 @@ class AzimuthMeasures:
     """Measures of one photograph, against the annotated outline nearest to the prediction.
 
     Attributes:
-        outline: number of that outline.
         log_error: (w,) predicted minus true log distance of the wall; infinite where the prediction is NaN.
         log_scale: (w,) predicted log scale of `log_error`, of a Laplace distribution.
         confusion: azimuths by true (row) and predicted class; None if no classes were predicted.
@@ -129,11 +128,8 @@ class AzimuthSummary:
     """Measures over several photographs.
 
     Attributes:
-        n: number of photographs.
         median_error: median over the photographs of their median |Δ log d|.
-        shape_error: median over the photographs.
         error_90: median over the photographs of their 90 % quantile of |Δ log d|.
-        scale_ratio: median over the photographs.
         within: share of all azimuths within each predicted quantile.
         classes: over all azimuths; None if no classes were predicted.
     """

@@ -57,8 +57,6 @@ class ImageFeatures:
 
     Attributes:
         ring: (b, c, s) features to compare with the layout encoder's.
-        walls: distance of the wall at each azimuth.
-        structure: openings, ceiling height and room type, if the encoder predicts them.
     """
 
     ring: Tensor

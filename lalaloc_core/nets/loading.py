@@ -44,6 +44,5 @@ def load_decoder(bundle: Bundle) -> LayoutDecoder:
 
 
 def _load_weights(module: nn.Module, weights: bytes) -> None:
-    """Load weights as single precision; half precision is only a storage format."""
     state = safetensors.torch.load(weights)
     module.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()}, strict=True)

@@ -29,9 +29,6 @@ class PaperConfig:
         layout_depth, image_depth: layers of the two ResNets.
         layout_predictor: layers from pooled features to the latent: one fully connected, or two with a ReLU between.
         width: channels of the first stage; each later stage doubles them. ResNets have 64.
-        latent_size: features of a latent.
-        layout_height, profile_columns: size of the layout depth, pixels.
-        image_height, image_width: size of the sphere, pixels.
     """
 
     layout_depth: Literal[18, 50] = 18

@@ -35,10 +35,7 @@ class TrunkEncoderConfig:
     """Sizes of the image encoder; `RingConfig` holds sectors, channels, profile columns and latent size.
 
     Attributes:
-        image_height, image_width: pixels; both must be multiples of the largest stride.
-        trunk: sizes of the trunk.
         squeezed: features per sector from each feature map of the trunk.
-        mixer_width, mixer_blocks, mixer_heads: sizes of the attention around the horizon.
         modes: distributions whose mixture predicts the wall at an azimuth; with two, a passage and the wall behind it
             are no compromise.
     """
@@ -53,11 +50,7 @@ class TrunkEncoderConfig:
     modes: int = 1
 
     def __post_init__(self) -> None:
-        """Check the sizes.
-
-        Raises:
-            ConfigError: a size is invalid.
-        """
+        """Check the sizes."""
         for name in ("image_height", "image_width"):
             if getattr(self, name) % TAP_STRIDES[-1] or getattr(self, name) < TAP_STRIDES[-1]:
                 raise ConfigError(f"trunk.{name} is {getattr(self, name)}; it must be a multiple of {TAP_STRIDES[-1]}")
@@ -71,7 +64,6 @@ class HorizonEncoder(nn.Module):
     """Base of the image encoders on a pretrained trunk: pixels to features of the sectors around the horizon.
 
     Args:
-        config: sizes.
         sectors: sectors that the picture covers.
         columns_per_sector: azimuth columns of a sector.
         extra_inputs: further features of each sector, given to `sector_features`.

@@ -52,11 +52,7 @@ class TrunkConfig:
     frozen_stages: int = 3
 
     def __post_init__(self) -> None:
-        """Check the sizes.
-
-        Raises:
-            ConfigError: a size is invalid.
-        """
+        """Check the sizes."""
         for name in ("widths", "repeats"):
             if len(getattr(self, name)) != len(_KERNELS):
                 raise ConfigError(f"trunk.{name} has {len(getattr(self, name))} values; it must have {len(_KERNELS)}")
@@ -85,7 +81,6 @@ class _FrozenNorm(nn.BatchNorm2d):
 
 
 def _padded_around(x: Tensor, before: int, after: int) -> Tensor:
-    """Pad the last axis, azimuth, circularly."""
     return torch.cat([x[..., x.shape[-1] - before :], x, x[..., :after]], dim=-1)
 
 
@@ -188,7 +183,6 @@ class Trunk(nn.Module):
     """Trunk: normalised pictures to the last feature maps of strides 4, 8, 16 and 32.
 
     Args:
-        config: sizes.
         circular: the pictures show the full circle, so that their left and right borders meet.
     """
 

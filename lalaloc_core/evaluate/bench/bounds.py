@@ -82,7 +82,6 @@ def bench_bounds(setting: Setting) -> dict[str, Any]:
 
 
 def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str, Any]:
-    """Return the shares of views of annotated photographs, of all and by photograph."""
     photographs = AnnotatedPhotographs(folder)
     scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
     found = {
@@ -95,7 +94,6 @@ def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str
 
 
 def _outcomes(model: LocalModel, every: Iterable[Asked]) -> dict[str, Counter[str]]:
-    """Return by row how often each outcome occurs."""
     rng = np.random.default_rng(0)
     outcomes: dict[str, Counter[str]] = {name: Counter() for name in _ROWS}
     for asked in every:
@@ -132,11 +130,8 @@ def _asked(model: LocalModel, scene: Scene, count: int | None) -> Iterator[Asked
 def with_truth(asked: Asked, *, noise: float | None, openings: bool, rng: np.random.Generator) -> Query:
     """Return the query with the layout at its true pose in place of the encoder's predictions.
 
-    Args:
-        asked: a query of unknown heading.
-        noise: standard deviation of independent errors of the walls' log distances; None leaves the predicted walls.
-        openings: replace openings and ceiling.
-        rng: draws the errors.
+    `noise` is the standard deviation of independent errors of the walls' log distances; None leaves the predicted
+    walls. `openings` replaces openings and ceiling.
     """
     plan, pose, query = asked
     assert query.profile is not None

@@ -105,7 +105,6 @@ class _Visit:
         return next_steps(self.shot.home.plan, self.model.bundle.manifest, known, step_m=self.grid.step_m)
 
     def row(self, step: NextStep, *, best: bool) -> _Row:
-        """Carry a step out."""
         before = self._confidence(self.found)
         assert before is not None
         confidence, error_m = getattr(self, f"_after_{step.kind}")(step)

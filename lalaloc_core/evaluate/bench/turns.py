@@ -221,7 +221,6 @@ def _filmed(model: LocalModel, photograph: AnnotatedPhotograph) -> tuple[Film, f
 
 
 def _prediction(scene: Scene, found: Localisation, turn: float, confidence: float | None) -> Prediction:
-    """Return a result as a prediction of the sphere's pose, from which the photograph is turned."""
     (camera,) = scene.cameras
     rooms = [candidate.room_index for candidate in found.candidates]
     pose = found_pose(found.query, found.candidates[0])

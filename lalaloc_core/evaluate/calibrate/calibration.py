@@ -61,9 +61,6 @@ class CalibrationConfig:
     """Settings of a calibration.
 
     Attributes:
-        homes: number of generated homes, 4 queries each.
-        seed: of the homes.
-        textures: folder of material pictures; None makes all materials procedural.
         views: calibrate the encoder of views instead of that of spheres.
         keep_evidence: keep the bundle's matching weights and fit the confidence; with a given `tail` or
             `openings_weight`, keep the others, and fit the doubt of headings.
@@ -135,7 +132,6 @@ class _Queries:
         }
 
     def localise(self, name: str, known: bool) -> list[Prediction]:
-        """Return the predictions for photographs, with a known or with a searched heading."""
         info = self._run_info(name, known)
         if self._config.out is not None:
             return run_evaluation(RunFolder(self._config.out / f"{name}-{'known' if known else 'searched'}"), info)
@@ -150,7 +146,6 @@ class _Queries:
         return Answers(own=own, disturbed=[*disturbed, *unopened], mismatched=[*mismatched, *foreign])
 
     def appearance(self, encoders: PhotographEncoder) -> tuple[tuple[float, ...], ...]:
-        """Fit `MatchingWeights.appearance` on the own and the disturbed photographs."""
         datasets = [build_dataset(self._run_info(name, True)) for name in ("own", "disturbed")]
         return fit_appearance(encoders, (data.load(name) for data in datasets for name in data.scenes("validation")))
 
@@ -192,7 +187,6 @@ def store_confidence(
 
 
 def _with_calibration(manifest: Manifest, views: bool, **fitted: Any) -> Manifest:
-    """Return a manifest with fitted values for spheres or for views."""
     if not views:
         return replace(manifest, **fitted)
     assert manifest.view is not None

@@ -159,7 +159,6 @@ def _best(tried: Mapping[float, Mapping[str, float]], *, spheres: bool) -> float
 
 
 def _compared(spot: Spot, query: Query) -> tuple[np.ndarray, ...]:
-    """Return the predictions of a query with a known heading, and the plan's layout there."""
     assert query.profile is not None
     assert query.openings is not None
     layouts = layouts_at(spot.plan, spot.place, np.array([query.frame_heading]), query.profile.log_m.shape[1])

@@ -127,7 +127,6 @@ def _choice(prediction: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _is_right(pose: Pose, prediction: Prediction) -> bool:
-    """Return whether a pose is within 1 m of the truth and has its heading."""
     truth = prediction.truth
     difference = wrap_angle(heading_from_degrees(pose.heading_deg - truth.heading_deg))
     near = np.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < RIGHT_WITHIN_M
@@ -156,7 +155,6 @@ def with_heading_doubt(weights: MatchingWeights, known: Answers, searched: Answe
 
 
 def _own(answers: Answers) -> list[tuple[Prediction, str]]:
-    """Return the predictions for photographs of the plan's home, with the name of their list."""
     return [(answer, part) for part in ("own", "disturbed") for answer in getattr(answers, part)]
 
 
@@ -204,7 +202,6 @@ def _confidence(model: LogisticModel, stage: str, prediction: Prediction) -> tup
 
 
 def _is_near(stage: str, prediction: Prediction) -> bool:
-    """Return whether the pose after a stage is within 1 m of the truth."""
     pose, truth = prediction.stages[stage], prediction.truth
     return bool(np.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < RIGHT_WITHIN_M)
 
@@ -215,7 +212,6 @@ def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
 
 
 def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
-    """Fit the probability that a photograph belongs to its plan; times the posterior it is the confidence."""
     own = [answer for answer in (*answers.own, *answers.disturbed) if stage in answer.signals]
     mismatched = [answer for answer in answers.mismatched if stage in answer.signals]
     signals = [answer.signals[stage] for answer in own + mismatched]

@@ -64,13 +64,7 @@ _CONFIG = LocaliseConfig(vdr_candidates=0, every_stage=True)
 
 @dataclass(frozen=True, kw_only=True)
 class TurnSettings:
-    """Settings of the calibration of turns.
-
-    Attributes:
-        homes: number of generated homes, 2 spots in each.
-        seed: of the homes.
-        textures: folder of material pictures; None makes all materials procedural.
-    """
+    """Settings of the calibration of turns."""
 
     homes: int = 100
     seed: int = 0
@@ -185,7 +179,6 @@ class _Turn:
     """A turn whose photographs were read."""
 
     def __init__(self, model: LocalModel, taken: _Taken) -> None:
-        """Read the photographs."""
         self._model, self._taken = model, taken
         manifest = model.bundle.manifest
         self._photographs = [

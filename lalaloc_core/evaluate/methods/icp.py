@@ -100,7 +100,6 @@ class Icp:
         return Answer(stages={"icp": found}, timings_ms=clock.timings_ms)
 
     def _scan(self, question: Question) -> Float[np.ndarray, "n 2"]:
-        """Return the scan around the camera, turned into the plan frame by the known heading."""
         if question.kind == "layout":
             return scan_of(question.true_profile(self.config.columns)[None], 0.0)
         depth = question.require_photograph().depth_m()

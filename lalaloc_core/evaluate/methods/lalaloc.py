@@ -118,7 +118,6 @@ class LaLaLoc:
         )
 
     def _query(self, question: Question, clock: StageClock) -> Query:
-        """Encode the photograph; a known heading has a uniformly distributed error."""
         photograph, camera = question.photograph, question.camera
         if not isinstance(photograph, ViewPhotograph):
             image = read_image(self.encoders, question)
@@ -150,11 +149,7 @@ def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
 
 
 def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the photograph of the query at the encoder's size; None for layout queries.
-
-    Raises:
-        DatasetError: the photograph cannot be read.
-    """
+    """Return the photograph of the query at the encoder's size; None for layout queries."""
     if question.kind == "layout":
         return None
     return question.require_photograph().image(encoders.manifest.image_height, encoders.manifest.image_width)

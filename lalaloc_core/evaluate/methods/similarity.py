@@ -77,7 +77,6 @@ class _Grid(ABC):
         """Return the distance of the query to every pose."""
 
     def nearest(self, query: Layout) -> int:
-        """Return the index of the pose nearest to the query."""
         return int(self.distances(query).argmin())
 
     def _check_columns(self, query: Layout) -> None:
@@ -151,7 +150,6 @@ class _Comparison:
         self._differs = (depth_m != query_depth_m).reshape(len(depth_m), -1)
 
     def distance(self, index: int) -> float:
-        """Return the Chamfer distance of one pose."""
         return float(self.to_query(np.array([index]), slice(None))[0]) + self.from_query(index)
 
     def to_query(self, poses: Int[np.ndarray, "k"], points: slice) -> Float[np.ndarray, "k"]:

@@ -193,7 +193,6 @@ def _times(runs: Sequence[Run]) -> Chart:
 
 
 def _stacked_bars(rows: dict[str, dict[str, float]], colours: dict[str, str]) -> Figure:
-    """Draw one horizontal bar per row, the first on top, with the parts that `colours` lists."""
     height = 0.7 + _BAR_INCHES * len(rows) + _legend_inches(list(colours))
     figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
     axes = figure.subplots()
@@ -227,7 +226,6 @@ def _legend(figure: Figure, marks: Sequence[Any], names: Sequence[str]) -> None:
 
 
 def _legend_columns(names: Sequence[str]) -> int:
-    """Return the number of columns for which the longest name leaves room."""
     return max(1, min(4, len(names), _LEGEND_CHARACTERS // (max(map(len, names)) + 6)))
 
 

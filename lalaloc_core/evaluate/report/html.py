@@ -56,7 +56,6 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart]) -> str:
 
 
 def _facts(run: Run) -> dict[str, str]:
-    """Return the description of a run as text."""
     info = run.info
     facts = {
         "Method": info.method,

@@ -42,7 +42,6 @@ class WorstQuery:
 
     Attributes:
         first_error_m: position error after the first stage.
-        facts: known difficulties of the photograph.
         symmetric: whether the pose fits the mirrored room; see `failures.is_symmetric`.
         symmetric_by_chance: probability of that for a random wrong position in the room.
         true_cost, found_cost: matching cost of the true and of the found pose; None if the model predicts no wall
@@ -154,7 +153,6 @@ class _ReopenedRun:
             self._encoders = encoders if encoders.predicts_profile else None
 
     def analyse(self, prediction: Prediction) -> WorstQuery:
-        """Return the analysis of a query."""
         scene, camera = self._find_camera(prediction)
         found = prediction.final_pose
         fit: dict[str, float | None] = {}

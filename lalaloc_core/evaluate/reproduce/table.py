@@ -82,7 +82,6 @@ class Row:
     """Row of a table.
 
     Attributes:
-        group: group of rows, such as the kind of query.
         stage: stage whose poses are scored; None for the final pose.
         paper: the paper's figures by column, shares from 0 to 1; empty for rows of our own.
     """
@@ -99,8 +98,6 @@ class Table:
     """Table of the paper.
 
     Attributes:
-        name: name for `lalaloc lab reproduce --table`.
-        source: label of the paper's table or figure.
         form: a "figure" is also drawn; "times" runs one query at a time.
     """
 
@@ -161,11 +158,7 @@ class TableResult:
 
     @classmethod
     def read(cls, path: Path) -> TableResult:
-        """Read a table from its file.
-
-        Raises:
-            RunError: the file is missing or not a table.
-        """
+        """Read a table from its file."""
         try:
             return build_config(cls, json.loads(path.read_text(encoding="utf-8")), path=path.name)
         except (OSError, ValueError, ConfigError) as error:
@@ -218,7 +211,6 @@ def _number(column: str, value: float | None) -> str:
 
 
 def _bound(column: str, value: float | None) -> str:
-    """Format an end of an interval."""
     if value is not None and column in SHARES:
         return f"{100.0 * value:.0f}"
     return _number(column, value)

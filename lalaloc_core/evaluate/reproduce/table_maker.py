@@ -49,9 +49,6 @@ class TableMaker:
     """Maker of tables.
 
     Attributes:
-        out: folder of models, runs and tables.
-        budget: size of networks and schedule of the trained variants.
-        shipped: bundle of the rows of the shipped model.
         limit: queries per row; None for the budget's default.
     """
 

@@ -81,7 +81,6 @@ def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = No
 
 
 def _resume(folder: RunFolder, info: RunInfo) -> tuple[list[Prediction], list[str]]:
-    """Return the predictions of an earlier run for whole scenes, and the skipped scenes and cameras."""
     if not folder.exists():
         folder.write_info(info)
         folder.replace([])
@@ -174,7 +173,6 @@ class _SceneEvaluator:
         self._layouts: dict[float, ChamferGrid] = {}
 
     def predict(self, camera: Camera, method: Method) -> Prediction:
-        """Localise one query."""
         info, scene = self._info, self._scene
         photograph = None
         if info.kind == "photograph":

@@ -31,7 +31,6 @@ class GalleryAnswer:
     """Result of one photograph in one gallery, for the outline with the better result.
 
     Attributes:
-        located: whether room and position are right.
         turned: whether it is located with a heading error above 10°.
         rank: rank of the best candidate in the right room, from 1; None without one.
         error_m: position error; infinite without an answer.
@@ -60,9 +59,7 @@ class GalleryScores:
     """Shares over all galleries of all photographs.
 
     Attributes:
-        located: share with the right room and position.
         turned: share with the right position and a wrong heading.
-        among_3, among_5: share with the right room among the first three, five candidates.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
         by_photograph: share of each photograph's galleries in which it is located.
     """

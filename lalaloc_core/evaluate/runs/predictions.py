@@ -49,7 +49,6 @@ class Prediction:
         heading_confidence: predicted probability of a heading error below 5°.
         room_confidence: predicted probability that the room is right; None outside albums.
         clicks: corrections that its album needs until all rooms are right; None outside albums.
-        facts: known difficulties of the photograph, in alphabetical order; see `learn.data.dataset.Described`.
     """
 
     scene: str
@@ -87,7 +86,6 @@ class RunInfo:
     """Description of a run, sufficient to repeat it.
 
     Attributes:
-        settings: settings of the method, as plain data.
         data: folder of the data set; None for generated homes.
         data_format: one of `DATASET_FORMATS`; None to detect it.
         generated: arguments of the generator if `data` is None.

@@ -224,7 +224,6 @@ class _Bootstrap:
         return replace(found, low=min(found.low, float(wilson.low)), high=max(found.high, float(wilson.high)))
 
     def median(self, values: Float[np.ndarray, "n"]) -> Estimate:
-        """Return the median; values can be infinite."""
         order = np.argsort(values, kind="stable")
         cumulated = np.cumsum(self._weights[:, order], axis=1)
         half = 0.5 * cumulated[:, -1:]
@@ -294,7 +293,6 @@ def _infinite(errors: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def _recall(bootstrap: _Bootstrap, hits: list[bool | None]) -> Estimate | None:
-    """Return the recall; a query without retrieval is a miss. None if no query passed retrieval."""
     if all(hit is None for hit in hits):
         return None
     return bootstrap.share(np.array([bool(hit) for hit in hits]))

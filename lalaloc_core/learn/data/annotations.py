@@ -53,12 +53,9 @@ class AnnotatedPhotograph:
     """Photograph with its annotation; metres, camera at (0, 0), +y along the picture's centre column.
 
     Attributes:
-        name: of the annotation file, without suffix.
         quality: of the photograph; poor ones have no galleries.
         outlines: the room, and an alternative outline if the annotation has one.
         has_flat_ceiling: the ceiling height is annotated; otherwise it is the default.
-        class_spans: the openings by column.
-        notes: remarks of the annotator.
     """
 
     name: str
@@ -148,7 +145,6 @@ class _Reader:
             raise self.error(f"the key '{missing[0]}' is missing")
 
     def ceiling_height_m(self, raw: Any) -> float:
-        """Return the height of the ceiling above the floor, or the default if none is given."""
         if raw is not None and not (is_number(raw) and 0.0 < raw <= _MAX_REACH):
             raise self.error(f"ceiling_above_camera is {raw!r}; it must be null, or above 0 and at most {_MAX_REACH:g}")
         return CAMERA_HEIGHT_M * (1.0 + (_DEFAULT_CEILING if raw is None else float(raw)))
@@ -160,7 +156,6 @@ class _Reader:
         return text
 
     def photograph(self, value: Any) -> tuple[FilePhotograph, int]:
-        """Return the photograph and its width in pixels."""
         path = path_below(self._path.parent, value) if isinstance(value, str) else None
         if path is None:
             raise self.error(f"photograph is {value!r}; it must be a path below the annotation's folder")
@@ -195,7 +190,6 @@ class _Reader:
         return drawn
 
     def openings(self, raw: Any, width: int) -> tuple[ClassSpan, ...]:
-        """Return the kinds of the openings with their columns as shares of the width."""
         if not isinstance(raw, list) or len(raw) > _MAX_OPENINGS:
             raise self.error(f"openings must be a list of at most {_MAX_OPENINGS} entries")
         spans = []

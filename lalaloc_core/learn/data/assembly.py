@@ -128,7 +128,6 @@ def _room_entries(
 
 
 def _vertices(ring: shapely.LinearRing) -> list[list[float]]:
-    """Return the vertices of a closed ring without the repeated one."""
     return shapely.get_coordinates(ring)[:-1].tolist()
 
 
@@ -155,11 +154,7 @@ def pose_fault(
 
 
 def read_json(path: Path, *, scene: str | None = None) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Raises:
-        DatasetError: the file cannot be read, is not JSON, or holds something else.
-    """
+    """Read a JSON file that holds an object."""
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:

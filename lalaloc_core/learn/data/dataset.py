@@ -68,9 +68,7 @@ class Camera:
 
     Attributes:
         name: unique within its scene.
-        position_m: (x, y) in the plan frame.
         heading: azimuth of the photographs' centre column, radians.
-        photographs: by appearance of the room.
     """
 
     name: str
@@ -90,11 +88,7 @@ class Scene:
     cameras: tuple[Camera, ...]
 
     def photograph(self, camera: Camera, appearance: Appearance) -> DatasetPhotograph:
-        """Return a photograph of a camera.
-
-        Raises:
-            DatasetError: the camera has no photograph of this appearance.
-        """
+        """Return a photograph of a camera."""
         found = camera.photographs.get(appearance)
         if found is None:
             known = ", ".join(str(look) for look in sorted(camera.photographs, key=str)) or "none"
@@ -180,22 +174,14 @@ class FilePhotograph:
     size: tuple[int, int] | None = None
 
     def content(self) -> bytes:
-        """Return the file.
-
-        Raises:
-            DatasetError: the file is missing, or not of the data set's size.
-        """
+        """Return the file."""
         content = self._read(self.path)
         if self.size is not None:
             self._check_size(self.path, content)
         return content
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-        """Return RGB pixels at the given size.
-
-        Raises:
-            DatasetError: the file is missing, damaged, not a sphere, or not of the data set's size.
-        """
+        """Return RGB pixels at the given size."""
         content = self.content()
         limits = PhotographLimits() if self.size is None else PhotographLimits(min_height=self.size[0])
         try:

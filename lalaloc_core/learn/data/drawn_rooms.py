@@ -28,8 +28,6 @@ class DrawnOpening:
     """Door, window or passage of a data set, in the plan frame.
 
     Attributes:
-        kind: one of `conventions.OPENING_CLASSES`.
-        line_m: both ends.
         sill_m, head_m: heights above the floor; None if unknown.
         rooms: names of the rooms that it opens into; empty if only its position determines them.
     """
@@ -158,11 +156,7 @@ class DrawnRoom:
 
 
 def plan_of_rooms(name: str, rooms: Sequence[DrawnRoom], camera_height_m: float) -> FloorPlan:
-    """Build a floor plan of rooms at their drawn positions, complete with openings.
-
-    Raises:
-        InvalidFloorPlanError: an outline is not a valid room, or openings overlap.
-    """
+    """Build a floor plan of rooms at their drawn positions, complete with openings."""
     numbered = [(f"room-{number}", room) for number, room in enumerate(rooms)]
     return FloorPlan.from_dict(
         {

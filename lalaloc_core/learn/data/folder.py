@@ -74,7 +74,6 @@ class OwnData:
 
     @cached_property
     def _splits(self) -> dict[str, Split]:
-        """Split of every scene, sorted by name."""
         names = sorted(path.parent.name for path in self.root.glob(f"*/{PLAN_FILE}"))
         path = self.root / SPLITS_FILE
         if not path.exists():

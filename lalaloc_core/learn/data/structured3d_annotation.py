@@ -248,7 +248,6 @@ class _Reader:
 
 
 def _middle_line(footprint: shapely.Geometry) -> Float[np.ndarray, "2 2"]:
-    """Return the centre line of a wall opening: the long axis of its smallest enclosing rectangle."""
     corners = shapely.get_coordinates(shapely.oriented_envelope(footprint))
     if len(corners) < 5:
         # A single face is a line in plan view.

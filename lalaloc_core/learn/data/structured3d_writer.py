@@ -161,7 +161,6 @@ class _Drawing:
         return _Prism(*caps, walls)
 
     def add_hole(self, wall: int, face: int) -> None:
-        """Add the outline of a plane to the wall that contains it."""
         self.planes[wall][2].extend(self.planes[face][2][:4])
 
     def semantic(self, kind: str, planes: list[int]) -> None:
@@ -213,7 +212,6 @@ class _Drawing:
 
 
 def _ends_m(plan: FloorPlan, opening: Opening) -> Float[np.ndarray, "2 2"]:
-    """Return both ends of an opening on its wall."""
     wall = plan.rooms[opening.room].walls_m[opening.wall]
     along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
     return wall[:2] + np.array([[opening.start_m], [opening.end_m]]) * along

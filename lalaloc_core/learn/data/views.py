@@ -42,7 +42,6 @@ class ViewScenes:
     """Data set whose cameras take views instead of spheres, tilted as photographs taken by hand are.
 
     Attributes:
-        spheres: the data set that views are cut from.
         field_deg: horizontal field of view; None draws one for each view.
         per_camera: number of views of each camera, at equal angles; the first looks along the sphere's centre.
         stated: what is known about the views; the rest is estimated.
@@ -126,10 +125,8 @@ class ViewPhotograph(WithoutDepth):
 
     Attributes:
         azimuth: of its centre relative to the sphere's, radians.
-        field_deg: horizontal field of view.
         pitch: elevation of its centre, radians.
         roll: clockwise rotation of the camera about its optical axis, radians.
-        stated: what is known about it.
     """
 
     sphere: CachedSphere = field(repr=False)

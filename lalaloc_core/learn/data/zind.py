@@ -165,7 +165,6 @@ class _FloorReader:
     def _holes(
         self, sphere: _Sphere, layout: Mapping[str, Any], faults: list[str]
     ) -> Iterator[Float[np.ndarray, "n 2"]]:
-        """Yield the rings of inner walls of a layout."""
         rings = layout.get("internal", [])
         if not isinstance(rings, list):
             faults.append(f"{sphere.name}: 'internal' is left out; it is not a list of rings")
@@ -291,11 +290,9 @@ class _Transform:
 
     @property
     def heading(self) -> float:
-        """Azimuth of the sphere's centre column in the plan frame, radians."""
         return heading_from_degrees(self.rotation_deg)
 
     def to_plan_m(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Convert points of the sphere's frame to the plan frame."""
         angle = math.radians(self.rotation_deg)
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         floor = self.scale * points @ turn.T + self.translation

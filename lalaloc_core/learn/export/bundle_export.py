@@ -286,7 +286,6 @@ def _parity(name: str, content: bytes, module: nn.Module, inputs: dict[str, Tens
 
 
 def _freeze(module: nn.Module) -> None:
-    """Put a network into evaluation mode and round its weights in place."""
     module.cpu().eval().requires_grad_(False)
     for parameter in module.parameters():
         if parameter.numel() >= _HALF_FROM_ELEMENTS:

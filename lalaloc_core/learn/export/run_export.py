@@ -79,14 +79,6 @@ def export_into(
     """Copy a bundle with the encoder of spheres, of views, or both, that were trained in `folder`, in place of its own.
 
     The copy keeps the fitted evidence and confidence, which should be fitted again.
-
-    Args:
-        bundle: folder of the bundle to copy.
-        folder: of the training run.
-        out: folder of the copy.
-        version: of the model.
-        notes: additional entries of the manifest's `training`.
-        last: export the last weights instead of the best by validation.
     """
     stages = [stage for stage in ("image", "view") if (folder / f"{stage}.pt").exists()]
     if not stages:

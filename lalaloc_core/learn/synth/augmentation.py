@@ -35,14 +35,8 @@ def framed(
 ) -> Float[Tensor, "b h w 4"]:
     """Show each picture through a random camera, level but for a small error.
 
-    Args:
-        images: pictures, 0 to 255.
-        azimuths: azimuth of each column relative to the centre, radians.
-        elevations: elevation of each row, radians.
-        generator: source of randomness, on the pictures' device.
-
-    Returns:
-        RGB and opacity, 0 to 255; pixels outside the camera's picture are transparent.
+    `azimuths` (radians) are relative to the centre. The fourth channel is opacity: pixels outside the camera's picture
+    are transparent.
     """
     count, device = len(images), images.device
 
@@ -81,7 +75,6 @@ def _lenses(count: int, device: torch.device, generator: torch.Generator) -> tup
 
 
 def _rays(azimuths: Tensor, elevations: Tensor) -> Float[Tensor, "h w 3"]:
-    """Return the direction of each pixel: right, ahead, up."""
     flat = torch.cos(elevations)[:, None]
     right, ahead = flat * torch.sin(azimuths), flat * torch.cos(azimuths)
     return torch.stack([right, ahead, torch.sin(elevations)[:, None].expand_as(right)], dim=2)
@@ -199,7 +192,6 @@ def _vignetting(
 
 
 def _blurred(pixels: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b h w 3"]:
-    """Return the mean of 3 x 3 pixels, wrapped around the horizon."""
     around = torch.cat([pixels[:, :, -1:], pixels, pixels[:, :, :1]], dim=2)
     wide = around[:, :, :-2] + around[:, :, 1:-1] + around[:, :, 2:]
     over = torch.cat([wide[:, :1], wide, wide[:, -1:]], dim=1)
@@ -246,7 +238,6 @@ def _seen_at(width: int, factors: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "
 def _sampled(
     images: UInt8[Tensor, "n h w 3"], row: Float[Tensor, "n h w"], column: Float[Tensor, "n w"]
 ) -> UInt8[Tensor, "n h w 3"]:
-    """Sample pixels bilinearly, wrapped around the horizon."""
     height, width = images.shape[1:3]
     around = torch.cat([images[:, :, -1:], images, images[:, :, :1]], dim=2).permute(0, 3, 1, 2).float()
     # The first column of `around` is the last of the picture, and -1 to 1 reach from the edges of its edge pixels.

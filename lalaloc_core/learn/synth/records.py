@@ -72,7 +72,6 @@ class Records:
             raise ValueError(f"rows of {type(self).__name__} have {self.WIDTH} columns, not {self.rows.shape[-1]}")
 
     def __getitem__(self, index: Any) -> Any:
-        """Return the records at an index into the leading axes."""
         return type(self)(self.rows[index])
 
     def copy(self) -> Any:
@@ -94,7 +93,6 @@ class Records:
 
 
 def _together(parts: list[int | slice]) -> slice:
-    """Return the slice of adjacent columns."""
     spans = [slice(part, part + 1) if isinstance(part, int) else part for part in parts]
     if any(first.stop != second.start for first, second in pairwise(spans)):
         raise ValueError(f"columns {spans} are joined, but are not neighbours")

@@ -267,6 +267,5 @@ def _batches(
 
 
 def _failures(source: Source) -> Iterator[LoadFailure]:
-    """Yield the load failures since the last call."""
     yield from [LoadFailure(error, fatal=False) for error in source.problems]
     source.problems.clear()

@@ -44,11 +44,7 @@ def worker_share() -> tuple[int, int]:
 
 
 def draw_visits(draw: Callable[[int], _Drawn | None], first: int, patience: int) -> Iterator[_Drawn]:
-    """Yield the results of `draw` for this worker's share of the visits from number `first` on, without None.
-
-    Raises:
-        DatasetError: `patience` visits in a row returned None.
-    """
+    """Yield the results of `draw` for this worker's share of the visits from number `first` on, without None."""
     worker, workers = worker_share()
     empty = 0
     for visit in itertools.count(first + worker, workers):

@@ -27,7 +27,6 @@ class Checkpoint:
     """State of a training stage.
 
     Attributes:
-        stage: "layout", "image" or "end-to-end".
         weights: state dict of the stage's modules by name.
         averaged: averaged weights (EMA) in the same form; empty if averaging is off.
         begun_from: the model that provided the first weights, and its training time; empty for random weights.
@@ -57,11 +56,7 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path, *, stage: str | None = None) -> Checkpoint:
-        """Read a checkpoint, optionally of a required stage, without executing anything in the file.
-
-        Raises:
-            CheckpointError: the file is missing, damaged, or of another stage.
-        """
+        """Read a checkpoint, optionally of a required stage, without executing anything in the file."""
         try:
             raw = torch.load(path, map_location="cpu", weights_only=True)
             raw["config"] = TrainConfig.from_dict(raw["config"])

@@ -189,11 +189,7 @@ class TrainConfig:
     image: ImageStageConfig = field(default_factory=ImageStageConfig)
 
     def __post_init__(self) -> None:
-        """Check the values that types cannot.
-
-        Raises:
-            ConfigError: names the key, its value and the limit.
-        """
+        """Check the values that types cannot."""
         for name, wanted in (("layout.cloud_columns", self.layout.cloud_columns), ("the decoder", DECODED_WIDTH)):
             if self.profile_columns % min(wanted, self.profile_columns):
                 raise ConfigError(
@@ -239,11 +235,7 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, raw: dict[str, Any]) -> TrainConfig:
-        """Build a configuration from plain data, refusing unknown keys.
-
-        Raises:
-            ConfigError: an unknown key or a value of the wrong type; names its path.
-        """
+        """Build a configuration from plain data, refusing unknown keys."""
         if isinstance(image := raw.get("image"), dict):
             raw = raw | {"image": {_EARLIER_NAMES.get(name, name): value for name, value in image.items()}}
         return build_config(cls, raw, path="config")

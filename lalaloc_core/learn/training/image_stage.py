@@ -122,7 +122,6 @@ class ImageStage(TrainingStage[ImageStageConfig]):
     def _structure_losses(
         self, features: StructureFeatures, batch: Batch, known: Bool[Tensor, "b w"]
     ) -> dict[str, Tensor]:
-        """Return the losses on openings, ceiling height and room type."""
         settings, room_type = self.settings, batch["room_type"]
         kind = torch.where(known, batch["opening_kind"], UNKNOWN)
         assert isinstance(self.encoder, TrunkImageEncoder)
@@ -151,7 +150,6 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         return image
 
     def _draw_seen(self, count: int, device: torch.device) -> Bool[Tensor, "b s"]:
-        """Draw the sectors that pictures show: all, or in a share of the pictures a part of the horizon."""
         sectors = self.config.ring.sectors
         if not self.settings.hidden_share:
             return torch.ones(count, sectors, dtype=torch.bool, device=device)
@@ -162,7 +160,6 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         return ((hidden >= self.settings.hidden_share) | (offset < width)).to(device)
 
     def _hide(self, image: Tensor, seen: Bool[Tensor, "b s"]) -> Tensor:
-        """Paint the hidden sectors grey."""
         if not self.settings.hidden_share:
             return image
         columns = seen.repeat_interleave(image.shape[2] // seen.shape[1], dim=1)

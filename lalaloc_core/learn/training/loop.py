@@ -104,17 +104,14 @@ class _Trainer:
 
     @property
     def budget(self) -> int | float:
-        """Length of the schedule: minutes if a time budget is set, else steps."""
         return self.settings.steps if self.settings.minutes is None else self.settings.minutes
 
     @property
     def spent(self) -> int | float:
-        """Part of `budget` that is done, in the same unit."""
         return self.step if self.settings.minutes is None else self.seconds / 60.0
 
     @property
     def progress(self) -> float:
-        """Share of the schedule that is done."""
         return self.spent / self.budget
 
     def train_step(self, batch: Batch) -> dict[str, float]:
@@ -139,7 +136,6 @@ class _Trainer:
         return {name: term.item() for name, term in terms.items()}
 
     def checkpoint(self) -> Checkpoint:
-        """Return the current state."""
         return Checkpoint(
             stage=self.stage.name,
             config=self.stage.config,
@@ -176,7 +172,6 @@ class _Trainer:
 
 
 def _progress_bar(trainer: _Trainer) -> tqdm[Any]:
-    """Create a progress bar in the unit of the budget: minutes or steps."""
     timed = trainer.settings.minutes is not None
     return tqdm(
         total=trainer.budget,

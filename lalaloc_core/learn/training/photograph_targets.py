@@ -183,7 +183,6 @@ def read_walls_and_openings(sphere: UInt8[np.ndarray, "h w 3"], segment: Segment
 
 
 def _openings(kind: Int[np.ndarray, "r w"], elevation_deg: Float[np.ndarray, "r"]) -> Float[np.ndarray, "w 2"]:
-    """Return the probabilities of door and window by column."""
     shares = []
     for classes, (low, high) in (((_DOOR,), _DOOR_BETWEEN_DEG), (_OUTSIDE, _WINDOW_BETWEEN_DEG)):
         rows = (elevation_deg > low) & (elevation_deg < high)

@@ -52,19 +52,9 @@ def train_stage(
 ) -> Checkpoint:
     """Train a stage in `folder`: "layout", then "image", or both at once ("end-to-end"), or "view".
 
-    Args:
-        name: stage to train.
-        config: of the run.
-        folder: of the run.
-        device: to train on.
-        data: training and validation scenes.
-        workers: number of processes that make batches.
-        resume: continue from the checkpoint in `folder`.
-        init_from: bundle or run folder that provides the first weights; it excludes `resume`. Views start from its
-            encoder of views, else from its image encoder.
-        layout_from: of the image stage: bundle or run folder whose layout encoder a `folder` without one gets
-            (default: `init_from`).
-        teacher: of the image stage: run folder of the layout encoder to train against (default: `folder`).
+    `init_from` is a bundle or run folder that provides the first weights, instead of `resume`; views start from its
+    encoder of views, else from its image encoder. The image stage trains against the layout encoder in the run folder
+    `teacher` (default: `folder`), or that of `layout_from` (default: `init_from`) if `folder` has none.
     """
     torch.manual_seed(config.seed + _SEED_OF_STAGE[name])
     layout_encoder = _load_teacher(config, folder, teacher, layout_from or init_from) if name == "image" else None

@@ -248,7 +248,6 @@ class SceneSource:
     def _picture(
         self, scene: Scene, camera: Camera, rng: np.random.Generator, height: int, width: int
     ) -> np.ndarray | None:
-        """Draw one of a camera's photographs; None if it has none that can be read."""
         looks = sorted(camera.photographs, key=str)
         if not looks:
             return None

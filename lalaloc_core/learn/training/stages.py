@@ -32,9 +32,7 @@ class TrainingStage(ABC, Generic[StageConfigT]):
     """Networks, data and losses of one stage, run by the training loop.
 
     Attributes:
-        name: of its checkpoints and log.
         settings: budget, optimiser and weights of the losses.
-        modules: trained networks by name.
         teacher: frozen network used by the losses; the loop moves it to the training device.
         photographs: unlabelled photographs, in addition to the source's spheres.
     """

@@ -226,7 +226,6 @@ class _Query:
 
     @property
     def fingerprint(self) -> bytes:
-        """Identity of this query among others of its kind."""
         camera, plan = self.camera, self.scene.plan
         numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
         return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
@@ -244,7 +243,6 @@ class _Query:
         )
 
     def layouts(self, poses: PoseSet, columns: int, device: torch.device) -> _Layouts:
-        """Return the layouts at poses of the plan, seen at the heading of the rotated photograph."""
         plan = self.scene.plan
         heading = np.full(len(poses), self.turn.heading)
         profile = torch.from_numpy(profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32))
@@ -253,7 +251,6 @@ class _Query:
         return _Layouts(profile.to(device), camera.to(device), ceiling.to(device))
 
     def distance_m(self) -> np.ndarray:
-        """Return the distance of every grid pose to the camera."""
         return np.linalg.norm(self.grid.position_m - self.camera.position_m, axis=1)
 
 
@@ -277,7 +274,6 @@ class _Layouts:
     ceiling_height_m: Tensor
 
     def embed(self, encoder: nn.Module) -> Tensor:
-        """Return the latents (n, d)."""
         inputs = (self.profile_m, self.camera_height_m, self.ceiling_height_m)
         parts = zip(*(tensor.split(_LAYOUT_BATCH) for tensor in inputs), strict=True)
         return torch.cat([encoder(*part) for part in parts])

@@ -111,7 +111,6 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         }
 
     def _cut(self, images: UInt8[Tensor, "n h w 3"]) -> UInt8[Tensor, "n h2 w2 3"]:
-        """Cut patches from the middle of spheres."""
         rows, columns = images.shape[1:3]
         pixel = np.pi / rows
         top = round((np.pi / 2.0 - np.radians(self.config.view.top_deg)) / pixel)
@@ -148,14 +147,7 @@ _BATCH = 16
 
 
 class ViewValidation:
-    """Errors of walls and openings in level views of several fields of view.
-
-    Args:
-        config: of the run.
-        homes: number of validation homes, with four views each.
-        textures: folder of material pictures; None makes all materials procedural.
-        device: to run on.
-    """
+    """Errors of walls and openings in level views of several fields of view."""
 
     def __init__(self, config: TrainConfig, homes: int, textures: Path | None, device: torch.device) -> None:
         self._config, self._device = config, device

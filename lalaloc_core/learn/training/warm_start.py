@@ -154,7 +154,6 @@ def halved_weights(network: bytes) -> dict[str, Tensor]:
 
 
 def _state(bundle: Bundle, file: str) -> dict[str, Tensor]:
-    """Read the weights of a network; bundles store half precision, training needs single precision."""
     state = halved_weights(bundle.read(_NETWORKS[file])) if file in _NETWORKS else {}
     try:
         state |= safetensors.torch.load(bundle.read(file))

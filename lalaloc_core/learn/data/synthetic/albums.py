@@ -45,7 +45,6 @@ class TakenPhotograph:
     Attributes:
         pixels: the picture; a full sphere if the album has spheres.
         heading: azimuth of its centre, radians.
-        taken_s: seconds since the first photograph.
     """
 
     pixels: UInt8[np.ndarray, "h w 3"]

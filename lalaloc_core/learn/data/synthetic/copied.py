@@ -83,7 +83,6 @@ def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
 
 
 def _visible_kinds(plan: FloorPlan, camera: Camera) -> Int[np.ndarray, "w"]:
-    """Return the opening class at each azimuth around a camera."""
     room, heading = np.array([camera.room_index]), np.zeros(1)
     view = render_layout(camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
     return view.kind[0]

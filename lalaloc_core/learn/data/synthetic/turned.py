@@ -36,9 +36,7 @@ class Instant(NamedTuple):
     """Camera at the time of a frame.
 
     Attributes:
-        time_s: since the first frame.
         turn: heading minus that of the first frame, radians.
-        rate: turn per second.
         pitch, roll: tilt, radians.
         gain: exposure over the usual one.
     """
@@ -112,8 +110,6 @@ class Phone:
     """Camera that is turned about a person who holds it.
 
     Attributes:
-        width, height: size of its pictures, pixels.
-        hfov_deg: horizontal field of view.
         arm_m: distance (m) from the axis of the turn to the camera.
     """
 

@@ -151,7 +151,6 @@ class _Job:
 
     @property
     def part(self) -> Path:
-        """Folder of the incomplete scene."""
         return self.settings.root / (scene_name(self.number) + PART_SUFFIX)
 
 

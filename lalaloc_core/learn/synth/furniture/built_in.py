@@ -180,7 +180,6 @@ def _tall_unit(body: Finish, height: float) -> Piece:
 
 
 def _block(width: float, depth: float, height: float, body: Finish) -> Piece:
-    """Return free-standing base units under a worktop."""
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [
         box(at=(0.0, 0.0), half=(hx - 0.05, hy - 0.05), z=(0.0, 0.1), finish="dark"),

@@ -98,8 +98,6 @@ class Prism(NamedTuple):
         axis_x, axis_y: unit vector of its first axis; the second is the first turned by +90°.
         half_a, half_b: half extents along the two axes, metres.
         z0, z1: lower and upper end above the floor, metres.
-        piece: number of its piece of furniture.
-        label: label of the piece, see `pieces`.
     """
 
     x: float
@@ -353,7 +351,6 @@ def _rugs(floor: _Floor, rng: np.random.Generator, first_number: int) -> list[Pr
 
 
 def _rectangles(centre_m: np.ndarray, axis: np.ndarray, half_a: float, half_b: float) -> np.ndarray:
-    """Return oriented rectangles (n,) as shapely geometries."""
     a, b = axis * half_a, np.stack([-axis[:, 1], axis[:, 0]], axis=1) * half_b
     corners = np.stack([centre_m - a - b, centre_m + a - b, centre_m + a + b, centre_m - a + b], axis=1)
     return np.asarray(shapely.polygons(corners))

@@ -45,7 +45,6 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def _chair_parts(x: float, y: float, facing: int, finish: Finish) -> list[Part]:
-    """Return a chair at (x, y) with its back on the side of `facing` (+1 or -1 along y)."""
     legs = [part._replace(x=part.x + x, y=part.y + y) for part in square_legs(0.21, 0.21, 0.04, 0.44, "wood")]
     seat = box(at=(x, y), half=(0.22, 0.22), z=(0.43, 0.48), finish=finish)
     back = box(at=(x, y + facing * 0.2), half=(0.21, 0.02), z=(0.48, 0.92), finish=finish)

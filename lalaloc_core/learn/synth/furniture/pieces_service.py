@@ -74,7 +74,6 @@ def counter_run(
 
 
 def _on_worktop(rng: np.random.Generator, half_width: float, height: float) -> list[Part]:
-    """Return appliances and jars on a worktop."""
     parts = []
     for _ in range(int(rng.integers(1, 2 + round(3 * half_width)))):
         finish: Finish = ("metal", "white", "dark", "accent", "wood", "ceramic")[int(rng.integers(6))]

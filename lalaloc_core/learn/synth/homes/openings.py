@@ -28,8 +28,6 @@ class Opening:
 
     Attributes:
         wall: index of the edge of the room's `polygon_m`.
-        start_m: start along the wall, from its first vertex.
-        end_m: end along the wall.
         kind: kind of opening; open doors, wide openings and windows are see-through.
         neighbour: index of the room behind it, -1 for the outdoors or a room outside the plan.
     """

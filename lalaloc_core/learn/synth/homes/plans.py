@@ -99,7 +99,6 @@ def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -
 
 
 def _area(polygon_m: Float[np.ndarray, "n 2"]) -> float:
-    """Return the area by the shoelace formula."""
     x, y = polygon_m.T
     return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
@@ -187,7 +186,6 @@ def _plan(
 
 
 def _line(opening: Opening, polygon_m: Float[np.ndarray, "n 2"]) -> list[list[float]]:
-    """Return both ends of an opening on the wall of its room."""
     start = polygon_m[opening.wall]
     along = polygon_m[(opening.wall + 1) % len(polygon_m)] - start
     along = along / np.linalg.norm(along)

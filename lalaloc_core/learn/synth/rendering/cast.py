@@ -31,7 +31,6 @@ class SceneBatch(SceneRecords):
     wall_surface: Int[Tensor, "b n"]
 
     def __getitem__(self, index: Tensor) -> SceneBatch:
-        """Return a batch of some of the scenes."""
         return SceneBatch(**{name: getattr(self, name)[index] for name in SceneBatch.__dataclass_fields__})
 
 

@@ -110,7 +110,6 @@ def shade(
 
 
 def _surface_of(surfaces: Surfaces, index: Int[Tensor, "b c h"]) -> Surfaces:
-    """Return the surface of every pixel: rows (b, c, h, 12)."""
     batch, size, width = surfaces.rows.shape
     flat = index + (torch.arange(batch, device=index.device) * size)[:, None, None]
     return Surfaces(surfaces.rows.reshape(-1, width)[flat.reshape(-1)].reshape(*index.shape, width))
@@ -221,7 +220,6 @@ def _visibility(
 def _add_sunlight(
     batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor], light: Float[Tensor, "b c h 3"]
 ) -> None:
-    """Add the patch of sun of a window."""
     sun = batch.sun[:, None, None]
     (start_x, start_y), (ax, ay) = sun.wall_start_m.unbind(-1), sun.wall_along.unbind(-1)
     toward_x, toward_y, rise = sun.direction.unbind(-1)
@@ -238,7 +236,6 @@ def _add_sunlight(
 
 
 def _ambient(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "b c h 3"]:
-    """Return ambient light, reduced in corners and beside furniture."""
     beyond = hits.slot.nonzero(as_tuple=True)
     room = batch.rooms[beyond[0], hits.slot[beyond]]
     z, nz = point[2], hits.normal[..., 2]

@@ -146,7 +146,6 @@ class SphereRenderer:
 
 
 def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Float[Tensor, "b h2 w2 3"]:
-    """Average blocks of rays; clip outliers first, as a sensor does."""
     planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
     return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)
 

@@ -97,7 +97,6 @@ class _Builder:
         return [opening for opening in self._home.openings if opening.room == room_index]
 
     def _add_room(self, slot: int, room_index: int, lighting: Lighting) -> None:
-        """Add shell, openings and furniture of a room."""
         first = self._shells.add(slot, room_index, self._home.plan.rooms[room_index], lighting)
         for opening in self._openings_of(room_index):
             self._add_opening(first + opening.wall, opening, is_own=slot == 0)
@@ -106,7 +105,6 @@ class _Builder:
             self._lower_ceiling()
 
     def _lower_ceiling(self) -> None:
-        """Add boxes below the ceiling of the own room, most of them of its surface."""
         tables = self._tables
         surfaces: dict[Finish, int] = {"paint": int(VisibleRooms.stacked(tables.rooms).ceiling_surface[0])}
         for box in ceiling_boxes(self._room, self._openings, self._shot.camera_height_m, self._rng):
@@ -130,7 +128,6 @@ class _Builder:
             add_radiator(tables, style, self._room, opening, rng)
 
     def _furnish(self, room_index: int, *, is_own: bool) -> None:
-        """Add furniture, less in other rooms than the camera's own; facts cover the own room only."""
         self._streams.begin(ScenePart.FURNITURE, room_index)
         level: FurnitureLevel = self._shot.furniture if is_own or self._is_bare else "simple"
         camera = self._tables.camera_m if is_own else None
@@ -226,7 +223,6 @@ def add_mirror(
 
 
 def _reflected_room(own: Row, lights: Lights, relative: Reflection) -> Row:
-    """Return the room with its brightest light at the reflected position."""
     room = VisibleRooms(own.copy())
     if len(lights.rows):
         brightest = lights[lights.colour.sum(axis=1).argmax()]

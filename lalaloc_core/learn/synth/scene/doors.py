@@ -150,7 +150,6 @@ def add_door(
 
 
 def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
-    """Return the distance to the facing wall of the room behind."""
     middle, _, inwards = _frame_of(room, opening)
     ray = shapely.LineString([middle, middle - inwards])
     depth = float(shapely.distance(shapely.Point(middle), shapely.intersection(ray, neighbour.shape)))
@@ -160,7 +159,6 @@ def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
 def _frame_of(
     room: Room, opening: Opening
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return (middle of an opening, unit vector along its wall, unit normal into the room)."""
     start, along, inwards = wall_frame(room, opening.wall)
     return start + along * 0.5 * (opening.start_m + opening.end_m), along, inwards
 
@@ -168,7 +166,6 @@ def _frame_of(
 def _add_shut_door(
     tables: SceneTables, style: HouseStyle, wall: int, opening: Opening, rng: np.random.Generator
 ) -> None:
-    """Add one or two closed leaves with up to three panels or panes and a handle."""
     s0, s1, head = opening.start_m, opening.end_m, opening.head_m
     middle, is_double = 0.5 * (s0 + s1), s1 - s0 > DOUBLE_FROM_M
     tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=style.door)
@@ -194,7 +191,6 @@ def _add_leaves(
     depth_m: float,
     rng: np.random.Generator,
 ) -> None:
-    """Add the leaves of an open door, with their handles."""
     for leaf in hang_leaves(opening, room, neighbour, depth_m, tables.camera_m, rng):
         for board in boards(leaf.half_width_m, opening.head_m, glazed=style.doors_are_glazed):
             centre = leaf.centre_m + leaf.axis * board.along_m
@@ -208,7 +204,6 @@ def _add_leaves(
 def _add_threshold(
     tables: SceneTables, style: HouseStyle, room: Room, opening: Opening, depth_m: float, rng: np.random.Generator
 ) -> None:
-    """Add a strip in some doorways."""
     if rng.random() > 0.2:
         return
     middle, along, inwards = _frame_of(room, opening)

@@ -171,14 +171,12 @@ def _lamps(
 def _hanging(
     spot_m: np.ndarray, radius_m: float, z_m: tuple[float, float], finish: Finish, *, is_round: bool = True
 ) -> Prism:
-    """Return a part of a lamp below the ceiling."""
     return Prism.upright(
         spot_m, (1.0, 0.0), (radius_m, radius_m), z_m, finish=finish, piece=_NO_PIECE, is_round=is_round
     )
 
 
 def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Prism]:
-    """Return small round lamps in a grid, flush with the ceiling."""
     x_min, y_min, x_max, y_max = room.shape.bounds
     step, radius = rng.uniform(0.9, 2.0), rng.uniform(0.035, 0.08)
     xs, ys = np.arange(x_min + 0.4, x_max, step), np.arange(y_min + 0.4, y_max, step)
@@ -202,7 +200,6 @@ def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.ran
 
 
 def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Generator) -> Sun:
-    """Return sunlight falling through a window."""
     start, along, inwards = wall_frame(room, window.wall)
     side, elevation = rng.uniform(-1.0, 1.0), math.radians(rng.uniform(15.0, 55.0))
     toward = math.cos(side) * -inwards + math.sin(side) * along

@@ -37,9 +37,6 @@ class Decals(Records):
     """Rectangles on walls; later ones cover earlier ones.
 
     Attributes:
-        wall: index of the wall, -1 for none.
-        s0_m, s1_m: start and end along it.
-        z0_m, z1_m: lower and upper edge above the floor.
         surface: row of the surfaces; of a hole, the surface of its reveals.
         slot: room behind it if it is a hole, else -1.
         depth_m: depth of a hole.

@@ -46,7 +46,6 @@ class SceneTables:
 
     Attributes:
         walls_m: ends of the walls in the plan frame; those of the own room come first.
-        wall_surfaces: their surfaces.
         decals: later ones cover earlier ones.
         prisms: rows of `render_scene.Prisms`, relative to the camera.
         rooms: rows of `render_scene.VisibleRooms`.

@@ -68,7 +68,6 @@ class Shells:
         return first
 
     def _floor_of(self, room_index: int, room: Room, colour: Colour) -> int:
-        """Return the surface of a room's floor; many homes have one floor throughout."""
         streams = self._streams
         if streams.is_staged:
             # Rooms without a floor of their own draw the same one, so that it looks the same from every room.
@@ -84,7 +83,6 @@ class Shells:
 def _dress_wall(
     tables: SceneTables, style: HouseStyle, wall: int, ceiling_m: float, rng: np.random.Generator, *, is_bare: bool
 ) -> None:
-    """Add baseboard, crown moulding, pictures and switches."""
     length = tables.wall_length_m(wall)
     start, end = -_BEYOND_M, length + _BEYOND_M
     if style.baseboard_m > 0.0:
@@ -103,7 +101,6 @@ def _dress_wall(
 
 
 def _hang_picture(tables: SceneTables, wall: int, length_m: float, rng: np.random.Generator) -> None:
-    """Add a picture or a screen in a dark frame to a wall that is long enough."""
     half_width, half_height = rng.uniform(0.12, 0.6), rng.uniform(0.12, 0.5)
     if 2 * half_width >= length_m - 0.2:
         return
@@ -199,7 +196,6 @@ def _clear_m(openings: Sequence[Opening], walls: list[int]) -> float:
 
 
 def _along_wall(room: Room, wall: int, reach_m: tuple[float, float], bottom_m: float) -> Prism | None:
-    """Return a box along a wall between two distances from it; None if it does not fit."""
     start, along, inwards = wall_frame(room, wall)
     length = float(np.hypot(*(room.walls_m[wall][2:] - room.walls_m[wall][:2])))
     near, far = (start + inwards * reach for reach in reach_m)
@@ -207,7 +203,6 @@ def _along_wall(room: Room, wall: int, reach_m: tuple[float, float], bottom_m: f
 
 
 def _beams(room: Room, wall: int, bottom_m: float, rng: np.random.Generator) -> list[Prism]:
-    """Return parallel beams from wall to wall."""
     _, along, inwards = wall_frame(room, wall)
     middle = np.array(room.shape.centroid.coords[0])
     reach = float(np.hypot(*np.ptp(room.polygon_m, axis=0)))
@@ -230,7 +225,6 @@ def _beams(room: Room, wall: int, bottom_m: float, rng: np.random.Generator) -> 
 def _box(
     room: Room, footprint: shapely.Polygon, along: np.ndarray, bottom_m: float, finish: Finish = "paint"
 ) -> Prism | None:
-    """Return a box from a footprint up to the ceiling; None if it is flat or reaches out of the room."""
     if room.ceiling_height_m - bottom_m < 0.03 or footprint.intersection(room.shape).area < _INSIDE * footprint.area:
         return None
     corners = shapely.get_coordinates(footprint)

@@ -31,8 +31,6 @@ class Shot:
     """One photograph: camera, furniture, and the seed of everything random.
 
     Attributes:
-        position_m: camera position (2,) in the plan frame.
-        heading: azimuth of the centre column, radians.
         seed: decides materials, furniture, light and camera settings.
         lighting: colour of all light; None draws one. A shot with lighting is *staged*: shots of one home with the same
             seed show the same materials, whatever their furniture and lighting, and there is no tripod.

@@ -22,7 +22,6 @@ class Surfaces(Records):
     """Appearance of the surfaces of a scene.
 
     Attributes:
-        scale: pictures per metre.
         gloss: share of light reflected like a mirror.
         glow: if positive, the surface emits its colour times this instead of reflecting light.
         is_outdoors: 1 for the view through a window.
