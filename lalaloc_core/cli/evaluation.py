@@ -97,12 +97,10 @@ class Report:
     Attributes:
         runs: folders of runs.
         out: page to write.
-        pictures: folder to write the page's charts to as well.
     """
 
     runs: tuple[Path, ...]
     out: Path = Path("report.html")
-    pictures: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,7 +265,7 @@ def _print_scores(report: dict[str, Any]) -> None:
 def _report(arguments: Report) -> None:
     from lalaloc_core.evaluate.report import write_report
 
-    write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
+    write_report(arguments.runs, arguments.out)
 
 
 def _worst(arguments: Worst) -> None:
