@@ -54,8 +54,8 @@ class ComputeSettings(SettingGroup):
         default=None,
         ge=0,
         le=64,
-        description="LPO worker processes, for turns with unknown angles and models that compare latents. Default: a "
-        "quarter of the usable cores (affinity and cgroup quota), at least 1. 0: no LPO; answers end at VDR.",
+        description="LPO worker processes, for models that compare latents. Default: a quarter of the usable cores "
+        "(affinity and cgroup quota), at least 1. 0: no LPO; answers end at VDR.",
     )
     # Torch threads per LPO worker: more use the cores less well.
     worker_threads: ClassVar[int] = 1
