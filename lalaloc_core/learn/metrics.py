@@ -125,14 +125,7 @@ class ClassScores:
 
 @dataclass(frozen=True, kw_only=True)
 class AzimuthSummary:
-    """Measures over several photographs.
-
-    Attributes:
-        median_error: median over the photographs of their median |Δ log d|.
-        error_90: median over the photographs of their 90 % quantile of |Δ log d|.
-        within: share of all azimuths within each predicted quantile.
-        classes: over all azimuths; None if no classes were predicted.
-    """
+    """Medians over several photographs; over all azimuths, the shares within predicted quantiles, and class scores."""
 
     n: int
     median_error: float
@@ -150,11 +143,7 @@ def measure_azimuths(
     true_classes: Int[np.ndarray, "w"] | None = None,
     class_scores: Float[np.ndarray, "w c"] | None = None,
 ) -> AzimuthMeasures:
-    """Compare a prediction with an annotation.
-
-    `profiles_m` are the true wall profiles, one per annotated outline. `class_scores` are log probabilities, or any
-    score that is largest for the likeliest class, and need `true_classes`.
-    """
+    """Compare a prediction with the true wall profiles, one per annotated outline, and with the true classes."""
     errors = [np.nan_to_num(log_profile - np.log(profile), nan=np.inf) for profile in profiles_m]
     outline = int(np.argmin([np.median(np.abs(error)) for error in errors]))
     confusion = None
@@ -165,10 +154,7 @@ def measure_azimuths(
 
 
 def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[str]) -> AzimuthSummary:
-    """Summarise photographs with equal weight.
-
-    `measures` has one item per photograph, at least one; `classes` are names by code.
-    """
+    """Summarise one or more photographs with equal weight; `classes` are names by code."""
     within = np.mean([measure.within for measure in measures], axis=0)
     confusions = [measure.confusion for measure in measures if measure.confusion is not None]
     return AzimuthSummary(

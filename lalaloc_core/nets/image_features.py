@@ -28,13 +28,7 @@ class StructureFeatures:
 
 @dataclass(frozen=True)
 class WallModes:
-    """Distance of the wall at each azimuth, as a mixture of Laplace distributions of its log.
-
-    Attributes:
-        log_profile: (b, w, m) centres of the modes: log distances of the wall (m).
-        log_scale: (b, w, m) logs of the scales of the modes.
-        log_share: (b, w, m) logs of the shares of the modes, which sum to 1.
-    """
+    """Distance of the wall at each azimuth, as mixtures (b, w, m) of Laplace distributions of its log."""
 
     log_profile: Tensor
     log_scale: Tensor
@@ -53,11 +47,7 @@ class WallModes:
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """Predictions of an image encoder for a batch of spheres.
-
-    Attributes:
-        ring: (b, c, s) features to compare with the layout encoder's.
-    """
+    """Predictions of an image encoder for spheres; `ring` (b, c, s) is compared with the layout encoder's."""
 
     ring: Tensor
     walls: WallModes

@@ -23,13 +23,7 @@ IMAGE_STD = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig:
-    """Sizes of the `paper` architecture.
-
-    Attributes:
-        layout_depth, image_depth: layers of the two ResNets.
-        layout_predictor: layers from pooled features to the latent: one fully connected, or two with a ReLU between.
-        width: channels of the first stage; each later stage doubles them. ResNets have 64.
-    """
+    """Sizes of the `paper` architecture; ResNets have a `width` of 64, which each later stage doubles."""
 
     layout_depth: Literal[18, 50] = 18
     layout_predictor: Literal["fc", "mlp"] = "fc"

@@ -182,10 +182,7 @@ class TrunkImageEncoder(HorizonEncoder):
     def forward(
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
     ) -> ImageFeatures:
-        """Encode spheres.
-
-        Pixels are 0 to 255 of any type, (b, h, w, 3); `styles` is for training only.
-        """
+        """Encode spheres (b, h, w, 3) of values from 0 to 255; `styles` is for training only."""
         mixed = self.sector_features(self.normalised(image), styles)
         log_height = torch.log(camera_height_m)
         height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)

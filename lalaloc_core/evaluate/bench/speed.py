@@ -153,10 +153,7 @@ _QUERIES = 300
 
 
 def bench_datasets(setting: Setting) -> dict[str, Any]:
-    """Measure writing synthetic test scenes, reading their annotations, and localising 300 spheres.
-
-    Each takes one process per core.
-    """
+    """Measure writing synthetic test scenes, reading their annotations, and localising 300 spheres, on all cores."""
     cores = os.cpu_count() or 1
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as scratch:
         root = Path(scratch) / "scenes"

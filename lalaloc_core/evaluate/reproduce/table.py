@@ -57,12 +57,7 @@ PAPER_SETTING: Mapping[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class RowQuery:
-    """Query of a row.
-
-    Attributes:
-        model: `SHIPPED` or the name of a trained variant; None for methods without a model.
-        furniture: furniture of the photographs; None for the data set's default.
-    """
+    """Query of a row; `model` is `SHIPPED`, the name of a trained variant, or None for methods without a model."""
 
     method: MethodName = "lalaloc"
     kind: QueryKind = "photograph"
@@ -79,12 +74,7 @@ class RowQuery:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Row of a table.
-
-    Attributes:
-        stage: stage whose poses are scored; None for the final pose.
-        paper: the paper's figures by column, shares from 0 to 1; empty for rows of our own.
-    """
+    """Row of a table: the stage whose poses are scored (None: the last), and the paper's figures by column, if any."""
 
     group: str
     name: str
@@ -95,11 +85,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Table of the paper.
-
-    Attributes:
-        form: a "figure" is also drawn; "times" runs one query at a time.
-    """
+    """Table of the paper; a "figure" is also drawn, and "times" runs one query at a time."""
 
     name: str
     title: str

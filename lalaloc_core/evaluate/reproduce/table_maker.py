@@ -46,11 +46,7 @@ _TIMED_LIMIT = 20
 
 @dataclass(frozen=True, kw_only=True)
 class TableMaker:
-    """Maker of tables.
-
-    Attributes:
-        limit: queries per row; None for the budget's default.
-    """
+    """Maker of tables; `limit` is the number of queries per row, None for the budget's default."""
 
     data: Path
     out: Path

@@ -56,13 +56,7 @@ class GalleryAnswer:
 
 @dataclass(frozen=True, kw_only=True)
 class GalleryScores:
-    """Shares over all galleries of all photographs.
-
-    Attributes:
-        turned: share with the right position and a wrong heading.
-        calibration_error: expected calibration error of "within 1 m"; None without confidences.
-        by_photograph: share of each photograph's galleries in which it is located.
-    """
+    """Shares over all galleries of all photographs; `turned` are located with a wrong heading."""
 
     photographs: int
     galleries: int

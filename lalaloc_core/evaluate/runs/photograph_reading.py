@@ -113,11 +113,7 @@ def read_views(
 def read_azimuths(
     encoders: PhotographEncoder, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
 ) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
-    """Predict walls and openings of a sphere in its own frame.
-
-    Returns:
-        the log of the predicted wall profile (m), the log of its scale, and `ReadPhotograph.class_scores`.
-    """
+    """Predict a sphere's log wall profile (m) in its own frame, its log scale, and `ReadPhotograph.class_scores`."""
     return _azimuths(encoders.spheres.query(image, 0.0, CameraHeight(camera_height_m, 0.0)), encoders.manifest.name)
 
 

@@ -344,10 +344,7 @@ def symmetric_positions(room: shapely.Polygon, x_m: float, y_m: float) -> list[t
 
 
 def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
-    """Return whether a misaligned pose in the right room fits the mirrored room.
-
-    It then lies within `ALIGNMENT_LIMIT_M` of one of the true position's `symmetric_positions`.
-    """
+    """Return whether a misaligned pose in the right room fits the mirrored room, near one of `symmetric_positions`."""
     pose = prediction.final_pose
     if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
         return False

@@ -50,13 +50,7 @@ _RAYS, _MIN_SHARE, _SAME_PLACE_M = 64, 0.2, 0.05
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnnotatedPhotograph:
-    """Photograph with its annotation; metres, camera at (0, 0), +y along the picture's centre column.
-
-    Attributes:
-        quality: of the photograph; poor ones have no galleries.
-        outlines: the room, and an alternative outline if the annotation has one.
-        has_flat_ceiling: the ceiling height is annotated; otherwise it is the default.
-    """
+    """Photograph with its annotation; metres, camera at (0, 0), +y along the picture's centre column."""
 
     name: str
     photograph: FilePhotograph

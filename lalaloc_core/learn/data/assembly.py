@@ -227,11 +227,7 @@ def signed_area(polygon: Float[np.ndarray, "n 2"]) -> float:
 
 
 def largest_simple_part(polygon: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "m 2"], float]:
-    """Return the largest simple polygon within a ring that may cross or touch itself.
-
-    Returns:
-        The polygon and its share of the enclosed area; a simple ring returns itself and 1.
-    """
+    """Return the largest simple polygon within a ring that may cross itself, and its share of the enclosed area."""
     shape = shapely.Polygon(polygon)
     if shape.is_valid:
         return polygon, 1.0

@@ -64,12 +64,7 @@ def photograph_facts(photograph: DatasetPhotograph | None) -> frozenset[str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
-    """True pose with its photographs.
-
-    Attributes:
-        name: unique within its scene.
-        heading: azimuth of the photographs' centre column, radians.
-    """
+    """True pose with its photographs; the heading is that of their centre column, and names are unique in a scene."""
 
     name: str
     position_m: Float[np.ndarray, "2"]

@@ -25,12 +25,7 @@ _MIN_COSINE = 0.966
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnOpening:
-    """Door, window or passage of a data set, in the plan frame.
-
-    Attributes:
-        sill_m, head_m: heights above the floor; None if unknown.
-        rooms: names of the rooms that it opens into; empty if only its position determines them.
-    """
+    """Door, window or passage of a data set; `rooms` is empty if only its position determines them."""
 
     kind: str
     line_m: Float[np.ndarray, "2 2"]
@@ -117,10 +112,7 @@ class DrawnRoom:
 
     @property
     def main_direction(self) -> float:
-        """Direction of the walls weighted by length (radians, counter-clockwise from +x, in (-π/4, π/4]).
-
-        Rotated by the negative angle, most walls of a right-angled room are parallel to the axes.
-        """
+        """Direction of the walls weighted by length (radians, counter-clockwise from +x, in (-π/4, π/4])."""
         edges = np.roll(self.polygon_m, -1, axis=0) - self.polygon_m
         # Multiplying the angle by four makes the directions of right-angled walls equal.
         turned = np.exp(4j * np.arctan2(edges[:, 1], edges[:, 0]))

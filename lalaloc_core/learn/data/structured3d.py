@@ -75,11 +75,7 @@ def scene_name(number: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Synthetic:
-    """Content of `synthetic.json`, which marks generated scenes in Structured3D's layout.
-
-    Attributes:
-        textures: name of the material pictures; None if all materials are procedural.
-    """
+    """Content of `synthetic.json`, which marks generated scenes in Structured3D's layout."""
 
     format: Literal[1]
     seed: int

@@ -96,11 +96,7 @@ def write_camera(sphere: Path, room: Room, position_m: Float[np.ndarray, "2"], c
 
 
 def layout_pixels(room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> Float[np.ndarray, "n 2"]:
-    """Return the pixels (x, y) of a room's visible corners in a sphere of `SPHERE_SIZE` with heading 0.
-
-    Returns:
-        Ceiling and floor corners alternating, from left to right.
-    """
+    """Return the pixels (x, y) of the room's visible corners, ceiling and floor alternating, from left to right."""
     height, width = SPHERE_SIZE
     # Corners lie on the outline, so a ray to a corner may leave the room by rounding.
     shape = room.shape.buffer(1e-6)

@@ -121,13 +121,7 @@ class CachedSphere:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewPhotograph(WithoutDepth):
-    """Part of a sphere, as an ordinary camera takes it.
-
-    Attributes:
-        azimuth: of its centre relative to the sphere's, radians.
-        pitch: elevation of its centre, radians.
-        roll: clockwise rotation of the camera about its optical axis, radians.
-    """
+    """Part of a sphere, as an ordinary camera takes it: azimuth and elevation of its centre, and its roll (radians)."""
 
     sphere: CachedSphere = field(repr=False)
     azimuth: float

@@ -244,10 +244,7 @@ def _halves(values: Tensor) -> tuple[Tensor, Tensor]:
 def _export(
     path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], sides: Mapping[int, Any] | None = None
 ) -> float:
-    """Export one network with a dynamic batch, store it compactly, and return its largest difference from torch.
-
-    `sides` are further dynamic axes of the inputs.
-    """
+    """Export a network with a dynamic batch and `sides`, and return its largest difference from torch."""
     with warnings.catch_warnings():
         # The exporter warns about its own internals.
         warnings.simplefilter("ignore")

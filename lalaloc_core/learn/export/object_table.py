@@ -21,11 +21,7 @@ _HEAD_CHANNELS, _NORM_EPSILON = 1280, 1e-3
 
 
 class ObjectNetwork(nn.Module):
-    """EfficientNet-Lite0 with its pretrained classifier.
-
-    Args:
-        classes: numbers of the ImageNet classes whose probabilities are returned, among all 1,000.
-    """
+    """EfficientNet-Lite0 with its pretrained classifier, for some of the 1,000 ImageNet classes."""
 
     def __init__(self, classes: Sequence[int]) -> None:
         super().__init__()

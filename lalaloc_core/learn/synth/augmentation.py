@@ -204,11 +204,7 @@ def stretched(
     log_distance: Float[Tensor, "n w"],
     factors: Float[Tensor, "n 2"],
 ) -> tuple[UInt8[Tensor, "n h w 3"], Float[Tensor, "n w k"], Float[Tensor, "n w"]]:
-    """Stretch spheres and their labels per column about the camera.
-
-    `openings` and `log_distance` are labels per column; `factors` are (a, b), across and along the direction of the
-    central column.
-    """
+    """Stretch spheres and their labels per column by (a, b), across and along the direction of the central column."""
     width = images.shape[2]
     column, reach = _seen_at(width, factors)
     nearest = column.round().long() % width

@@ -49,10 +49,7 @@ class Exposure(Records):
 
 
 def sample_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:
-    """Sample camera settings.
-
-    `bright` exposes like pictures of homes for sale: light, with compressed contrasts.
-    """
+    """Sample camera settings; `bright` exposes like pictures of homes for sale, light, with compressed contrasts."""
     exposure = Exposure(np.zeros(Exposure.WIDTH))
     exposure.target = math.exp(rng.normal(math.log(0.42), 0.42))
     if bright:

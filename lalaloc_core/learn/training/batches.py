@@ -64,10 +64,7 @@ def stack_rows(rows: list[dict[str, np.ndarray]]) -> Batch:
 
 
 def load_batches(stream: Stream, workers: int) -> Iterator[Any]:
-    """Yield batches from `workers` processes with one thread each; 0 makes them in this process.
-
-    Each file that cannot be used is logged once, with a running number.
-    """
+    """Yield batches from `workers` processes, 0 for this one; each file that cannot be used is logged once."""
     options: dict[str, Any] = {}
     if workers:
         options = {"multiprocessing_context": "spawn", "worker_init_fn": _single_thread, "prefetch_factor": 6}
@@ -95,12 +92,7 @@ _QUARTER = TWO_PI / 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Rotation:
-    """Rotation and mirroring of a sphere.
-
-    Attributes:
-        shift: pixels by which its columns move to the right.
-        heading: azimuth of the centre column after the shift, radians; layouts are cast at this heading.
-    """
+    """Rotation and mirroring of a sphere: columns moved to the right, and the heading after that (radians)."""
 
     shift: int
     heading: float

@@ -24,13 +24,7 @@ _LIKELIHOOD, _ACCURACY, _TIE_BREAKER = "val_nll", "val_within_1m", "val_median_c
 
 @dataclass(kw_only=True)
 class Checkpoint:
-    """State of a training stage.
-
-    Attributes:
-        weights: state dict of the stage's modules by name.
-        averaged: averaged weights (EMA) in the same form; empty if averaging is off.
-        begun_from: the model that provided the first weights, and its training time; empty for random weights.
-    """
+    """State of a training stage; `averaged` weights are empty if averaging is off, `begun_from` for random weights."""
 
     stage: str
     config: TrainConfig

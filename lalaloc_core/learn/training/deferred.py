@@ -41,15 +41,7 @@ class DeferredRow:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeferredBatch:
-    """A batch without pixels.
-
-    Attributes:
-        rest: the batch without `image`.
-        shift: columns by which each sphere is rolled to the right.
-        mirrored: spheres mirrored after that.
-        scenes: scenes used for the first time, by number.
-        evicted: numbers of scenes that no later batch uses.
-    """
+    """A batch without pixels; `scenes` are those used for the first time, `evicted` those that no later batch uses."""
 
     rest: Batch
     number: tuple[int, ...]

@@ -74,10 +74,7 @@ def is_passage(opening_logits: Float[Tensor, "b w c"]) -> Bool[Tensor, "b w"]:
 
 
 def wall_shape(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[Tensor, "b w"]) -> Tensor:
-    """Return the mean absolute error of log distances where known, after each picture's median error is removed.
-
-    The error of a view's scale is large; this loss is not concerned with it.
-    """
+    """Return the mean absolute error of log distances where known, without each picture's median error, its scale."""
     mean = (walls.log_share.exp() * walls.log_profile).sum(dim=2)
     error = torch.where(known, mean - target, torch.nan)
     scale = error.detach().nanmedian(dim=1, keepdim=True).values

@@ -29,13 +29,7 @@ StageConfigT = TypeVar("StageConfigT", LayoutStageConfig, ImageStageConfig)
 
 
 class TrainingStage(ABC, Generic[StageConfigT]):
-    """Networks, data and losses of one stage, run by the training loop.
-
-    Attributes:
-        settings: budget, optimiser and weights of the losses.
-        teacher: frozen network used by the losses; the loop moves it to the training device.
-        photographs: unlabelled photographs, in addition to the source's spheres.
-    """
+    """Networks, data and losses of one stage, run by the training loop; `teacher` is a frozen network."""
 
     name: ClassVar[str]
     config: TrainConfig

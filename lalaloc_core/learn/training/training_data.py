@@ -53,10 +53,7 @@ class TrainingData:
         return SceneSource(config, self.dataset, self.skip_bad)
 
     def load_photographs(self, config: TrainConfig, size: tuple[int, int] | None = None) -> Photographs | None:
-        """Load the photographs with their targets; None if there are no photographs.
-
-        `size` is their (height, width) in pixels (default: the image encoder's).
-        """
+        """Load the photographs with their targets at a (height, width), by default that of the image encoder."""
         if not self.photographs:
             if self.teachers:
                 raise ConfigError("--teacher is for --photographs, which are not given")
@@ -93,10 +90,7 @@ class TrainingData:
         device: torch.device,
         folder: Path | None = None,
     ) -> Validate:
-        """Create the validation with sphere queries, in the data set's usual appearance.
-
-        Without a `layout_encoder` the one being trained is used; `folder` caches rendered spheres.
-        """
+        """Create the validation with sphere queries; without a `layout_encoder` the one being trained is used."""
         usual = None if self.dataset is None else self.dataset.appearances[0]
         problems: list[DatasetError] | None = [] if self.skip_bad else None
         cache = folder / "validation.npz" if folder is not None and self.dataset is None else None

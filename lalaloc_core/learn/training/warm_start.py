@@ -45,11 +45,7 @@ HALVED, _EXPORTED = ".half", "encoder."
 
 @dataclass(frozen=True, kw_only=True)
 class WarmStart:
-    """Trained weights of one stage.
-
-    Attributes:
-        origin: description for checkpoints and manifests, with the total minutes and spheres spent so far.
-    """
+    """Trained weights of one stage, and their origin for checkpoints and manifests, with the totals spent so far."""
 
     checkpoint: Checkpoint
     origin: dict[str, Any]
@@ -185,10 +181,7 @@ def check_same_networks(stage: str, config: TrainConfig, trained: TrainConfig, w
 
 
 def find_checkpoint(stage: str, folder: Path, *, last: bool = False) -> Checkpoint:
-    """Load the checkpoint with the networks of stage "layout" or "image", possibly that of end-to-end training.
-
-    The best checkpoint is preferred unless `last` is set.
-    """
+    """Load the best checkpoint, or the last one, with the networks of a stage, possibly that of end-to-end training."""
     own, joint = folder / f"{stage}.pt", folder / f"{JOINT}.pt"
     if own.exists() and joint.exists():
         raise CheckpointError(f"'{folder}' holds both '{own.name}' and '{joint.name}'; remove one of them")

@@ -40,12 +40,7 @@ _SPHERE_SIZE = (512, 1024)
 
 @dataclass(frozen=True, eq=False)
 class TakenPhotograph:
-    """A photograph with the pose of its camera.
-
-    Attributes:
-        pixels: the picture; a full sphere if the album has spheres.
-        heading: azimuth of its centre, radians.
-    """
+    """A photograph, or a full sphere, with the pose of its camera; the heading (radians) is that of its centre."""
 
     pixels: UInt8[np.ndarray, "h w 3"]
     position_m: Float[np.ndarray, "2"]

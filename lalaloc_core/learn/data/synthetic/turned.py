@@ -33,13 +33,7 @@ _WAVES = 6
 
 
 class Instant(NamedTuple):
-    """Camera at the time of a frame.
-
-    Attributes:
-        turn: heading minus that of the first frame, radians.
-        pitch, roll: tilt, radians.
-        gain: exposure over the usual one.
-    """
+    """Camera at the time of a frame: turn since the first one and tilt (radians), and exposure over the usual one."""
 
     time_s: float
     turn: float
@@ -107,11 +101,7 @@ _COARSE_WINDOW, _COARSE_WINDOW_SIZE, _COARSE = Window(math.radians(75.0), math.r
 
 @dataclass(frozen=True, kw_only=True)
 class Phone:
-    """Camera that is turned about a person who holds it.
-
-    Attributes:
-        arm_m: distance (m) from the axis of the turn to the camera.
-    """
+    """Camera that is turned about a person who holds it, `arm_m` away from the axis of the turn."""
 
     width: int = 480
     height: int = 640

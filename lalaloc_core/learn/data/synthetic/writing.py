@@ -155,10 +155,7 @@ class _Job:
 
 
 def _write_scene(job: _Job, stop: Event | None = None) -> int:
-    """Render and write one scene; a failure leaves no files.
-
-    `stop` is checked between rooms; when set, the scene is abandoned. The result is the number of spheres written.
-    """
+    """Render and write one scene, and return its number of spheres; a failure, or `stop`, leaves no files."""
     settings, split = job.settings, SPLIT_NUMBERS[job.split]
     home, rng = home_of(split, settings.seed, job.number)
     renderer = split_renderer_cache(split, settings.seed, settings.textures).renderer(

@@ -26,10 +26,7 @@ def counter_run(
     wall_units: bool,
     ceiling_m: float | None = None,
 ) -> Piece:
-    """Return a run of kitchen units of a width and height (m).
-
-    With the height of the ceiling, there are things on the worktop, and wall units may reach the ceiling.
-    """
+    """Return a run of kitchen units; with the height of the ceiling, there are things on the worktop."""
     units = max(1, round(width / _UNIT_M))
     unit, depth = width / units, COUNTER_DEPTH_M
     hx, hy = 0.5 * width, 0.5 * depth

@@ -43,11 +43,7 @@ class Building:
 
 
 def building_of(split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> Building:
-    """Return a building with at least this floor area.
-
-    `split` and `seed` are those of its homes, see `plans.home_of`; `hall_share` is the share of the floor in
-    halls.
-    """
+    """Return a building of the homes of a split with at least this floor area, `hall_share` of it in halls."""
     return _Builder(split, seed, area_m2, hall_share).build()
 
 

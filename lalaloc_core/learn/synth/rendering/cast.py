@@ -102,10 +102,7 @@ class _ShellHits:
 
 
 def trace(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> Hits:
-    """Cast the camera's rays.
-
-    `direction` is a horizontal unit vector per column, and `slope` the tangent of each row's elevation.
-    """
+    """Cast the camera's rays: a horizontal unit vector per column, and the tangent of the elevation per row."""
     shell = _trace_shell(batch, direction, slope)
     return _before(batch, shell, cross_prisms(batch.prisms, direction, shell.end_m), direction, slope)
 

@@ -124,11 +124,7 @@ def add_door(
     slot_behind: int | None,
     rng: np.random.Generator,
 ) -> None:
-    """Add a door or a wide opening.
-
-    The opening is not a window; `wall` is its wall in the tables. `slot_behind` is the slot of the room behind it, None
-    for a closed or dark opening.
-    """
+    """Add a door or a wide opening; `slot_behind` is the slot of the room behind it, None if it is closed or dark."""
     room = home.plan.rooms[opening.room]
     s0, s1, head = opening.start_m, opening.end_m, opening.head_m
     is_framed = opening.kind != "opening" or (head < room.ceiling_height_m - 0.15 and rng.random() < 0.3)

@@ -63,11 +63,7 @@ class Prisms(Records):
 
 
 class VisibleRooms(Records):
-    """Room of the camera, then rooms seen through its doors.
-
-    Attributes:
-        light_m, light_colour: position, and colour times power, of the one lamp of a room seen through a door.
-    """
+    """Room of the camera, then rooms seen through its doors, each with the light of its one lamp."""
 
     ceiling_m, floor_surface, ceiling_surface = columns(3)
     light_m = Column(3)
@@ -92,13 +88,7 @@ class Lights(Records):
 
 
 class Sun(Records):
-    """Sunlight through one window; all 0 for none.
-
-    Attributes:
-        wall_start_m, wall_along: a point of the window's wall and the unit vector along it.
-        s0_m, s1_m: start and end of the window along the wall.
-        colour: colour times power.
-    """
+    """Sunlight through one window, from `s0_m` to `s1_m` along its wall; all 0 for none."""
 
     direction = Column(3)
     wall_start_m = Column(2)
@@ -108,13 +98,7 @@ class Sun(Records):
 
 
 class Backdrop(Records):
-    """The outdoors.
-
-    Attributes:
-        horizon: slope (tangent of the elevation) of the mean outline before the sky.
-        ruggedness: amplitude of the outline, as a slope.
-        turn, lift: shifts of outline and mottle as shares of a full turn.
-    """
+    """The outdoors: slopes of the outline before the sky, and shifts of it and its mottle as shares of a full turn."""
 
     sky = Column(3)
     ground = Column(3)

@@ -42,14 +42,7 @@ class Decal(NamedTuple):
 
 
 class SceneTables:
-    """Tables of one scene; see `RenderScene` for their rows.
-
-    Attributes:
-        walls_m: ends of the walls in the plan frame; those of the own room come first.
-        decals: later ones cover earlier ones.
-        prisms: rows of `render_scene.Prisms`, relative to the camera.
-        rooms: rows of `render_scene.VisibleRooms`.
-    """
+    """Tables of one scene, see `RenderScene`; the own room's walls come first, and later decals cover earlier ones."""
 
     def __init__(self, camera_m: Float[np.ndarray, "2"], surfaces: SurfaceTable) -> None:
         self.camera_m = camera_m
@@ -83,10 +76,7 @@ class SceneTables:
         slot: int = -1,
         depth_m: float = 0.0,
     ) -> None:
-        """Add a rectangle on a wall: its interval along the wall, and its interval of height.
-
-        With a `slot` it is a hole of some depth that shows that room.
-        """
+        """Add a rectangle on a wall; with a `slot` it is a hole of some depth that shows that room."""
         decal = Decal(
             wall=wall, s0_m=s_m[0], s1_m=s_m[1], z0_m=z_m[0], z1_m=z_m[1], surface=surface, slot=slot, depth_m=depth_m
         )
