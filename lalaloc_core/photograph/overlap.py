@@ -151,8 +151,8 @@ def find_links(
         for first in range(count)
         for step in range(1, apart + 1)
     }
-    rays = [_rays_of(*view) for view in zip(features, cameras, strict=True)]
-    rooted = [_rooted(view.descriptor) for view in features]
+    rays = [_rays_of(*each) for each in zip(features, cameras, strict=True)]
+    rooted = [_rooted(found.descriptor) for found in features]
     axes = [camera_axes(pitch=attitude.pitch, roll=attitude.roll) for attitude in attitudes]
 
     def link(pair: tuple[int, int], min_matches: int, min_share: float) -> Link | None:

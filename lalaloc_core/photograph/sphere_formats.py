@@ -2,7 +2,7 @@
 
 Such a picture passes for an ordinary photograph by its size, and would be localised with a wrong geometry. A sphere on
 its side or within bars is taken out of the picture; other formats are refused by name. All detectors judge one small
-picture, and take 2 ms together at most.
+picture.
 """
 
 from __future__ import annotations

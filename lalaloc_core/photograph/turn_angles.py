@@ -313,7 +313,7 @@ class _Fit:
         parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for side, numbers in enumerate((self._first, self._second)):
             for axis in range(3):
-                one, other = (view.copy() for view in pair)
+                one, other = (rays.copy() for rays in pair)
                 (one, other)[side][:, axis] += _STEP
                 slope = (self._match_residuals(one, other, log_focal, nearness) - base) / _STEP
                 parts.append((slope, rows, np.tile(3 * numbers + axis, 2)))

@@ -56,21 +56,21 @@ def turn_views(photographs: Sequence[Photograph]) -> list[TurnView]:
 
     An unknown field of view is that of the photographs that have one, else the mean of the estimates.
     """
-    known = [view for view in photographs if _has_lens(view)]
-    usual = known or [view for view in photographs if isinstance(view.camera, Perspective)]
-    log_focal = float(np.mean([math.log(_long_focal(view)) for view in usual])) if usual else 0.0
-    return [_turn_view(view, log_focal, is_known=bool(known)) for view in photographs]
+    known = [photograph for photograph in photographs if _has_lens(photograph)]
+    usual = known or [photograph for photograph in photographs if isinstance(photograph.camera, Perspective)]
+    log_focal = float(np.mean([math.log(_long_focal(photograph)) for photograph in usual])) if usual else 0.0
+    return [_turn_view(photograph, log_focal, is_known=bool(known)) for photograph in photographs]
 
 
-def _turn_view(view: Photograph, log_focal: float, *, is_known: bool) -> TurnView:
-    assert view.camera is not None
-    assert view.overview is not None
-    camera, focal_sd, overview = view.camera, 0.0, view.overview
-    if not _has_lens(view) and isinstance(camera, Perspective):
+def _turn_view(photograph: Photograph, log_focal: float, *, is_known: bool) -> TurnView:
+    assert photograph.camera is not None
+    assert photograph.overview is not None
+    camera, focal_sd, overview = photograph.camera, 0.0, photograph.overview
+    if not _has_lens(photograph) and isinstance(camera, Perspective):
         focal = math.exp(log_focal) * max(camera.width, camera.height)
         camera, overview = replace(camera, fx=focal, fy=focal), replace(overview, attitude=None)
         focal_sd = 0.0 if is_known else _LINES_FOCAL_SD
-    pitch, roll = (angle.value if angle.source == "given" else None for angle in (view.pitch, view.roll))
+    pitch, roll = (angle.value if angle.source == "given" else None for angle in (photograph.pitch, photograph.roll))
     return TurnView(overview=overview, camera=camera, focal_sd=focal_sd, pitch=pitch, roll=roll)
 
 
@@ -81,43 +81,43 @@ def turned_photographs(
     return [_turned(*each, size) for each in zip(photographs, views, angles, strict=True)]
 
 
-def _turned(view: Photograph, turn_view: TurnView, angles: TurnAngles, size: PatchSize) -> Photograph:
-    assert view.overview is not None
-    if view.overview.picture is None:
-        return replace(view, overview=None)
-    attitude, camera, hfov, warnings = angles.attitude, turn_view.camera, view.hfov, view.warnings
+def _turned(photograph: Photograph, turn_view: TurnView, angles: TurnAngles, size: PatchSize) -> Photograph:
+    assert photograph.overview is not None
+    if photograph.overview.picture is None:
+        return replace(photograph, overview=None)
+    attitude, camera, hfov, warnings = angles.attitude, turn_view.camera, photograph.hfov, photograph.warnings
     pitch, roll = (
         Assumed(value=value, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
         for value, sd in ((attitude.pitch, attitude.pitch_sd), (attitude.roll, attitude.roll_sd))
     )
-    pitch = view.pitch if view.pitch.source == "given" else pitch
-    roll = view.roll if view.roll.source == "given" else roll
-    if not _has_lens(view) and isinstance(camera, Perspective):
+    pitch = photograph.pitch if photograph.pitch.source == "given" else pitch
+    roll = photograph.roll if photograph.roll.source == "given" else roll
+    if not _has_lens(photograph) and isinstance(camera, Perspective):
         focal = camera.fx * angles.focal_factor
         camera = replace(camera, fx=focal, fy=focal)
         focal_sd = max(angles.focal_sd, _LINES_FOCAL_SD)
         hfov = Assumed(value=camera.hfov, sd=focal_sd * math.sin(camera.hfov), source="estimated")
     origin = "was estimated from all photographs of the turn"
-    if not _is_possible(view, camera, pitch.value, roll.value):
-        assert view.camera is not None
+    if not _is_possible(photograph, camera, pitch.value, roll.value):
+        assert photograph.camera is not None
         camera, hfov, pitch, roll, origin = (
-            view.camera,
-            view.hfov,
-            view.pitch,
-            view.roll,
+            photograph.camera,
+            photograph.hfov,
+            photograph.pitch,
+            photograph.roll,
             "was estimated from straight lines",
         )
     if hfov.source == "estimated":
         warnings = (*warnings, field_warning(hfov.value, hfov.sd, origin))
-    rows, columns = view.overview.picture.shape[:2]
+    rows, columns = photograph.overview.picture.shape[:2]
     small, tilt = camera.scaled(columns, rows), {"pitch": pitch.value, "roll": roll.value}
     return replace(
-        view,
+        photograph,
         hfov=hfov,
         pitch=pitch,
         roll=roll,
         azimuths=seen_azimuths(small, **tilt),
-        patches=cut_patches(view.overview.picture, small, **tilt, size=size),
+        patches=cut_patches(photograph.overview.picture, small, **tilt, size=size),
         camera=camera,
         axes=camera_axes(**tilt),
         overview=None,
@@ -125,19 +125,19 @@ def _turned(view: Photograph, turn_view: TurnView, angles: TurnAngles, size: Pat
     )
 
 
-def _is_possible(view: Photograph, camera: Camera, pitch: float, roll: float) -> bool:
+def _is_possible(photograph: Photograph, camera: Camera, pitch: float, roll: float) -> bool:
     """Return whether a photograph can have a camera and a tilt."""
-    low, high = HFOV_RANGE_DEG[view.projection]
+    low, high = HFOV_RANGE_DEG[photograph.projection]
     is_tilted = abs(math.degrees(pitch)) > MAX_PITCH_DEG or abs(math.degrees(roll)) > MAX_ROLL_DEG
     return not is_tilted and low <= math.degrees(camera.hfov) <= high
 
 
-def _has_lens(view: Photograph) -> bool:
+def _has_lens(photograph: Photograph) -> bool:
     """Return whether the field of view was stated, or is in the photograph's metadata."""
-    return view.hfov.source not in ("estimated", "assumed")
+    return photograph.hfov.source not in ("estimated", "assumed")
 
 
-def _long_focal(view: Photograph) -> float:
+def _long_focal(photograph: Photograph) -> float:
     """Return the focal length as a share of the longer side."""
-    assert isinstance(view.camera, Perspective)
-    return view.camera.fx / max(view.camera.width, view.camera.height)
+    assert isinstance(photograph.camera, Perspective)
+    return photograph.camera.fx / max(photograph.camera.width, photograph.camera.height)
