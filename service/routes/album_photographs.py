@@ -6,9 +6,9 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Query, Response
 
 from lalaloc_core.draw.plan import HEAT_PLACE
 from lalaloc_core.errors import InvalidCorrectionError, InvalidFeaturesError
@@ -34,13 +34,16 @@ from service.routes.batch_lines import BatchLines
 from service.routes.dependencies import After, ApiCall, Call, cursor_text, is_id, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
-    CONDITIONAL,
-    NOT_MODIFIED,
+    PHOTOGRAPH_LINES,
     QUERY_ERRORS,
     READ_ERRORS,
     STORE_ERRORS,
-    UNLESS_CHANGED,
+    changes,
+    deletes,
     json_body,
+    on_earth,
+    photographs_schema,
+    reads,
 )
 from service.routes.query_request import FEATURES, PHOTO, VARY, read_files
 from service.schemas.albums import (
@@ -68,12 +71,7 @@ _VALUES = 100
 _MOST, _PAGE = 500, 100
 _MAX_NAME = 255
 _MISSING = (errors.UnknownAlbumError, errors.UnknownAlbumPhotographError)
-_PHOTOS_SCHEMA: dict[str, Any] = {
-    "type": "array",
-    "items": {"type": "string", "format": "binary"},
-    "description": "Photographs, one part named `photo` each, as for `POST /localise`; limits: "
-    "`max_batch_photographs`, and `max_sequence_bytes` together.",
-}
+_PHOTOS_SCHEMA = photographs_schema("Photographs", "max_batch_photographs")
 _FEATURES_SCHEMA = _PHOTOS_SCHEMA | {
     "description": "Instead of `photo`: their features, computed on the device (docs/reference/features.md)."
 }
@@ -92,7 +90,7 @@ _BODY = {
     response_class=LinesResponse,
     response_model=AlbumLine,
     openapi_extra={"requestBody": _BODY},
-    responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
+    responses=PHOTOGRAPH_LINES
     | problem_responses(
         *(error for error in QUERY_ERRORS if error not in (errors.PlanFailedError, errors.PlanNotReadyError)),
         errors.RateLimitedError,
@@ -200,7 +198,7 @@ class _Adding:
             # As for `POST /localise`, files are not listed under `content`.
             "description": f"The photographs with their pins; with `Accept: {_CSV}` a table, with `Accept: {_SVG}` a "
             "drawing of a plan with its pins.",
-            "content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}},
+            "content": on_earth(geojson="A FeatureCollection of RFC 7946."),
         }
     }
     | problem_responses(errors.UnknownAlbumError, errors.UnanchoredPlanError, *READ_ERRORS),
@@ -268,13 +266,7 @@ async def _drawing(
     return head.encode() + rooms.content.replace(_HEAT, b"") + tail.encode()
 
 
-@router.get(
-    "/{photograph_id}",
-    summary="Get a photograph of an album",
-    response_model=AlbumPhotographAnswer,
-    openapi_extra=CONDITIONAL,
-    responses=NOT_MODIFIED | problem_responses(*_MISSING, *READ_ERRORS),
-)
+@router.get("/{photograph_id}", summary="Get a photograph of an album", **reads(AlbumPhotographAnswer, *_MISSING))
 def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
     """Return a photograph with its correction and its pin."""
     content, etag = _representation(_photograph_of(call, album_of(call, album_id), photograph_id))
@@ -284,16 +276,15 @@ def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Respo
 @router.patch(
     "/{photograph_id}",
     summary="Correct a photograph of an album",
-    response_model=AlbumPhotographAnswer,
-    openapi_extra={"requestBody": json_body(PhotographChangeDocument), "parameters": UNLESS_CHANGED},
-    responses=problem_responses(
+    **changes(
+        AlbumPhotographAnswer,
+        json_body(PhotographChangeDocument),
         errors.InvalidRequestError,
         InvalidCorrectionError,
         *BODY_ERRORS,
         *STORE_ERRORS,
         *_MISSING,
         errors.AlbumOutdatedError,
-        errors.RevisionMismatchError,
     ),
 )
 async def correct_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
@@ -333,13 +324,7 @@ async def correct_album_photograph(album_id: str, photograph_id: str, call: Call
     return answer
 
 
-@router.delete(
-    "/{photograph_id}",
-    status_code=status.HTTP_204_NO_CONTENT,
-    summary="Delete a photograph of an album",
-    openapi_extra={"parameters": UNLESS_CHANGED},
-    responses=problem_responses(*_MISSING, errors.RevisionMismatchError, *READ_ERRORS),
-)
+@router.delete("/{photograph_id}", summary="Delete a photograph of an album", **deletes(*_MISSING))
 def delete_album_photograph(album_id: str, photograph_id: str, call: Call) -> None:
     """Delete a photograph with its features and its pin; the rest is solved again."""
     album = album_of(call, album_id)

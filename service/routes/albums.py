@@ -5,56 +5,30 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
-from fastapi import APIRouter, Response, status
-from fastapi.responses import StreamingResponse
+from fastapi import APIRouter, Response
 
-from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.encode.features import gives_features
 from service import errors
 from service.capacity.admission_control import STREAM, admitted_as
-from service.http.events import EventStream
 from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.representations import not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON, Parts
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
-from service.routes.descriptions import (
-    BODY_ERRORS,
-    CONDITIONAL,
-    IDEMPOTENCY_ERRORS,
-    IDEMPOTENCY_KEY,
-    NOT_MODIFIED,
-    READ_ERRORS,
-    STORE_ERRORS,
-    UNLESS_CHANGED,
-    json_body,
-)
+from service.routes.descriptions import BEGIN_ERRORS, READ_ERRORS, deletes, event_stream, json_body, reads, stores
 from service.schemas.albums import AlbumAnswer, AlbumDocument, AlbumList, AlbumSolution, AlbumSummary
 from service.storage.album_rows import AlbumRecord, NewAlbum
 
 router = APIRouter(prefix="/albums", tags=["albums"])
 # Lists, objects and items of an album document.
 _VALUES = 100
-_ALBUM_RESPONSES = problem_responses(errors.UnknownAlbumError, *READ_ERRORS)
 
 
 @router.post(
     "",
-    status_code=status.HTTP_201_CREATED,
     summary="Create an album",
-    response_model=AlbumAnswer,
-    openapi_extra={"requestBody": json_body(AlbumDocument), "parameters": [IDEMPOTENCY_KEY]},
-    responses=problem_responses(
-        InvalidPoseError,
-        errors.InvalidRequestError,
-        *BODY_ERRORS,
-        *STORE_ERRORS,
-        errors.UnknownFloorPlanError,
-        errors.UnknownVenueError,
-        errors.VenueUnsearchableError,
-        errors.FeaturelessModelError,
-        errors.TooManyAlbumsError,
-        *IDEMPOTENCY_ERRORS,
+    **stores(
+        AlbumAnswer, json_body(AlbumDocument), *BEGIN_ERRORS, errors.FeaturelessModelError, errors.TooManyAlbumsError
     ),
 )
 async def create_album(call: Call) -> Response:
@@ -98,13 +72,7 @@ def list_albums(call: Call, page: Page, name: Name = None) -> AlbumList:
     return AlbumList(albums=[_summary(record, call) for record in found], next_cursor=more)
 
 
-@router.get(
-    "/{album_id}",
-    summary="Get an album",
-    response_model=AlbumAnswer,
-    openapi_extra=CONDITIONAL,
-    responses=NOT_MODIFIED | _ALBUM_RESPONSES,
-)
+@router.get("/{album_id}", summary="Get an album", **reads(AlbumAnswer, errors.UnknownAlbumError))
 def get_album(album_id: str, call: Call) -> Response:
     """Return an album with its state and what its photographs have in common."""
     content, etag = _representation(album_of(call, album_id), call)
@@ -114,14 +82,7 @@ def get_album(album_id: str, call: Call) -> Response:
 @router.get(
     "/{album_id}/events",
     summary="Follow an album",
-    response_class=StreamingResponse,
-    responses={
-        200: {
-            "description": "Server-sent events; their data is an AlbumEvent.",
-            "content": {EventStream.media_type: {"schema": {"type": "string"}}},
-        },
-        **_ALBUM_RESPONSES,
-    },
+    **event_stream("an AlbumEvent", problem_responses(errors.UnknownAlbumError, *READ_ERRORS)),
 )
 @admitted_as(STREAM)
 async def follow_album(album_id: str, call: Call) -> Response:
@@ -136,13 +97,7 @@ async def follow_album(album_id: str, call: Call) -> Response:
     )
 
 
-@router.delete(
-    "/{album_id}",
-    status_code=status.HTTP_204_NO_CONTENT,
-    summary="Delete an album",
-    openapi_extra={"parameters": UNLESS_CHANGED},
-    responses=problem_responses(errors.UnknownAlbumError, errors.RevisionMismatchError, *READ_ERRORS),
-)
+@router.delete("/{album_id}", summary="Delete an album", **deletes(errors.UnknownAlbumError))
 def delete_album(album_id: str, call: Call) -> None:
     """Delete an album with its photographs."""
     current = album_of(call, album_id)

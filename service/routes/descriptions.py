@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from fastapi import Response, status
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
 from lalaloc_core.errors import (
@@ -16,10 +18,11 @@ from lalaloc_core.errors import (
     SeveralLevelsError,
 )
 from service import errors
+from service.http.events import EventStream
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
 from service.http.problems import problem_responses
 from service.http.representations import NDJSON
-from service.http.uploads import JSON
+from service.http.uploads import GEOJSON, GEOPOSE, JSON
 
 Errors = tuple[type[Exception], ...]
 Responses = dict[int | str, dict[str, Any]]
@@ -71,18 +74,95 @@ QUERY_ERRORS: Errors = (
     errors.DeadlineExceededError,
 )
 
-PARTIAL_CONTENT: Responses = {206: {"description": "The bytes that the request asks for."}}
-NOT_MODIFIED: Responses = {304: {"description": "The client has this representation already."}}
-PLAN_RESPONSES = problem_responses(errors.UnknownFloorPlanError, *READ_ERRORS)
-REVISION_RESPONSES = NOT_MODIFIED | problem_responses(
-    errors.UnknownFloorPlanError, errors.UnknownRevisionError, *READ_ERRORS
+# Errors of beginning something that lasts, such as a session, in a plan or venue.
+BEGIN_ERRORS: Errors = (
+    InvalidPoseError,
+    errors.InvalidRequestError,
+    *BODY_ERRORS,
+    *STORE_ERRORS,
+    errors.UnknownFloorPlanError,
+    errors.UnknownVenueError,
+    errors.VenueUnsearchableError,
 )
 
+BINARY: dict[str, Any] = {"type": "string", "format": "binary"}
+PARTIAL_CONTENT: Responses = {206: {"description": "The bytes that the request asks for."}}
+_NOT_MODIFIED: Responses = {304: {"description": "The client has this representation already."}}
+PLAN_RESPONSES = problem_responses(errors.UnknownFloorPlanError, *READ_ERRORS)
+PHOTOGRAPH_LINES: Responses = {
+    200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}
+}
 
-def file_response(*media_types: str, schema_format: str | None = "binary") -> Responses:
-    """Describe an answer that is a file; `schema_format` is None for text."""
-    schema = {"type": "string"} if schema_format is None else {"type": "string", "format": schema_format}
-    return {200: {"content": {name: {"schema": schema} for name in media_types}}} | NOT_MODIFIED
+
+def photographs_schema(text: str, limit: str, **further: Any) -> dict[str, Any]:
+    """Describe the part of a form that has photographs; `text` tells their order, `limit` is that of their number."""
+    description = f"{text}, one part named `photo` each, as for `POST /localise`; limits: `{limit}`, and "
+    return {"type": "array", "items": BINARY, **further, "description": f"{description}`max_sequence_bytes` together."}
+
+
+def on_earth(**texts: str) -> dict[str, Any]:
+    """Describe answers in latitude and longitude; `geojson` and `geopose` tell of what they are one."""
+    media = {"geojson": GEOJSON, "geopose": GEOPOSE}
+    return {media[name]: {"schema": {"type": "object", "description": text}} for name, text in texts.items()}
+
+
+def event_stream(event: str, responses: Responses) -> dict[str, Any]:
+    """Describe a route that answers with server-sent events."""
+    content = {EventStream.media_type: {"schema": {"type": "string"}}}
+    answer = {"description": f"Server-sent events; their data is {event}.", "content": content}
+    return {"response_class": StreamingResponse, "responses": {200: answer, **responses}}
+
+
+def reads(model: type[BaseModel], *failures: type[Exception]) -> dict[str, Any]:
+    """Describe a route that answers with a representation, or with 304."""
+    responses = _NOT_MODIFIED | problem_responses(*failures, *READ_ERRORS)
+    return {"response_model": model, "openapi_extra": CONDITIONAL, "responses": responses}
+
+
+def reads_file(
+    *media: str, responses: Responses, schema: dict[str, Any] = BINARY, parameters: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Describe a route that answers with a file, or with 304."""
+    answer: Responses = {200: {"content": {name: {"schema": schema} for name in media}}}
+    return {
+        "response_class": Response,
+        "openapi_extra": parameters or CONDITIONAL,
+        "responses": answer | _NOT_MODIFIED | responses,
+    }
+
+
+def stores(
+    model: type[BaseModel], body: dict[str, Any], *failures: type[Exception], lines: Responses | None = None
+) -> dict[str, Any]:
+    """Describe a route that stores something new, once for an idempotency key."""
+    return {
+        "status_code": status.HTTP_201_CREATED,
+        "response_model": model,
+        "openapi_extra": {"requestBody": body, "parameters": [IDEMPOTENCY_KEY]},
+        "responses": (lines or {}) | problem_responses(*failures, *IDEMPOTENCY_ERRORS),
+    }
+
+
+def changes(
+    model: type[BaseModel], body: dict[str, Any], *failures: type[Exception], idempotent: bool = False
+) -> dict[str, Any]:
+    """Describe a route that changes something stored, under preconditions."""
+    known = (*failures, errors.RevisionMismatchError, *(IDEMPOTENCY_ERRORS if idempotent else ()))
+    parameters = [*UNLESS_CHANGED, IDEMPOTENCY_KEY] if idempotent else UNLESS_CHANGED
+    return {
+        "response_model": model,
+        "openapi_extra": {"requestBody": body, "parameters": parameters},
+        "responses": problem_responses(*known),
+    }
+
+
+def deletes(*failures: type[Exception]) -> dict[str, Any]:
+    """Describe a route that deletes something stored, under preconditions."""
+    return {
+        "status_code": status.HTTP_204_NO_CONTENT,
+        "openapi_extra": {"parameters": UNLESS_CHANGED},
+        "responses": problem_responses(*failures, errors.RevisionMismatchError, *READ_ERRORS),
+    }
 
 
 def import_lines(model: type[BaseModel]) -> Responses:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import astuple
 from functools import partial
 
-from fastapi import APIRouter, Response, status
+from fastapi import APIRouter, Response
 from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.importers import OnStep
-from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.errors import TooManyFloorPlansError, UnknownFloorPlanError, UnknownRevisionError
 from service.grids import GridState
 from service.http.problems import problem_responses
 from service.http.representations import not_modified, revision_etag, tagged_answer
@@ -18,16 +18,7 @@ from service.plan_documents import Rendition
 from service.plan_files.plan_file import PlanFile
 from service.plan_files.renditions import describe, state_of_description, with_head
 from service.routes.dependencies import ApiCall, Call, Name, Page, Revision
-from service.routes.descriptions import (
-    CONDITIONAL,
-    IDEMPOTENCY_ERRORS,
-    IDEMPOTENCY_KEY,
-    READ_ERRORS,
-    REVISION_RESPONSES,
-    UNLESS_CHANGED,
-    UPLOAD_ERRORS,
-    import_lines,
-)
+from service.routes.descriptions import READ_ERRORS, UPLOAD_ERRORS, changes, deletes, import_lines, reads, stores
 from service.routes.plan_uploads import UPLOAD_BODY, PlanUpload, answer_import, prepare_plan, read_upload
 from service.schemas.stored_plans import FloorPlanAnswer, FloorPlanList, FloorPlanSummary
 from service.storage.records import PlanRecord, PlanSummary
@@ -37,12 +28,8 @@ router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
 @router.post(
     "",
-    status_code=status.HTTP_201_CREATED,
     summary="Upload a floor plan",
-    response_model=FloorPlanAnswer,
-    openapi_extra={"requestBody": UPLOAD_BODY, "parameters": [IDEMPOTENCY_KEY]},
-    responses=import_lines(FloorPlanAnswer)
-    | problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, *IDEMPOTENCY_ERRORS),
+    **stores(FloorPlanAnswer, UPLOAD_BODY, *UPLOAD_ERRORS, TooManyFloorPlansError, lines=import_lines(FloorPlanAnswer)),
 )
 async def create_floorplan(call: Call) -> Response:
     """Store a floor plan from a plan file.
@@ -83,11 +70,7 @@ def list_floorplans(call: Call, page: Page, name: Name = None) -> FloorPlanList:
 
 
 @router.get(
-    "/{floorplan_id}",
-    summary="Get a floor plan",
-    response_model=FloorPlanAnswer,
-    openapi_extra=CONDITIONAL,
-    responses=REVISION_RESPONSES,
+    "/{floorplan_id}", summary="Get a floor plan", **reads(FloorPlanAnswer, UnknownFloorPlanError, UnknownRevisionError)
 )
 async def get_floorplan(floorplan_id: str, call: Call, revision: Revision = None) -> Response:
     """Return a stored floor plan with the status and progress of its pose grid."""
@@ -108,9 +91,7 @@ async def get_floorplan(floorplan_id: str, call: Call, revision: Revision = None
 @router.put(
     "/{floorplan_id}",
     summary="Replace a floor plan",
-    response_model=FloorPlanAnswer,
-    openapi_extra={"requestBody": UPLOAD_BODY, "parameters": UNLESS_CHANGED},
-    responses=problem_responses(*UPLOAD_ERRORS, UnknownFloorPlanError, RevisionMismatchError),
+    **changes(FloorPlanAnswer, UPLOAD_BODY, *UPLOAD_ERRORS, UnknownFloorPlanError),
 )
 async def replace_floorplan(floorplan_id: str, call: Call) -> Response:
     """Store a new revision of a floor plan, from a file of any format that `POST /floorplans` accepts.
@@ -134,13 +115,7 @@ def _replace(call: ApiCall, uploaded: PlanUpload, current: PlanSummary, expected
     return _change_answer(call, record, file, GridState.after_upload(new.grid), created=False)
 
 
-@router.delete(
-    "/{floorplan_id}",
-    status_code=status.HTTP_204_NO_CONTENT,
-    summary="Delete a floor plan",
-    openapi_extra={"parameters": UNLESS_CHANGED},
-    responses=problem_responses(UnknownFloorPlanError, RevisionMismatchError, *READ_ERRORS),
-)
+@router.delete("/{floorplan_id}", summary="Delete a floor plan", **deletes(UnknownFloorPlanError))
 def delete_floorplan(floorplan_id: str, call: Call) -> None:
     """Delete a floor plan with all its revisions, uploaded files and pose grids.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Response, status
 
@@ -17,7 +17,16 @@ from service.query import Content, PhotographQuery, PictureQuery, QueryContext
 from service.query.geopose import geojson_feature, geopose_document
 from service.routes.batch_lines import BatchLines
 from service.routes.dependencies import Call, is_id
-from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS, READ_ERRORS
+from service.routes.descriptions import (
+    BINARY,
+    IDEMPOTENCY_ERRORS,
+    PHOTOGRAPH_LINES,
+    PLACE_ERRORS,
+    QUERY_ERRORS,
+    READ_ERRORS,
+    on_earth,
+    photographs_schema,
+)
 from service.routes.query_request import (
     FEATURES,
     PHOTO,
@@ -42,12 +51,10 @@ _PNG, _SVG = "image/png", "image/svg+xml"
 _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-ancestors 'none'"}
 
 
-_PHOTO_SCHEMA = {
-    "type": "string",
-    "format": "binary",
+_PHOTO_SCHEMA = BINARY | {
     "description": "Photograph as JPEG, PNG, WebP or, with the extra `heic`, HEIC: a 360° sphere, twice as wide as "
     "high, or a part of it with photo sphere metadata (GPano in XMP), or, for models with an encoder of views, an "
-    "ordinary or fisheye photograph, or a strip of a phone's panorama mode. Its EXIF metadata state the field of view.",
+    "ordinary or fisheye photograph, or a strip of a phone's panorama mode. Its EXIF metadata state the field of view."
 }
 
 
@@ -65,10 +72,7 @@ _ON_EARTH = {GEOJSON: geojson_feature, GEOPOSE: geopose_document}
             # Pictures are not listed under `content`, which would make the type of an answer in generated clients a
             # union with strings.
             "description": f"The answer; with `Accept: {_PNG}` or `Accept: {_SVG}`, its picture.",
-            "content": {
-                GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}},
-                GEOPOSE: {"schema": {"type": "object", "description": "A Basic-Quaternion of OGC GeoPose 1.0."}},
-            },
+            "content": on_earth(geojson="A Feature of RFC 7946.", geopose="A Basic-Quaternion of OGC GeoPose 1.0."),
         }
     }
     | problem_responses(
@@ -140,13 +144,7 @@ async def localise(
     return await idempotent.run_async(parts, respond, call.runtime.reads)
 
 
-_PHOTOS_SCHEMA: dict[str, Any] = {
-    "type": "array",
-    "items": {"type": "string", "format": "binary"},
-    "minItems": 1,
-    "description": "Photographs, one part named `photo` each, as for `POST /localise`; limits: "
-    "`max_batch_photographs`, and `max_sequence_bytes` together.",
-}
+_PHOTOS_SCHEMA = photographs_schema("Photographs", "max_batch_photographs", minItems=1)
 
 
 @router.post(
@@ -156,7 +154,7 @@ _PHOTOS_SCHEMA: dict[str, Any] = {
     response_class=LinesResponse,
     response_model=BatchLine,
     openapi_extra=body_schema(LocaliseForm, _PHOTOS_SCHEMA, idempotent=False),
-    responses={200: {"description": f"`{NDJSON}`: a line of JSON per photograph, in the order of the request."}}
+    responses=PHOTOGRAPH_LINES
     | problem_responses(
         InvalidHintError, errors.RateLimitedError, errors.UnknownVenueError, errors.UnknownFloorPlanError, *QUERY_ERRORS
     ),

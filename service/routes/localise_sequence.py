@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter, Response
 
 from lalaloc_core.errors import InvalidFilmError
@@ -15,28 +13,29 @@ from service.http.uploads import GEOJSON, GEOPOSE, JSON, Parts, Repeats, Settabl
 from service.query import Content, QueryContext, SequenceQuery
 from service.query.geopose import geojson_features, geopose_documents
 from service.routes.dependencies import ApiCall, Call
-from service.routes.descriptions import IDEMPOTENCY_ERRORS, PLACE_ERRORS, QUERY_ERRORS
+from service.routes.descriptions import (
+    BINARY,
+    IDEMPOTENCY_ERRORS,
+    PLACE_ERRORS,
+    QUERY_ERRORS,
+    on_earth,
+    photographs_schema,
+)
 from service.routes.query_request import FILM, PHOTO, answer_as, body_schema, check_anchor, photographs_of, read_query
 from service.schemas import SequenceAnswer, SequenceForm
 from service.settings.settings import FILM_PHOTOGRAPHS
 
 router = APIRouter(tags=["localisation"])
 _MIN_PHOTOGRAPHS = 2
-_FILM_SCHEMA = {
-    "type": "string",
-    "format": "binary",
+_FILM_SCHEMA = BINARY | {
     "description": f"Instead of `{PHOTO}`: a film of one slow turn, once around on the spot: MP4, "
     "MOV or WebM with H.264, HEVC, VP8 or VP9. Limits: `max_film_bytes`, `max_film_s`, `max_film_pixels`, "
     "`max_film_cpu_s`. "
-    "Sharp frames at equal angles become poses.",
+    "Sharp frames at equal angles become poses."
 }
-_PHOTOS_SCHEMA: dict[str, Any] = {
-    "type": "array",
-    "items": {"type": "string", "format": "binary"},
-    "minItems": _MIN_PHOTOGRAPHS,
-    "description": "Photographs in the order in which they were taken, one part named `photo` each, as for "
-    "`POST /localise`; limits: `max_sequence_photographs`, and `max_sequence_bytes` together.",
-}
+_PHOTOS_SCHEMA = photographs_schema(
+    "Photographs in the order in which they were taken", "max_sequence_photographs", minItems=_MIN_PHOTOGRAPHS
+)
 
 
 _GEOPOSES = "One Basic-Quaternion of OGC GeoPose 1.0 for each photograph, in their order."
@@ -52,7 +51,7 @@ _ON_EARTH = {GEOJSON: geojson_features, GEOPOSE: geopose_documents}
     responses={
         200: {
             "content": {
-                GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}},
+                **on_earth(geojson="A FeatureCollection of RFC 7946."),
                 GEOPOSE: {"schema": {"type": "array", "items": {"type": "object"}, "description": _GEOPOSES}},
             }
         }

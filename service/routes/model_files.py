@@ -20,7 +20,7 @@ from service.http.problems import problem_responses
 from service.http.representations import byte_range, digest_etag, not_modified, tagged_answer, tagged_stream
 from service.http.uploads import JSON, on_request_end
 from service.routes.dependencies import ApiCall, Call
-from service.routes.descriptions import PARTIAL, PARTIAL_CONTENT, file_response
+from service.routes.descriptions import PARTIAL, PARTIAL_CONTENT, reads_file
 
 router = APIRouter(prefix="/model", tags=["localisation"])
 _BINARY = "application/octet-stream"
@@ -33,11 +33,12 @@ _PACKED = ".planes.gz"
 @router.get(
     "/{file}",
     summary="Get a file of the image encoder",
-    response_class=Response,
-    openapi_extra=PARTIAL,
-    responses=file_response("*/*")
-    | PARTIAL_CONTENT
-    | problem_responses(UnknownModelFileError, InvalidRequestError, RangeError, ChangedModelFileError),
+    **reads_file(
+        "*/*",
+        parameters=PARTIAL,
+        responses=PARTIAL_CONTENT
+        | problem_responses(UnknownModelFileError, InvalidRequestError, RangeError, ChangedModelFileError),
+    ),
 )
 async def get_model_file(file: str, call: Call) -> Response:
     """Return a file with which a device computes features: `manifest.json`, `image_encoder.onnx`, `view_encoder.onnx`.

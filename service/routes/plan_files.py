@@ -8,7 +8,6 @@ from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
-from fastapi.responses import StreamingResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
@@ -16,28 +15,14 @@ from lalaloc_core.conditions import HeadingState, Photograph, condition_of
 from lalaloc_core.draw.plan import HEAT_PLACE, Bounds, Marker, svg_around
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
+from service import errors
 from service.capacity.admission_control import STREAM, admitted_as
-from service.errors import (
-    ConverterNotReadyError,
-    InvalidRequestError,
-    UnanchoredPlanError,
-    UnknownFloorPlanError,
-    UnmeasuredModelError,
-)
-from service.http.events import EventStream
 from service.http.problems import problem_responses
 from service.http.representations import digest_etag, not_modified, revision_etag, tagged_answer, tagged_stream
 from service.http.uploads import JSON
 from service.plan_documents import PREDICTIONS, RenditionKind
 from service.routes.dependencies import ApiCall, Call, Revision
-from service.routes.descriptions import (
-    CONDITIONAL,
-    NOT_MODIFIED,
-    PLAN_RESPONSES,
-    READ_ERRORS,
-    REVISION_RESPONSES,
-    file_response,
-)
+from service.routes.descriptions import PLAN_RESPONSES, READ_ERRORS, event_stream, reads, reads_file
 from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.stored_plans import LayoutAnswer
 from service.storage.records import PlanSummary
@@ -51,16 +36,15 @@ _INERT = "default-src 'none'; img-src data:"
 # Tolerance for a covariance whose three numbers were rounded.
 _ROUNDED = 1e-3
 # Predictions are made by conversion workers.
-_PREDICTED = problem_responses(UnknownFloorPlanError, UnmeasuredModelError, *READ_ERRORS, ConverterNotReadyError)
+_PREDICTION_ERRORS = (errors.UnknownFloorPlanError, errors.UnmeasuredModelError, errors.ConverterNotReadyError)
+_TEXT = {"type": "string"}
 
 
 @router.get(
     "/{floorplan_id}/original",
     summary="Get the uploaded file",
-    response_class=Response,
-    openapi_extra=CONDITIONAL,
     # Bytes, even of a JSON plan: generated clients must not parse what was uploaded.
-    responses=file_response("*/*") | PLAN_RESPONSES,
+    **reads_file("*/*", responses=PLAN_RESPONSES),
 )
 async def get_original(floorplan_id: str, call: Call) -> Response:
     """Return the uploaded file of the current revision, unchanged, with the media type of its content."""
@@ -70,7 +54,7 @@ async def get_original(floorplan_id: str, call: Call) -> Response:
         return answer
     original = await run_in_threadpool(originals.checked, plan.revision_id)
     if digest is None or original is None:
-        raise UnknownFloorPlanError(floorplan_id)
+        raise errors.UnknownFloorPlanError(floorplan_id)
     # An uploaded drawing can contain scripts, so browsers must not open it as a page of this service.
     kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
     chunks = _chunks(plan, original.size_bytes, call)
@@ -80,11 +64,15 @@ async def get_original(floorplan_id: str, call: Call) -> Response:
 @router.get(
     "/{floorplan_id}/export",
     summary="Export a floor plan",
-    response_class=Response,
-    openapi_extra=CONDITIONAL,
-    responses=file_response(*(FORMATS[name].media_type for name in EXPORT_FORMATS))
-    | problem_responses(
-        UnknownFloorPlanError, UnanchoredPlanError, MissingExtraError, *READ_ERRORS, ConverterNotReadyError
+    **reads_file(
+        *(FORMATS[name].media_type for name in EXPORT_FORMATS),
+        responses=problem_responses(
+            errors.UnknownFloorPlanError,
+            errors.UnanchoredPlanError,
+            MissingExtraError,
+            *READ_ERRORS,
+            errors.ConverterNotReadyError,
+        ),
     ),
 )
 async def get_export(
@@ -98,17 +86,13 @@ async def get_export(
     """Return the plan in another file format."""
     plan = await run_in_threadpool(call.plan, floorplan_id)
     if format == "imdf" and not plan.anchored:
-        raise UnanchoredPlanError(plan.id)
+        raise errors.UnanchoredPlanError(plan.id)
     kept = {"Content-Disposition": f'attachment; filename="plan.{FORMATS[format].suffix}"'}
     return await _rendition(call, plan, format, FORMATS[format].media_type, kept)
 
 
 @router.get(
-    "/{floorplan_id}/preview.svg",
-    summary="Get a drawing",
-    response_class=Response,
-    openapi_extra=CONDITIONAL,
-    responses=file_response(_SVG, schema_format=None) | PLAN_RESPONSES,
+    "/{floorplan_id}/preview.svg", summary="Get a drawing", **reads_file(_SVG, responses=PLAN_RESPONSES, schema=_TEXT)
 )
 async def get_preview(
     floorplan_id: str,
@@ -130,12 +114,12 @@ async def get_preview(
 ) -> Response:
     """Return a drawing of the plan with room names, and optionally a camera; one SVG unit is one metre."""
     if (x_m is None) != (y_m is None):
-        raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; give both x_m and y_m")])
+        raise errors.InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; give both x_m and y_m")])
     if x_m is None:
         marker_fields = {"heading_deg": heading_deg, "covariance_m2": covariance_m2}
         faults = [(name, "needs x_m and y_m") for name, value in marker_fields.items() if value is not None]
         if faults:
-            raise InvalidRequestError(faults)
+            raise errors.InvalidRequestError(faults)
     marker = None
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
@@ -153,13 +137,7 @@ async def get_preview(
     return tagged_answer(parts, _SVG, etag, policy)
 
 
-@router.get(
-    "/{floorplan_id}/mesh.glb",
-    summary="Get a mesh",
-    response_class=Response,
-    openapi_extra=CONDITIONAL,
-    responses=file_response(_GLB) | PLAN_RESPONSES,
-)
+@router.get("/{floorplan_id}/mesh.glb", summary="Get a mesh", **reads_file(_GLB, responses=PLAN_RESPONSES))
 async def get_mesh(floorplan_id: str, call: Call) -> Response:
     """Return floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
     plan = await run_in_threadpool(call.plan, floorplan_id)
@@ -169,9 +147,7 @@ async def get_mesh(floorplan_id: str, call: Call) -> Response:
 @router.get(
     "/{floorplan_id}/localisability",
     summary="Predict which photographs will be found",
-    response_model=LocalisabilityAnswer,
-    openapi_extra=CONDITIONAL,
-    responses=NOT_MODIFIED | _PREDICTED,
+    **reads(LocalisabilityAnswer, *_PREDICTION_ERRORS),
 )
 async def get_localisability(
     floorplan_id: str,
@@ -193,9 +169,7 @@ async def get_localisability(
 @router.get(
     "/{floorplan_id}/localisability.svg",
     summary="Get a map of the photographs that will be found",
-    response_class=Response,
-    openapi_extra=CONDITIONAL,
-    responses=file_response(_SVG, schema_format=None) | _PREDICTED,
+    **reads_file(_SVG, responses=problem_responses(*_PREDICTION_ERRORS, *READ_ERRORS), schema=_TEXT),
 )
 async def get_localisability_map(
     floorplan_id: str,
@@ -214,9 +188,7 @@ async def get_localisability_map(
 @router.get(
     "/{floorplan_id}/layout",
     summary="Get the walls of a floor plan",
-    response_model=LayoutAnswer,
-    openapi_extra=CONDITIONAL,
-    responses=REVISION_RESPONSES,
+    **reads(LayoutAnswer, errors.UnknownFloorPlanError, errors.UnknownRevisionError),
 )
 async def get_layout(floorplan_id: str, call: Call, revision: Revision = None) -> Response:
     """Return the walls of each room, and the part of a wall that each opening takes up.
@@ -228,18 +200,7 @@ async def get_layout(floorplan_id: str, call: Call, revision: Revision = None) -
     return await _rendition(call, plan, "layout", JSON)
 
 
-@router.get(
-    "/{floorplan_id}/events",
-    summary="Follow a floor plan",
-    response_class=StreamingResponse,
-    responses={
-        200: {
-            "description": "Server-sent events; their data is a PlanEvent.",
-            "content": {EventStream.media_type: {"schema": {"type": "string"}}},
-        },
-        **PLAN_RESPONSES,
-    },
-)
+@router.get("/{floorplan_id}/events", summary="Follow a floor plan", **event_stream("a PlanEvent", PLAN_RESPONSES))
 @admitted_as(STREAM)
 async def follow_floorplan(floorplan_id: str, call: Call) -> Response:
     """Stream server-sent events about the plan's pose grid.
@@ -261,7 +222,7 @@ async def _chunks(plan: PlanSummary, size_bytes: int, call: ApiCall) -> AsyncIte
         async with call.reading():
             chunk = await run_in_threadpool(call.store.originals.chunk, plan.revision_id, number)
         if chunk is None:
-            raise UnknownFloorPlanError(plan.id)
+            raise errors.UnknownFloorPlanError(plan.id)
         yield chunk
         sent_bytes, number = sent_bytes + len(chunk), number + 1
 
@@ -289,7 +250,7 @@ def _check_near(marker: Marker, bounds_m: Bounds) -> None:
         if not low - margin_m <= value <= high + margin_m
     ]
     if faults:
-        raise InvalidRequestError(faults)
+        raise errors.InvalidRequestError(faults)
 
 
 def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
@@ -298,7 +259,7 @@ def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
         return None
     xx, xy, yy = given
     if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + _ROUNDED):
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}; xx and yy must be at least 0, and xy² at most xx·yy")]
         )
     return xx, xy, yy

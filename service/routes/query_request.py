@@ -30,7 +30,7 @@ from service.http.uploads import (
 )
 from service.query import Content, QueryContext
 from service.routes.dependencies import ApiCall
-from service.routes.descriptions import IDEMPOTENCY_KEY
+from service.routes.descriptions import BINARY, IDEMPOTENCY_KEY
 from service.schemas import LocaliseAnswer, LocaliseForm, PhotographForm, SequenceAnswer, SequenceForm
 from service.schemas.photographs import PhotographFields
 from service.storage.records import PlanRecord, VenueRecord
@@ -53,9 +53,8 @@ def body_schema(
     schema.pop("$defs", None)
     schema["properties"][PHOTO] = dict(photo)
     schema["properties"][_EARLIER_PHOTO] = {**photo, "description": f"Earlier name of `{PHOTO}`.", "deprecated": True}
-    kind = {"type": "string", "format": "binary"}
     schema["properties"][FEATURES] = {
-        **({"type": "array", "items": kind} if photo["type"] == "array" else kind),
+        **({"type": "array", "items": BINARY} if photo["type"] == "array" else BINARY),
         "description": f"Instead of `{PHOTO}`: its features, computed on the device with the image encoder of this "
         "service (`GET /model/{file}`; docs/reference/features.md), so that the photograph stays there.",
     }

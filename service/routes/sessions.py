@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 from fastapi import APIRouter, Response, status
 
-from lalaloc_core.errors import InvalidHintError, InvalidMotionError, InvalidPoseError
+from lalaloc_core.errors import InvalidHintError, InvalidMotionError
 from lalaloc_core.render.sampling import grid_size
 from service import errors
 from service.capacity.admission_control import QUERY, admitted_as
@@ -21,13 +20,14 @@ from service.query import MAX_POSES, TrackQuery
 from service.query.geopose import geopose_document
 from service.routes.dependencies import ApiCall, Call, is_id
 from service.routes.descriptions import (
-    BODY_ERRORS,
+    BEGIN_ERRORS,
+    BINARY,
     IDEMPOTENCY_ERRORS,
-    IDEMPOTENCY_KEY,
     QUERY_ERRORS,
     READ_ERRORS,
-    STORE_ERRORS,
     json_body,
+    on_earth,
+    stores,
 )
 from service.routes.query_request import PHOTO, VARY, body_schema, check_anchor, photographs_of, read_query
 from service.schemas import PhotographForm, SessionDocument, StoredPose
@@ -38,32 +38,14 @@ from service.storage.sessions import SessionRecord
 router = APIRouter(prefix="/sessions", tags=["sessions"])
 # Lists, objects and items of a session document.
 _VALUES = 1000
-_PHOTOGRAPH: dict[str, Any] = {
-    "type": "string",
-    "format": "binary",
-    "description": "Photograph, as for `POST /localise`.",
-}
+_PHOTOGRAPH = BINARY | {"description": "Photograph, as for `POST /localise`."}
 _READ_RESPONSES = problem_responses(errors.UnknownSessionError, *READ_ERRORS)
 
 
 @router.post(
     "",
-    status_code=status.HTTP_201_CREATED,
     summary="Begin a session",
-    response_model=SessionAnswer,
-    openapi_extra={"requestBody": json_body(SessionDocument), "parameters": [IDEMPOTENCY_KEY]},
-    responses=problem_responses(
-        InvalidHintError,
-        InvalidPoseError,
-        errors.InvalidRequestError,
-        *BODY_ERRORS,
-        *STORE_ERRORS,
-        errors.UnknownFloorPlanError,
-        errors.UnknownVenueError,
-        errors.VenueUnsearchableError,
-        errors.TooManySessionsError,
-        *IDEMPOTENCY_ERRORS,
-    ),
+    **stores(SessionAnswer, json_body(SessionDocument), InvalidHintError, *BEGIN_ERRORS, errors.TooManySessionsError),
 )
 async def create_session(call: Call) -> Response:
     """Begin to follow a camera in a floor plan or venue; send its photographs to `/sessions/{session_id}/photographs`.
@@ -109,13 +91,7 @@ def delete_session(session_id: str, call: Call) -> None:
     summary="Send the next photograph of a session",
     response_model=SessionAnswer,
     openapi_extra=body_schema(PhotographForm, _PHOTOGRAPH),
-    responses={
-        200: {
-            "content": {
-                GEOPOSE: {"schema": {"type": "object", "description": "A Basic-Quaternion of OGC GeoPose 1.0."}}
-            }
-        }
-    }
+    responses={200: {"content": on_earth(geopose="A Basic-Quaternion of OGC GeoPose 1.0.")}}
     | problem_responses(
         InvalidHintError,
         InvalidMotionError,

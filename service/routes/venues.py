@@ -7,17 +7,11 @@ from dataclasses import asdict
 from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response, status
+from fastapi import APIRouter, Query, Response
 
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers import OnStep, building_name
-from service.errors import (
-    InvalidRequestError,
-    RevisionMismatchError,
-    TooManyFloorPlansError,
-    TooManyVenuesError,
-    UnknownVenueError,
-)
+from service import errors
 from service.http.fields import Model, parse_document
 from service.http.problems import problem_responses
 from service.http.representations import not_modified, revision_etag, tagged_answer
@@ -25,16 +19,15 @@ from service.http.uploads import JSON, MULTIPART, Parts, media_type
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
-    CONDITIONAL,
-    IDEMPOTENCY_ERRORS,
-    IDEMPOTENCY_KEY,
-    NOT_MODIFIED,
     READ_ERRORS,
     STORE_ERRORS,
-    UNLESS_CHANGED,
     UPLOAD_ERRORS,
+    changes,
+    deletes,
     import_lines,
     json_body,
+    reads,
+    stores,
 )
 from service.routes.plan_uploads import LEVELS_FORM, PlanUpload, answer_import, prepare_levels, read_upload
 from service.schemas.plan_import import LevelsForm
@@ -58,20 +51,19 @@ router = APIRouter(prefix="/venues", tags=["venues"])
 _DEFAULT_NAME = "venue"
 # Lists, objects and further items of a venue document, besides those of its plans.
 _FURTHER_VALUES = 1000
-_VENUE_RESPONSES = problem_responses(UnknownVenueError, *READ_ERRORS)
 
 
 @router.post(
     "",
-    status_code=status.HTTP_201_CREATED,
     summary="Create a venue",
-    response_model=VenueAnswer,
-    openapi_extra={
-        "requestBody": json_body(VenueDocument, **{MULTIPART: LEVELS_FORM}),
-        "parameters": [IDEMPOTENCY_KEY],
-    },
-    responses=import_lines(VenueAnswer)
-    | problem_responses(*UPLOAD_ERRORS, TooManyFloorPlansError, TooManyVenuesError, *IDEMPOTENCY_ERRORS),
+    **stores(
+        VenueAnswer,
+        json_body(VenueDocument, **{MULTIPART: LEVELS_FORM}),
+        *UPLOAD_ERRORS,
+        errors.TooManyFloorPlansError,
+        errors.TooManyVenuesError,
+        lines=import_lines(VenueAnswer),
+    ),
 )
 async def create_venue(call: Call) -> Response:
     """Group floor plans, each on a level, so that one query searches all of them.
@@ -114,20 +106,18 @@ def list_venues(call: Call, page: Page, name: Name = None) -> VenueList:
     return VenueList(venues=[_summary(record) for record in found], next_cursor=more)
 
 
-@router.get(
-    "/{venue_id}",
-    summary="Get a venue",
-    response_model=VenueAnswer,
-    openapi_extra=CONDITIONAL,
-    responses=NOT_MODIFIED | _VENUE_RESPONSES,
-)
+@router.get("/{venue_id}", summary="Get a venue", **reads(VenueAnswer, errors.UnknownVenueError))
 def get_venue(venue_id: str, call: Call) -> Response:
     """Return a stored venue with the number of plans that are ready."""
     content, etag = _representation(call.venue(venue_id), call)
     return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
 
 
-@router.get("/{venue_id}/plans", summary="List the plans of a venue", responses=_VENUE_RESPONSES)
+@router.get(
+    "/{venue_id}/plans",
+    summary="List the plans of a venue",
+    responses=problem_responses(errors.UnknownVenueError, *READ_ERRORS),
+)
 def list_venue_plans(
     venue_id: str,
     call: Call,
@@ -148,10 +138,13 @@ def list_venue_plans(
 @router.put(
     "/{venue_id}",
     summary="Replace a venue",
-    response_model=VenueAnswer,
-    openapi_extra={"requestBody": json_body(VenueDocument), "parameters": UNLESS_CHANGED},
-    responses=problem_responses(
-        InvalidRequestError, *BODY_ERRORS, *STORE_ERRORS, UnknownVenueError, RevisionMismatchError
+    **changes(
+        VenueAnswer,
+        json_body(VenueDocument),
+        errors.InvalidRequestError,
+        *BODY_ERRORS,
+        *STORE_ERRORS,
+        errors.UnknownVenueError,
     ),
 )
 async def replace_venue(venue_id: str, call: Call) -> Response:
@@ -181,13 +174,13 @@ async def replace_venue(venue_id: str, call: Call) -> Response:
 @router.patch(
     "/{venue_id}",
     summary="Change a venue",
-    response_model=VenueAnswer,
-    openapi_extra={
-        "requestBody": json_body(VenueChangeDocument, **{MULTIPART: LEVELS_FORM}),
-        "parameters": [*UNLESS_CHANGED, IDEMPOTENCY_KEY],
-    },
-    responses=problem_responses(
-        *UPLOAD_ERRORS, UnknownVenueError, RevisionMismatchError, TooManyFloorPlansError, *IDEMPOTENCY_ERRORS
+    **changes(
+        VenueAnswer,
+        json_body(VenueChangeDocument, **{MULTIPART: LEVELS_FORM}),
+        *UPLOAD_ERRORS,
+        errors.UnknownVenueError,
+        errors.TooManyFloorPlansError,
+        idempotent=True,
     ),
 )
 async def change_venue(venue_id: str, call: Call) -> Response:
@@ -206,7 +199,7 @@ async def change_venue(venue_id: str, call: Call) -> Response:
         document = _document(VenueChangeDocument, content.read(), call)
         given = document.model_fields_set
         if not given:
-            raise InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
+            raise errors.InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
         record = call.store.venues.change(
             call.tenant,
             current.id,
@@ -223,18 +216,12 @@ async def change_venue(venue_id: str, call: Call) -> Response:
     return await call.upload(store)
 
 
-@router.delete(
-    "/{venue_id}",
-    status_code=status.HTTP_204_NO_CONTENT,
-    summary="Delete a venue",
-    openapi_extra={"parameters": UNLESS_CHANGED},
-    responses=problem_responses(UnknownVenueError, RevisionMismatchError, *READ_ERRORS),
-)
+@router.delete("/{venue_id}", summary="Delete a venue", **deletes(errors.UnknownVenueError))
 def delete_venue(venue_id: str, call: Call) -> None:
     """Delete a venue; its floor plans are kept."""
     current = call.venue(venue_id)
     if not call.store.venues.delete(call.tenant, current.id, expected=call.expected_revision(current)):
-        raise UnknownVenueError(venue_id)
+        raise errors.UnknownVenueError(venue_id)
 
 
 async def _add_levels(venue_id: str, call: ApiCall) -> Response:
@@ -280,22 +267,24 @@ def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMem
     """Return the plans of a venue in a request."""
     limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [("plans", f"has {len(documents)} floor plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)")]
         )
     counted = Counter(document.floorplan_id for document in documents)
     twice = [plan_id for plan_id, count in counted.items() if count > 1]
     if twice:
-        raise InvalidRequestError([("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times; give it once")])
+        raise errors.InvalidRequestError(
+            [("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times; give it once")]
+        )
     if wrong := [plan_id for plan_id in counted if not is_id(plan_id)]:
-        raise InvalidRequestError([("plans", f"floor plan '{wrong[0]}' does not exist")])
+        raise errors.InvalidRequestError([("plans", f"floor plan '{wrong[0]}' does not exist")])
     return [VenueMember(document.floorplan_id, document.level, document.name) for document in documents]
 
 
 def _removed(document: VenueChangeDocument) -> set[str]:
     removed = set(document.remove)
     if both := removed & {plan.floorplan_id for plan in document.plans}:
-        raise InvalidRequestError(
+        raise errors.InvalidRequestError(
             [("remove", f"has floor plan '{min(both)[:64]}', which is also in plans; give it in one of them")]
         )
     return removed
