@@ -6,13 +6,12 @@ import json
 from dataclasses import asdict
 from datetime import datetime, timedelta
 from functools import partial
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response, status
-from pydantic import AwareDatetime, BaseModel
+from pydantic import AwareDatetime
 
 from service.errors import InvalidRequestError, StoreFullError, UnknownKeyError
-from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
 from service.routes.dependencies import ApiCall, Call, Limit, Page, is_id
@@ -39,7 +38,6 @@ router = APIRouter(prefix="/admin", tags=["administration"])
 # Lists, objects and items of a document.
 _VALUES = 100
 _CHANGE_ERRORS = (*READ_ERRORS, *BODY_ERRORS, StoreFullError)
-Document = TypeVar("Document", bound=BaseModel)
 OfTenant = Annotated[
     str | None, Query(pattern=f"^{TENANT.pattern}$", description="Only those of this tenant. Default: all.")
 ]
@@ -65,7 +63,7 @@ async def create_key(call: Call) -> Response:
 
     If the answer is lost, revoke the key and create another one.
     """
-    document = await _document(call, KeyDocument)
+    document, _ = await call.read_document(KeyDocument, _VALUES)
 
     def create() -> Response:
         secret = new_secret()
@@ -104,7 +102,7 @@ async def rotate_key(key_id: str, call: Call) -> Response:
 
     The old key stays valid for `overlap_s`, so that programs can change to the new one.
     """
-    document = await _document(call, RotationDocument)
+    document, _ = await call.read_document(RotationDocument, _VALUES)
 
     def rotate() -> Response:
         secret, overlap = new_secret(), timedelta(seconds=document.overlap_s)
@@ -157,7 +155,7 @@ async def limit_tenant(tenant: str, call: Call) -> TenantAnswer:
     if not TENANT.fullmatch(tenant):
         fault = "has 1 to 64 letters, digits, '.', '_' and '-', and begins with a letter or digit"
         raise InvalidRequestError([("tenant", f"is '{tenant[:64]}'; a tenant's name {fault}")])
-    document = await _document(call, TenantLimitsDocument)
+    document, _ = await call.read_document(TenantLimitsDocument, _VALUES)
     changes = document.model_dump(exclude_unset=True)
     if not changes:
         raise InvalidRequestError([("body", "changes nothing; give stored_bytes, bytes_in_flight or cpu_share")])
@@ -191,11 +189,6 @@ def list_audit_entries(
     times = {"since": _check_year("since", since), "until": _check_year("until", until)}
     found, more = page.read(partial(call.store.audit_log.page, tenant=tenant, actor=actor, **times))
     return AuditList(entries=[_audit_answer(entry) for entry in found], next_cursor=more)
-
-
-async def _document(call: ApiCall, model: type[Document]) -> Document:
-    content = await call.read_json()
-    return await call.upload(parse_document, model, content.read(), _VALUES)
 
 
 def _new_key_answer(call: ApiCall, key: ApiKey, secret: str) -> Response:

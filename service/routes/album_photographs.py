@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 
@@ -16,17 +16,8 @@ from lalaloc_core.localise.encode.features import MAX_BYTES, read_features
 from service import errors
 from service.albums.album_documents import correction_document, pins_csv, pins_geojson, pins_svg, stored_correction
 from service.capacity.admission_control import QUERY_IN_PARTS, admitted_as
-from service.http.fields import parse_document
 from service.http.problems import problem_responses
-from service.http.representations import (
-    NDJSON,
-    LinesResponse,
-    expected_revision,
-    not_modified,
-    preferred,
-    revision_etag,
-    tagged_answer,
-)
+from service.http.representations import NDJSON, LinesResponse, expected_revision, preferred, revision_etag
 from service.http.uploads import GEOJSON, JSON, MULTIPART, Repeats
 from service.query import AlbumPhotographQuery, Content, QueryContext
 from service.routes.albums import album_of
@@ -56,7 +47,6 @@ from service.schemas.albums import (
     PhotographFacts,
     PinAnswer,
 )
-from service.schemas.fields import Problem
 from service.security import caller_of
 from service.storage.album_rows import AlbumRecord, NewPhotograph, PhotographRecord
 from service.storage.records import PlanRecord, VenuePlace
@@ -122,7 +112,7 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
     files = parts.named(PHOTO) or parts.named(FEATURES)
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(files))
     adding = _Adding(call, album, len(files), are_features=are_features)
-    lines = BatchLines(call, adding.add, adding.line).lines([(file, file) for file in files])
+    lines = BatchLines(call, AlbumLine, adding.add, adding.end).lines([(file, file) for file in files])
     return LinesResponse(lines, call.settings.requests.request_deadline_s)
 
 
@@ -137,15 +127,17 @@ class _Adding:
         # Photographs are read side by side, and stored in the order of the request.
         self._done = [asyncio.Event() for _ in range(count)]
 
-    async def add(
-        self, index: int, file: UploadedFile, _: Content, context: QueryContext
-    ) -> tuple[PhotographRecord, bool]:
-        """Store a photograph, and return it with True if it is new."""
+    def end(self, index: int) -> None:
+        """Let the next photograph be stored."""
+        self._done[index].set()
+
+    async def add(self, index: int, file: UploadedFile, _: Content, context: QueryContext) -> dict[str, Any]:
+        """Store a photograph, and return the fields of its line: status 201 if it is new."""
         call, album = self._call, self._album
         content, sha256 = await call.upload(self._read, file)
         same = await call.read(call.store.albums.same_picture, album.id, sha256)
         if same is not None:
-            return same, False
+            return {"status": 200, "photograph": _photograph_answer(same)}
         place = await call.place(self._document.floorplan_id, self._document.venue_id)
         query = AlbumPhotographQuery(document=self._document, content=content, sha256=sha256, context=context)
         entry = await call.runtime.localiser.answer(place, query)
@@ -154,11 +146,11 @@ class _Adding:
             await self._done[index - 1].wait()
         storage = call.settings.storage
         ttl_s, limit = storage.album_ttl_s, storage.max_album_photographs
-        added = await call.upload(
+        record, is_new = await call.upload(
             lambda: call.store.albums.add_photograph(call.tenant, album.id, new, ttl_s=ttl_s, limit=limit)
         )
         call.runtime.albums.wake()
-        return added
+        return {"status": 201 if is_new else 200, "photograph": _photograph_answer(record)}
 
     def _read(self, file: UploadedFile) -> tuple[Content, str]:
         digest = hashlib.sha256()
@@ -169,24 +161,6 @@ class _Adding:
         if len(file) > MAX_BYTES:
             raise InvalidFeaturesError(f"{FEATURES} has {len(file)} bytes; the limit is {MAX_BYTES}")
         return read_features(file.read(), self._call.runtime.bundle), digest.hexdigest()
-
-    def line(
-        self,
-        index: int,
-        name: str | None,
-        added: tuple[PhotographRecord, bool] | None,
-        problem: Problem | None,
-        retry_after_s: int | None,
-    ) -> AlbumLine:
-        """Return the line of a photograph, after which the next one can be stored."""
-        self._done[index].set()
-        if added is None:
-            assert problem is not None
-            return AlbumLine(
-                index=index, name=name, status=problem.status, problem=problem, retry_after_s=retry_after_s
-            )
-        record, is_new = added
-        return AlbumLine(index=index, name=name, status=201 if is_new else 200, photograph=_photograph_answer(record))
 
 
 @router.get(
@@ -270,7 +244,7 @@ async def _drawing(
 def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
     """Return a photograph with its correction and its pin."""
     content, etag = _representation(_photograph_of(call, album_of(call, album_id), photograph_id))
-    return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
+    return call.representation(content, etag)
 
 
 @router.patch(
@@ -292,8 +266,7 @@ async def correct_album_photograph(album_id: str, photograph_id: str, call: Call
 
     The answer has the correction at once; pins follow when the album is `solved` again.
     """
-    content = await call.read_json()
-    document = await call.upload(parse_document, PhotographChangeDocument, content.read(), _VALUES)
+    document, _ = await call.read_document(PhotographChangeDocument, _VALUES)
     album = await call.read(album_of, call, album_id)
     album.check_model(call.runtime.bundle.sha256)
     current = await call.read(_photograph_of, call, album, photograph_id)

@@ -10,10 +10,8 @@ from fastapi import APIRouter, Response
 from lalaloc_core.localise.encode.features import gives_features
 from service import errors
 from service.capacity.admission_control import STREAM, admitted_as
-from service.http.fields import parse_document
 from service.http.problems import problem_responses
-from service.http.representations import not_modified, revision_etag, tagged_answer
-from service.http.uploads import JSON, Parts
+from service.http.representations import revision_etag
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
 from service.routes.descriptions import BEGIN_ERRORS, READ_ERRORS, deletes, event_stream, json_body, reads, stores
 from service.schemas.albums import AlbumAnswer, AlbumDocument, AlbumList, AlbumSolution, AlbumSummary
@@ -40,8 +38,7 @@ async def create_album(call: Call) -> Response:
     or venue. After a new revision of the plan it is solved again.
     """
     idempotent, storage = call.idempotent(), call.settings.storage
-    content = await call.read_json()
-    document = await call.upload(parse_document, AlbumDocument, content.read(), _VALUES)
+    document, parts = await call.read_document(AlbumDocument, _VALUES)
     # Checked before anything is stored.
     _ = document.stated_camera
     if not gives_features(manifest := call.runtime.bundle.manifest):
@@ -62,7 +59,7 @@ async def create_album(call: Call) -> Response:
         content, etag = _representation(record, call)
         return call.change_answer(content, etag, call.path_of("get_album", album_id=record.id), created=True)
 
-    return await call.upload(idempotent.run, Parts({}, {"body": content}), store)
+    return await call.upload(idempotent.run, parts, store)
 
 
 @router.get("", summary="List albums", responses=problem_responses(*READ_ERRORS))
@@ -76,7 +73,7 @@ def list_albums(call: Call, page: Page, name: Name = None) -> AlbumList:
 def get_album(album_id: str, call: Call) -> Response:
     """Return an album with its state and what its photographs have in common."""
     content, etag = _representation(album_of(call, album_id), call)
-    return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
+    return call.representation(content, etag)
 
 
 @router.get(

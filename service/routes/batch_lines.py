@@ -7,7 +7,7 @@ import json
 import logging
 from collections import deque
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
-from typing import Generic, TypeVar
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -16,7 +16,6 @@ from service import errors
 from service.http.problems import problem_document
 from service.query import Content, QueryContext
 from service.routes.dependencies import ApiCall
-from service.schemas.fields import Problem
 from service.telemetry import LOGGER_NAME
 from service.uploaded_file import UploadedFile
 
@@ -36,25 +35,29 @@ _COMMON_ERRORS = (
 _BUSY_PAUSE_S = 0.25
 _MAX_NAME = 255
 
-T = TypeVar("T")
 Photographs = Sequence[tuple[UploadedFile, Content]]
-# Number, file name, answer or problem, and seconds until the photograph can be sent again.
-LineOf = Callable[[int, str | None, T | None, Problem | None, int | None], BaseModel]
+# Returns the fields of a line that only answers have, the status among them.
+AnswerOf = Callable[[int, UploadedFile, Content, QueryContext], Awaitable[dict[str, Any]]]
 
 
-class BatchLines(Generic[T]):
-    """Answers to the photographs of one request, as lines in their order.
+class BatchLines:
+    """Answers to the photographs of one request, as lines of a model in their order.
 
-    Args:
-        answer: answers the photograph of a number; called again while the tenant's other queries have all slots.
+    `answer` is called again while the tenant's other queries have all slots, and `on_end` with the number of a
+    photograph after its answer or problem.
     """
 
     def __init__(
-        self, call: ApiCall, answer: Callable[[int, UploadedFile, Content, QueryContext], Awaitable[T]], line: LineOf[T]
+        self,
+        call: ApiCall,
+        line: type[BaseModel],
+        answer: AnswerOf,
+        on_end: Callable[[int], object] = lambda _index: None,
     ) -> None:
         self._call = call
+        self._line_model = line
         self._answer_one = answer
-        self._line_of = line
+        self._on_end = on_end
         self._common_error: Exception | None = None
 
     async def lines(self, photographs: Photographs) -> AsyncGenerator[str]:
@@ -82,24 +85,26 @@ class BatchLines(Generic[T]):
         return await self._call.runtime.admission.cpu_accounts.charged_steps(self._call.client, line)
 
     async def _line(self, index: int, file: UploadedFile, photograph: Content) -> str:
-        answer = problem = retry_after_s = None
+        problem = retry_after_s = None
         try:
-            answer = await self._answer(index, file, photograph)
+            fields = await self._answer(index, file, photograph)
         except Exception as error:
             if not isinstance(error, LaLaLocError):
                 logging.getLogger(LOGGER_NAME).exception("unexpected error")
             if isinstance(error, _COMMON_ERRORS):
                 self._common_error = error
             problem = problem_document(self._call.request, error)
+            fields = {"status": problem.status}
             retry_after_s = error.retry_after_s if isinstance(error, errors.ServiceError) else None
         finally:
             file.close()
+        self._on_end(index)
         name = None if file.name is None else file.name[:_MAX_NAME]
-        line = self._line_of(index, name, answer, problem, retry_after_s)
+        line = self._line_model(index=index, name=name, problem=problem, retry_after_s=retry_after_s, **fields)
         # In ASCII: names and details quote the request, which is not always encodable as UTF-8.
         return json.dumps(line.model_dump(mode="json", exclude_none=problem is not None))
 
-    async def _answer(self, index: int, file: UploadedFile, photograph: Content) -> T:
+    async def _answer(self, index: int, file: UploadedFile, photograph: Content) -> dict[str, Any]:
         """Answer one photograph; wait for a slot while the tenant's other queries have them all."""
         settings = self._call.settings
         limit = settings.photographs.max_photograph_bytes

@@ -16,10 +16,11 @@ from fastapi import Depends, Query, Request, Response, status
 
 from service.errors import InvalidRequestError, UnknownFloorPlanError, UnknownRevisionError, UnknownVenueError
 from service.http import IdempotentRequest
+from service.http.fields import Model, parse_document
 from service.http.idempotent_request import HEADER
 from service.http.middleware.admission import reading
-from service.http.representations import expected_revision
-from service.http.uploads import JSON, UploadLimits, media_type, read_body
+from service.http.representations import expected_revision, not_modified, tagged_answer
+from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.plan_documents import Rendition, RenditionKind
 from service.runtime import Runtime, get_runtime
 from service.security import caller_of
@@ -128,6 +129,12 @@ class ApiCall:
         media_type(self.request, (JSON,))
         return await read_body(self.request, UploadLimits.of(self.settings, "max_venue_bytes"))
 
+    async def read_document(self, model: type[Model], max_values: int) -> tuple[Model, Parts]:
+        """Read a body in JSON as a document; return it with the part that identifies the request."""
+        content = await self.read_json()
+        document = await self.upload(parse_document, model, content.read(), max_values)
+        return document, Parts({}, {"body": content})
+
     async def upload(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run work on what was uploaded, on a thread; see `Threads.run`."""
         return await self.runtime.uploads.run(self.client, work, *args, **kwargs)
@@ -194,6 +201,10 @@ class ApiCall:
     def path_of(self, route: str, **ids: str) -> str:
         """Return the path of a route, by the name of its function."""
         return str(self.request.app.url_path_for(route, **ids))
+
+    def representation(self, content: bytes, etag: str) -> Response:
+        """Return something stored as JSON, or 304 if the client has it."""
+        return not_modified(self.request, etag) or tagged_answer([content], JSON, etag)
 
     def change_answer(self, content: bytes, etag: str, path: str, *, created: bool) -> Response:
         """Return the representation of a plan or venue that was created or changed; `etag` is also that of a GET."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response, status
 
@@ -39,7 +39,6 @@ from service.routes.query_request import (
     read_query,
 )
 from service.schemas import LocaliseAnswer, LocaliseForm
-from service.schemas.fields import Problem
 from service.schemas.localise_answer import BatchLine
 from service.security import caller_of
 from service.storage.records import PlanRecord
@@ -179,18 +178,12 @@ async def localise_batch(call: Call) -> Response:
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(photographs))
     place = await call.place(form.floorplan_id, form.venue_id)
 
-    async def answer(_index: int, _file: UploadedFile, content: Content, context: QueryContext) -> LocaliseAnswer:
+    async def answer(_index: int, _file: UploadedFile, content: Content, context: QueryContext) -> dict[str, Any]:
         found = await call.runtime.localiser.answer(place, PhotographQuery(form, content, context))
-        return await keep_answer(found, call)
+        return {"status": 200, "answer": await keep_answer(found, call)}
 
-    return LinesResponse(BatchLines(call, answer, _line).lines(photographs), settings.requests.request_deadline_s)
-
-
-def _line(
-    index: int, name: str | None, answer: LocaliseAnswer | None, problem: Problem | None, retry_after_s: int | None
-) -> BatchLine:
-    status = 200 if problem is None else problem.status
-    return BatchLine(index=index, name=name, status=status, answer=answer, problem=problem, retry_after_s=retry_after_s)
+    lines = BatchLines(call, BatchLine, answer).lines(photographs)
+    return LinesResponse(lines, settings.requests.request_deadline_s)
 
 
 _KEPT = problem_responses(errors.UnknownAnswerError, *READ_ERRORS)

@@ -35,38 +35,24 @@ _WORKER = "on_device.js"
 _WORKER_HEADERS = _HEADERS | {
     "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'"
 }
+_PAGES = {"/": "index.html", "/pin": "pin.html", "/docs": "docs.html", "/favicon.ico": "icon.svg"}
 _MAX_FILES = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+(?:\.[a-z0-9]+)+")
 
 
 @router.get("/")
-def index(request: Request) -> Response:
-    """Return the start page."""
-    return _file(request, "index.html")
-
-
 @router.get("/pin")
-def pin(request: Request) -> Response:
-    """Return the page that pins a folder of photographs."""
-    return _file(request, "pin.html")
-
-
 @router.get("/docs")
-def docs(request: Request) -> Response:
-    """Return the API documentation."""
-    return _file(request, "docs.html")
+@router.get("/favicon.ico")
+def page(request: Request) -> Response:
+    """Return a page, or the icon."""
+    return _file(request, _PAGES[request.scope["route"].path])
 
 
 @router.get("/web/{name}")
 def part(request: Request, name: str) -> Response:
     """Return a script, style or example of the pages."""
     return _file(request, name)
-
-
-@router.get("/favicon.ico")
-def icon(request: Request) -> Response:
-    """Return the icon."""
-    return _file(request, "icon.svg")
 
 
 def _file(request: Request, name: str) -> Response:

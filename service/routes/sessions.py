@@ -12,10 +12,9 @@ from lalaloc_core.errors import InvalidHintError, InvalidMotionError
 from lalaloc_core.render.sampling import grid_size
 from service import errors
 from service.capacity.admission_control import QUERY, admitted_as
-from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.representations import preferred
-from service.http.uploads import GEOPOSE, JSON, MULTIPART, Parts, media_type
+from service.http.uploads import GEOPOSE, JSON, MULTIPART, media_type
 from service.query import MAX_POSES, TrackQuery
 from service.query.geopose import geopose_document
 from service.routes.dependencies import ApiCall, Call, is_id
@@ -54,8 +53,8 @@ async def create_session(call: Call) -> Response:
     photograph, and ends if its plan or venue is changed or deleted.
     """
     idempotent, storage = call.idempotent(), call.settings.storage
-    content = await call.read_json()
-    document = _limit_candidates(await call.upload(parse_document, SessionDocument, content.read(), _VALUES), call)
+    stated, parts = await call.read_document(SessionDocument, _VALUES)
+    document = _limit_candidates(stated, call)
     place = await call.place(document.floorplan_id, document.venue_id)
     if isinstance(place, PlanRecord):
         _check_size(place, call)
@@ -68,7 +67,7 @@ async def create_session(call: Call) -> Response:
         path = call.path_of("get_session", session_id=session.id)
         return Response(_answer(session), status.HTTP_201_CREATED, {"Location": path}, JSON)
 
-    return await call.upload(idempotent.run, Parts({}, {"body": content}), store)
+    return await call.upload(idempotent.run, parts, store)
 
 
 @router.get("/{session_id}", summary="Get a session", response_model=SessionAnswer, responses=_READ_RESPONSES)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Query, Response
 
@@ -14,7 +15,7 @@ from lalaloc_core.importers import OnStep, building_name
 from service import errors
 from service.http.fields import Model, parse_document
 from service.http.problems import problem_responses
-from service.http.representations import not_modified, revision_etag, tagged_answer
+from service.http.representations import revision_etag
 from service.http.uploads import JSON, MULTIPART, Parts, media_type
 from service.routes.dependencies import ApiCall, Call, Name, Page, is_id, parse_venue_cursor
 from service.routes.descriptions import (
@@ -44,9 +45,11 @@ from service.schemas.venues import (
     VenueSummary,
 )
 from service.storage.records import NewPlan, PlanRecord, VenueMember, VenuePlace, VenueRecord
+from service.uploaded_file import UploadedFile
 
 router = APIRouter(prefix="/venues", tags=["venues"])
 
+DocumentT = TypeVar("DocumentT", VenueDocument, VenueChangeDocument)
 # Name of a venue of levels, if neither its file nor the request has one.
 _DEFAULT_NAME = "venue"
 # Lists, objects and further items of a venue document, besides those of its plans.
@@ -110,7 +113,7 @@ def list_venues(call: Call, page: Page, name: Name = None) -> VenueList:
 def get_venue(venue_id: str, call: Call) -> Response:
     """Return a stored venue with the number of plans that are ready."""
     content, etag = _representation(call.venue(venue_id), call)
-    return not_modified(call.request, etag) or tagged_answer([content], JSON, etag)
+    return call.representation(content, etag)
 
 
 @router.get(
@@ -149,26 +152,11 @@ def list_venue_plans(
 )
 async def replace_venue(venue_id: str, call: Call) -> Response:
     """Replace the name, anchor and plans of a venue; fields that are left out are reset."""
-    content = await call.read_json()
 
-    def store() -> Response:
-        current = call.venue(venue_id)
-        expected = call.expected_revision(current)
-        document = _document(VenueDocument, content.read(), call)
-        record = call.store.venues.change(
-            call.tenant,
-            current.id,
-            name=document.name,
-            anchor=_anchor(document.anchor),
-            drop_anchor=document.anchor is None,
-            members=_members(document.plans, call),
-            replace_members=True,
-            max_plans=call.settings.plans.max_venue_plans,
-            expected=expected,
-        )
-        return _change_answer(call, record, created=False)
+    def values(document: VenueDocument) -> dict[str, Any]:
+        return {"name": document.name, "drop_anchor": document.anchor is None, "replace_members": True}
 
-    return await call.upload(store)
+    return await call.upload(_change, venue_id, call, await call.read_json(), VenueDocument, values)
 
 
 @router.patch(
@@ -191,29 +179,41 @@ async def change_venue(venue_id: str, call: Call) -> Response:
     """
     if media_type(call.request, (JSON, MULTIPART)) == MULTIPART:
         return await _add_levels(venue_id, call)
-    content = await call.read_json()
 
-    def store() -> Response:
-        current = call.venue(venue_id)
-        expected = call.expected_revision(current)
-        document = _document(VenueChangeDocument, content.read(), call)
+    def values(document: VenueChangeDocument) -> dict[str, Any]:
         given = document.model_fields_set
         if not given:
             raise errors.InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
-        record = call.store.venues.change(
-            call.tenant,
-            current.id,
-            name=document.name if "name" in given else None,
-            anchor=_anchor(document.anchor),
-            drop_anchor="anchor" in given and document.anchor is None,
-            members=_members(document.plans, call),
-            removed=_removed(document),
-            max_plans=call.settings.plans.max_venue_plans,
-            expected=expected,
-        )
-        return _change_answer(call, record, created=False)
+        return {
+            "name": document.name if "name" in given else None,
+            "drop_anchor": "anchor" in given and document.anchor is None,
+            "removed": _removed(document),
+        }
 
-    return await call.upload(store)
+    return await call.upload(_change, venue_id, call, await call.read_json(), VenueChangeDocument, values)
+
+
+def _change(
+    venue_id: str,
+    call: ApiCall,
+    content: UploadedFile,
+    model: type[DocumentT],
+    values_of: Callable[[DocumentT], dict[str, Any]],
+) -> Response:
+    """Change a venue as a document of the model states; `values_of` returns what differs between the models."""
+    current = call.venue(venue_id)
+    expected = call.expected_revision(current)
+    document = _document(model, content.read(), call)
+    record = call.store.venues.change(
+        call.tenant,
+        current.id,
+        anchor=_anchor(document.anchor),
+        members=_members(document.plans, call),
+        max_plans=call.settings.plans.max_venue_plans,
+        expected=expected,
+        **values_of(document),
+    )
+    return _change_answer(call, record, created=False)
 
 
 @router.delete("/{venue_id}", summary="Delete a venue", **deletes(errors.UnknownVenueError))
