@@ -124,7 +124,7 @@ def draw_answer(
         shown, outline = _sized(photograph, is_sphere=answer.photograph is None), answer.outline
         height, width = shown.shape[:2]
         x = _PAD + 0.5 * (PHOTOGRAPH_SIZE[0] - width)
-        parts.append(photograph_part(jpeg(shown), "jpeg", outline, (x, y, width, height)))
+        parts.append(photograph_part(jpeg(shown), outline, (x, y, width, height)))
         y += height
         parts.append(photograph_key(outline, _PAD, y + 32))
         y += _KEY

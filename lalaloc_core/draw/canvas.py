@@ -17,8 +17,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 INK, MUTED, RULE, PAPER = "#20242c", "#5a6472", "#d5dbe1", "#ffffff"
-# Predicted and true poses: vermilion and sky blue of Okabe and Ito's palette, distinct for colour-blind readers.
-FOUND, TRUE = "#d55e00", "#56b4e9"
+# Predicted poses: vermilion of Okabe and Ito's palette, distinct for colour-blind readers.
+FOUND = "#d55e00"
 # Walls and openings: the same colours in plans, over photographs (with a dark edge) and on the page, whose style sheet
 # repeats them, with lighter ones for plans on a dark ground. Readers with protanopia and deuteranopia can tell them
 # apart, and the importer of pictures reads brown doors and blue windows.
@@ -103,17 +103,6 @@ def words(
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{fill}" text-anchor="{anchor}" {more}>'
         f"{xml_text(text)}</text>"
-    )
-
-
-def draw_cross(x: Number, y: Number, reach: Number) -> str:
-    """Draw a cross at a true position, in the units of the drawing."""
-    both = 2.0 * reach
-    d = f"M{x - reach:.3f} {y - reach:.3f}l{both:.3f} {both:.3f}m0 {-both:.3f}l{-both:.3f} {both:.3f}"
-    return "".join(
-        f'<path class="true" d="{d}" fill="none" stroke="{colour}" stroke-width="{width * reach:.4f}" '
-        'stroke-linecap="round"/>'
-        for colour, width in ((INK, 0.62), (TRUE, 0.36))
     )
 
 

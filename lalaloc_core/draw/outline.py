@@ -6,7 +6,6 @@ It is computed in closed form from the pose, the camera height and the room's wa
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,41 +182,17 @@ def _opening(
     return drawn
 
 
-@dataclass(frozen=True, eq=False)
-class Stroke:
-    """Lines of pixels (x, y) in one colour, `width` pixels wide, on a dark edge of `edge_width`."""
-
-    lines: Sequence[Float[np.ndarray, "_ 2"]]
-    colour: str
-    width: float
-    edge_width: float
-
-
-def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:
-    """Return the line at `rise_m` above the camera on the walls of a profile, as pixels (x, y) of a sphere."""
-    x = np.arange(len(profile_m)) + 0.5
-    return np.stack([x, (0.5 - np.arctan2(rise_m, profile_m) / np.pi) * height], axis=1)
-
-
-def wall_stroke(
-    outline: Outline, size: tuple[int, int], colour: str = WALL_COLOUR, width: float = 2.0, edge_width: float = 3.0
-) -> Stroke:
-    """Return floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
-    return Stroke([line * size for line in outline.edges], colour, width, edge_width)
-
-
-def photograph_part(content: bytes, kind: str, outline: Outline, box: Box) -> str:
+def photograph_part(jpeg: bytes, outline: Outline, box: Box) -> str:
     """Draw a photograph with a layout over it as a part of a larger drawing.
 
-    `content` is the encoded picture, of kind "jpeg" or "png", with as many pixels as the box; `box` is x, y, width and
-    height.
+    The picture has as many pixels as the box (x, y, width, height).
     """
     x, y, width, height = box
     size = np.array([width, height])
     # Proportional to the width, so that lines look alike at every size.
     line = width / 480.0
     # Unscaled pixels need no smoothing, which takes a second.
-    parts = [image(content, kind, (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')]
+    parts = [image(jpeg, "jpeg", (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')]
     for opening in outline.openings:
         d, colour = path([opening.line * size]), ON_PHOTOGRAPH[opening.kind]
         parts.append(
@@ -225,7 +200,12 @@ def photograph_part(content: bytes, kind: str, outline: Outline, box: Box) -> st
             f'stroke-width="{1.6 * line:.2f}" stroke-linejoin="round"/>'
             f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="{0.9 * line:.2f}" stroke-linejoin="round"/>'
         )
-    parts.append(_stroke(wall_stroke(outline, (round(width), round(height)), WALL_COLOUR, line, 1.8 * line)))
+    edges = path([edge * (round(width), round(height)) for edge in outline.edges if len(edge) > 1], 2)
+    parts += [
+        f'<path class="layout" d="{edges}" fill="none" stroke="{colour}" stroke-width="{thickness:.2f}" '
+        'stroke-linejoin="round" stroke-linecap="round"/>'
+        for colour, thickness in ((INK, 1.8 * line), (WALL_COLOUR, line))
+    ]
     return f'<g class="photograph" transform="translate({x:.1f} {y:.1f})">{"".join(parts)}</g>'
 
 
@@ -240,12 +220,3 @@ def photograph_key(outline: Outline, x: Number, y: Number) -> str:
         )
         x += 36 + 9.8 * len(name) + 34
     return "".join(parts)
-
-
-def _stroke(stroke: Stroke) -> str:
-    d = path([line for line in stroke.lines if len(line) > 1], 2)
-    return "".join(
-        f'<path class="layout" d="{d}" fill="none" stroke="{colour}" stroke-width="{width:.2f}" '
-        'stroke-linejoin="round" stroke-linecap="round"/>'
-        for colour, width in ((INK, stroke.edge_width), (stroke.colour, stroke.width))
-    )

@@ -48,19 +48,15 @@ class Marker:
 
 
 def plan_svg(
-    plan: FloorPlan,
-    marker: Marker | None = None,
-    *,
-    rooms: str | None = None,
-    no_room: Sequence[Sequence[Sequence[float]]] = (),
+    plan: FloorPlan, marker: Marker | None = None, *, no_room: Sequence[Sequence[Sequence[float]]] = ()
 ) -> str:
     """Draw the plan with names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
     The view box is the plan's bounds with a margin, extended to the camera. Its y axis points down: plan point (x, y)
-    is drawn at (x, -y). `rooms` is a cached result of `draw_rooms` for the plan; for `no_room` see there.
+    is drawn at (x, -y). For `no_room` see `draw_rooms`.
     """
     head, tail = svg_around(plan.name, bounds_with(plan.bounds_m, no_room), marker)
-    return head + (draw_rooms(plan, no_room) if rooms is None else rooms).replace(HEAT_PLACE, "") + tail
+    return head + draw_rooms(plan, no_room).replace(HEAT_PLACE, "") + tail
 
 
 def plan_with(plan: FloorPlan, over: str, marker: Marker | None = None) -> str:

@@ -129,7 +129,7 @@ def read_film(
         raise InvalidFilmError(
             f"the film has {len(content)} bytes; the limit is {limits.max_bytes} (LALALOC_MAX_FILM_BYTES)"
         )
-    tracker = FlowTracker(_field(stated))
+    tracker = FlowTracker(None if stated.hfov_deg is None else math.radians(stated.hfov_deg))
     samples = _sampled(content, tracker, limits)
     kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
     if not kept:
@@ -330,11 +330,6 @@ def _too_long(seconds: float, limits: FilmLimits) -> InvalidFilmError:
         f"the film is longer than {limits.max_s:g} s, the limit (max_film_s): it has {seconds:.0f} s at least; "
         "cut it to one turn"
     )
-
-
-def _field(stated: StatedCamera) -> float | None:
-    """Return the stated horizontal field of view (radians)."""
-    return None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -151,7 +151,10 @@ def find_links(
         for first in range(count)
         for step in range(1, apart + 1)
     }
-    rays = [_rays_of(*each) for each in zip(features, cameras, strict=True)]
+    rays = [
+        camera.rays(found.place * (camera.width, camera.height))
+        for found, camera in zip(features, cameras, strict=True)
+    ]
     rooted = [_rooted(found.descriptor) for found in features]
     axes = [camera_axes(pitch=attitude.pitch, roll=attitude.roll) for attitude in attitudes]
 
@@ -196,10 +199,6 @@ def grouped(count: int, links: Sequence[Link]) -> list[dict[int, float]]:
             one |= {index: heading + offset for index, heading in other.items()}
             group |= dict.fromkeys(other, one)
     return list({min(members): members for members in group.values()}.values())
-
-
-def _rays_of(features: Features, camera: Camera) -> Float[np.ndarray, "n 3"]:
-    return camera.rays(features.place * (camera.width, camera.height))
 
 
 def turn_between(

@@ -60,12 +60,12 @@ class PlacedCopy:
     sidecar: bytes | None
 
 
-def placed_copy(content: bytes, place: Place, limits: PhotographLimits | None = None) -> PlacedCopy:
+def placed_copy(content: bytes, place: Place) -> PlacedCopy:
     """Return a copy of a picture file with a place.
 
     Positions and directions that the file states are replaced, keywords are added to its own.
     """
-    with opened_picture(content, limits or PhotographLimits()) as file:
+    with opened_picture(content, PhotographLimits()) as file:
         kind, exif = file.kind, file.exif
         packet = next((packet for packet in file.packets if packet), None)
         xmp = _xmp(packet, place)

@@ -66,11 +66,8 @@ def _openings(plan: FloorPlan, room: Room, faces: Sequence[OpeningFace]) -> dict
         start, end = ends[0] + np.array([[face.start], [face.end]]) * edge + _PANEL_OFFSET_M * inwards
         if low < high:
             panels.setdefault(opening.kind, []).append(np.array([[*start, *end, low, high]]))
-    return {kind: _vertical(*_columns(np.concatenate(rows))) for kind, rows in panels.items()}
-
-
-def _columns(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    return rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5]
+    joined = {kind: np.concatenate(rows) for kind, rows in panels.items()}
+    return {kind: _vertical(rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5]) for kind, rows in joined.items()}
 
 
 def _horizontal(corners: np.ndarray, triangles: np.ndarray, z: float, *, up: bool) -> trimesh.Trimesh:

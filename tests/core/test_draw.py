@@ -15,7 +15,7 @@ from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.draw import canvas, rasterise
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, heat_image, posterior_map
-from lalaloc_core.draw.outline import layout_outline, wall_line
+from lalaloc_core.draw.outline import layout_outline
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import ProbabilityMap
@@ -66,7 +66,7 @@ def test_wall_lines_match_the_renderer(room: int, heading: float) -> None:
     columns = 512
     profile_m = profiles_at(PLAN, position_m[None], np.array([room]), np.array([heading]), columns)[0]
     for line, rise_m in zip(outline.edges, (-EYE_M, 1.0), strict=False):
-        expected = wall_line(profile_m, rise_m, 256) / [columns, 256]
+        expected = np.stack([(np.arange(columns) + 0.5) / columns, 0.5 - np.arctan2(rise_m, profile_m) / np.pi], axis=1)
         drawn = np.interp(expected[:, 0], line[:, 0], line[:, 1])
         # Next to corners either wall is correct.
         assert np.quantile(np.abs(drawn - expected[:, 1]), 0.98) < 1e-4
