@@ -99,7 +99,7 @@ def next_step(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: floa
     return next(iter(next_steps(plan, manifest, known, step_m=step_m)), None)
 
 
-def next_steps(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: float, seed: int = 0) -> list[NextStep]:
+def next_steps(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: float) -> list[NextStep]:
     """Return the steps that are worth it, the one with the highest expected confidence first; none for sure answers.
 
     `step_m` is the step of the pose grid. Models without measured errors allow no expectation of photographs, so that
@@ -114,7 +114,7 @@ def next_steps(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: flo
     steps = list(_statements(plan, belief, known))
     errors = manifest.errors if not known.is_view else None if manifest.view is None else manifest.view.errors
     if errors is not None and manifest.profile_columns:
-        drawn = _Photographs(plan, manifest, errors, known, belief, step_m, np.random.default_rng(seed))
+        drawn = _Photographs(plan, manifest, errors, known, belief, step_m, np.random.default_rng(0))
         steps += [*drawn.turns(), *drawn.doors()]
     steps = [step for step in steps if step.confidence >= known.fit * now + _WORTH]
     return sorted(steps, key=lambda step: (-step.confidence, -step.bits))

@@ -118,13 +118,13 @@ def spacing_m(plan: FloorPlan) -> float:
     return max(STEP_M, math.ceil(_STEPS_PER_M * math.sqrt(plan.area_m2 / left)) / _STEPS_PER_M)
 
 
-def localisability(plan: FloorPlan, manifest: Manifest, *, coarse: bool = False, seed: int = 0) -> Localisability:
+def localisability(plan: FloorPlan, manifest: Manifest, *, coarse: bool = False) -> Localisability:
     """Return the probabilities at places spread over a plan; the work is bounded for plans of any size.
 
     A `coarse` prediction has the fewest places with one draw at each, and takes about a fifth of the time.
     """
     errors, step_m = errors_of(manifest), spacing_m(plan)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     share = 0.0 if coarse else min(1.0, _FULL_POSES / grid_size(plan, step_m))
     places = _spread(plan, max(_MIN_PLACES, round(_PLACES * share)), rng)
     search = Searches(plan, manifest, errors, step_m=step_m)
