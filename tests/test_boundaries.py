@@ -23,6 +23,7 @@ LAYERS = {
     "lalaloc_core.errors": 0,
     "lalaloc_core.conventions": 0,
     "lalaloc_core.conditions": 0,
+    "lalaloc_core.answer_numbers": 0,
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.files": 0,
     "lalaloc_core.configuration": 1,

@@ -32,14 +32,7 @@ from service.schemas.localise_answer import (
     TimingsAnswer,
 )
 from service.schemas.query_fields import EarthPoint, LocaliseForm
-from service.schemas.sequence import (
-    DroppedFrames,
-    FilmAnswer,
-    SequenceAnswer,
-    SequenceForm,
-    SequencePoseAnswer,
-    StatedHeading,
-)
+from service.schemas.sequence import FilmAnswer, SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading
 from service.schemas.sessions import (
     PathPoint,
     PhotographForm,

@@ -7,7 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from service.schemas.fields import Degrees, HeadingDeg, Metres, Problem, ResponseModel, Score, Share, SignedDegrees
+from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Metres, Score, Share, SignedDegrees
+from service.schemas.fields import Problem, ResponseModel
 from service.schemas.localise_answer import GeoPose, Position
 from service.schemas.photographs import PhotographFields, ReadView
 from service.schemas.query_fields import HEADING_MEANING, HeightFields, PlaceFields, PlanPoint

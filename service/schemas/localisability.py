@@ -6,8 +6,9 @@ from typing import Annotated
 
 from pydantic import Field
 
+from lalaloc_core.answer_numbers import Metres, Score, Share
 from lalaloc_core.conditions import Condition
-from service.schemas.fields import Metres, ResponseModel, Score, Share
+from service.schemas.fields import ResponseModel
 from service.schemas.localise_answer import ModelAnswer
 
 RoomId = Annotated[str, Field(description="`id` of a room.")]

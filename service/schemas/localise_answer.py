@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from lalaloc_core.bundle import Bundle
-from service.schemas.fields import (
-    Degrees,
-    HeadingDeg,
-    Mass,
-    Metres,
-    Milliseconds,
-    Problem,
-    ResponseModel,
-    Score,
-    Share,
-    Variance,
-)
+from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Mass, Metres, Milliseconds, Score, Share, Variance
+from lalaloc_core.localise.answers import documents
+from service.schemas.fields import CoreAnswer, Problem, ResponseModel
 from service.schemas.photographs import ViewAnswer
 from service.schemas.query_fields import HEADING_MEANING
 
@@ -65,11 +55,8 @@ Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
 Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
 
 
-class Position(ResponseModel):
+class Position(CoreAnswer, documents.Position, frozen=True):
     """Point in the plan frame."""
-
-    x_m: Metres = Field(description="Metres to the right on the drawing.")
-    y_m: Metres = Field(description="Metres up on the drawing.")
 
 
 class CandidateAnswer(ResponseModel):
@@ -120,17 +107,8 @@ class TimingsAnswer(ResponseModel):
     total: Milliseconds = Field(description="Time from the complete upload to the answer, waiting included.")
 
 
-class ModelAnswer(ResponseModel):
+class ModelAnswer(CoreAnswer, documents.Model, frozen=True):
     """Model that computed the answer."""
-
-    name: str
-    version: str
-    sha256: str = Field(description="Digest over the model's files.")
-
-    @classmethod
-    def of(cls, bundle: Bundle) -> Self:
-        """Return name, version and digest of a bundle."""
-        return cls(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
 class LocaliseAnswer(ResponseModel):

@@ -6,21 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from lalaloc_core.answer_numbers import Score, Share
+from lalaloc_core.localise.answers import documents
+from lalaloc_core.localise.localisability.reports import AdvisedStep
 from lalaloc_core.photograph import Intrinsics, StatedCamera
-from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
-from service.schemas.fields import (
-    Degrees,
-    Finite,
-    ResponseModel,
-    Score,
-    Share,
-    SignedDegrees,
-    parse_json,
-    reject_underscores,
-)
+from lalaloc_core.photograph.projection import Source
+from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG, Projection
+from service.schemas.fields import CoreAnswer, Finite, ResponseModel, parse_json, reject_underscores
 
-Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
-ValueSource = Literal["given", "gpano", "exif", "estimated", "assumed"]
 _HFOV_RANGES = ", ".join(
     f"{low:g} to {high:g} ({name})" for name, (low, high) in HFOV_RANGE_DEG.items() if name != AUTO
 )
@@ -96,43 +89,23 @@ class PhotographFields(BaseModel):
         )
 
 
-class AssumedAngle(ResponseModel):
+class AssumedAngle(CoreAnswer, documents.Angle, frozen=True):
     """Angle that the photograph was read with."""
 
-    value_deg: SignedDegrees
-    std_deg: Degrees = Field(description="Standard deviation; 0 where it does not apply.")
-    source: ValueSource = Field(
-        description="Origin: the request (`given`), metadata (`gpano`, `exif`), the picture (`estimated`), or a usual "
-        "value (`assumed`)."
-    )
 
-
-class CameraAnswer(ResponseModel):
+class CameraAnswer(CoreAnswer, documents.CameraMatrix, frozen=True):
     """Camera matrix and distortion of the upright photograph, as `intrinsics` of the request."""
 
-    width: int = Field(description="Size of the upright photograph, pixels.")
-    height: int
-    fx: Score
-    fy: Score
-    cx: Score
-    cy: Score
-    distortion: list[float] = Field(
-        description="k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye camera: OpenCV's order."
-    )
 
-
-class SeenArc(ResponseModel):
+class SeenArc(CoreAnswer, documents.SeenArc, frozen=True):
     """Azimuths that photographs show, relative to the centre of the first, clockwise."""
-
-    from_deg: SignedDegrees
-    to_deg: SignedDegrees = Field(description="Greater than `from_deg`; above 180 for an arc that passes the back.")
 
 
 class ReadView(ResponseModel):
     """Assumptions about the photograph, and the azimuths it shows."""
 
     projection: Projection
-    projection_source: ValueSource
+    projection_source: Source
     hfov: AssumedAngle = Field(description="Horizontal field of view.")
     pitch: AssumedAngle = Field(description="Elevation of the photograph's centre above the horizon.")
     roll: AssumedAngle = Field(description="Clockwise rotation of the camera about its optical axis.")
@@ -149,31 +122,12 @@ class ReadView(ResponseModel):
     warnings: list[str] = Field(description="Metadata that were ignored, and estimates to check.")
 
 
-class SeenObjectAnswer(ResponseModel):
+class SeenObjectAnswer(CoreAnswer, documents.SeenObject, frozen=True):
     """Object that the photograph shows."""
 
-    name: str = Field(description="Object, such as `stove`.")
-    probability: Share
-    azimuth_deg: SignedDegrees = Field(description="Direction relative to the photograph's centre, clockwise.")
 
-
-class NextStepAnswer(ResponseModel):
+class NextStepAnswer(CoreAnswer, AdvisedStep, frozen=True):
     """Step after an answer that is not sure, and what it is expected to tell."""
-
-    kind: Literal["turn", "door", "heading", "rooms"] = Field(
-        description="`turn`: take another photograph from the same spot; `door`: take one from behind a door; "
-        "`heading`: state the heading, within 10°; `rooms`: choose one of `rooms` as a hint."
-    )
-    text: str = Field(description="The step in words.")
-    turn_deg: SignedDegrees | None = Field(
-        description="Of `turn` and `door`: direction relative to the photograph's centre, clockwise; else null."
-    )
-    distance_m: Score | None = Field(description="Of `door`: distance to the door; else null.")
-    rooms: list[str] | None = Field(
-        description="Of `rooms`: `id` of each probable room, the most probable first; else null."
-    )
-    expected_bits: Score = Field(description="Expected increase of `information_bits`.")
-    expected_confidence: Share = Field(description="Expected `confidence` after the step.")
 
 
 class ViewAnswer(ReadView):

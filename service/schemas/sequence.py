@@ -7,18 +7,9 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from service.schemas.fields import (
-    Degrees,
-    Finite,
-    HeadingDeg,
-    Metres,
-    ResponseModel,
-    Score,
-    Share,
-    needs,
-    parse_json,
-    reject_underscores,
-)
+from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Metres, Score, Share
+from lalaloc_core.localise.answers.documents import FilmReading
+from service.schemas.fields import CoreAnswer, Finite, ResponseModel, needs, parse_json, reject_underscores
 from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.photographs import PhotographFields, ViewAnswer
 from service.schemas.query_fields import CameraFields, PlaceFields
@@ -138,24 +129,8 @@ class SequencePoseAnswer(ResponseModel):
     )
 
 
-class DroppedFrames(ResponseModel):
-    """Frames of a film that were not kept for one reason."""
-
-    reason: str
-    frames: int
-
-
-class FilmAnswer(ResponseModel):
+class FilmAnswer(CoreAnswer, FilmReading, frozen=True):
     """Reading of a film."""
-
-    frames_read: int = Field(description="Frames that were decoded.")
-    frames_kept: int = Field(description="Frames that became poses.")
-    dropped: list[DroppedFrames] = Field(description="Frames that were not kept, by reason.")
-    duration_s: float = Field(description="Time of the last frame.")
-    turned_deg: float = Field(description="Angle that the camera turned through, by optical flow.")
-    warnings: list[str] = Field(
-        description="Faults of the film: the camera walks, shakes or stands still, or nothing can be followed."
-    )
 
 
 class SequenceAnswer(ResponseModel):

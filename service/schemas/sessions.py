@@ -9,19 +9,10 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
+from lalaloc_core.answer_numbers import HeadingDeg, Metres, Share, Variance
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN, usual_stds
-from service.schemas.fields import (
-    Finite,
-    HeadingDeg,
-    Metres,
-    ResponseModel,
-    Share,
-    Variance,
-    needs,
-    parse_json,
-    reject_underscores,
-)
+from service.schemas.fields import Finite, ResponseModel, needs, parse_json, reject_underscores
 from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
 from service.schemas.photographs import PhotographFields, ReadView
 from service.schemas.query_fields import HEADING_MEANING, CameraFields, EarthPoint, PlaceFields, PlanPoint

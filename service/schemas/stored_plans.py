@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, WithJsonSchema
 
-from service.schemas.fields import Metres, ResponseModel, Share, SquareMetres
+from lalaloc_core.answer_numbers import Metres, Share, SquareMetres
+from service.schemas.fields import ResponseModel
 from service.schemas.native_plan import OpeningKind, Ring, RoomType
 from service.schemas.plan_import import ImportReport
 

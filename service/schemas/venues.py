@@ -8,7 +8,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from service.schemas.fields import ResponseModel, Share, SquareMetres
+from lalaloc_core.answer_numbers import Share, SquareMetres
+from service.schemas.fields import ResponseModel
 from service.schemas.stored_plans import PlanStatus
 
 _NOT_TEXT = {"Cc", "Cs"}

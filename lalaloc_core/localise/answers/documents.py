@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+from pydantic import ConfigDict, Field
+
+from lalaloc_core.answer_numbers import Degrees, Metres, Score, Share, SignedDegrees
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import union_of_arcs
@@ -16,6 +19,7 @@ from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.query.query import HeadingSource
 from lalaloc_core.localise.search.pipeline import Localisation, SearchStage
 from lalaloc_core.photograph import Assumed, Photograph
+from lalaloc_core.photograph.projection import Source
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +90,11 @@ class Model(_Document):
 
     name: str
     version: str
-    sha256: str
+    sha256: Annotated[str, Field(description="Digest over the model's files.")]
 
     @classmethod
-    def of(cls, bundle: Bundle) -> Model:
-        """Return those of a bundle."""
+    def of(cls, bundle: Bundle) -> Self:
+        """Return name, version and digest of a bundle."""
         return cls(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
@@ -98,17 +102,23 @@ class Model(_Document):
 class Position:
     """Point in the frame of the plan, metres."""
 
-    x_m: float
-    y_m: float
+    x_m: Annotated[Metres, Field(description="Metres to the right on the drawing.")]
+    y_m: Annotated[Metres, Field(description="Metres up on the drawing.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Angle:
     """Angle, its standard deviation, and where it is from."""
 
-    value_deg: float
-    std_deg: float
-    source: str
+    value_deg: SignedDegrees
+    std_deg: Annotated[Degrees, Field(description="Standard deviation; 0 where it does not apply.")]
+    source: Annotated[
+        Source,
+        Field(
+            description="Origin: the request (`given`), metadata (`gpano`, `exif`), the picture (`estimated`), or a "
+            "usual value (`assumed`)."
+        ),
+    ]
 
     @classmethod
     def of(cls, assumed: Assumed) -> Angle:
@@ -118,32 +128,41 @@ class Angle:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMatrix:
-    """Camera matrix and distortion, in OpenCV's order, of the upright photograph (pixels)."""
+    """Camera matrix and distortion of the upright photograph, pixels."""
 
-    width: int
+    width: Annotated[int, Field(description="Size of the upright photograph, pixels.")]
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: list[float]
+    fx: Score
+    fy: Score
+    cx: Score
+    cy: Score
+    distortion: Annotated[
+        list[float],
+        Field(
+            description="k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye camera: OpenCV's order."
+        ),
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeenArc:
     """Azimuths that photographs show, relative to the centre of the first, clockwise."""
 
-    from_deg: float
-    to_deg: float
+    from_deg: SignedDegrees
+    to_deg: Annotated[
+        SignedDegrees, Field(description="Greater than `from_deg`; above 180 for an arc that passes the back.")
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeenObject:
-    """Recognised object and its direction relative to the photograph's centre, clockwise."""
+    """Object that the photograph shows."""
 
-    name: str
-    probability: float
-    azimuth_deg: float
+    name: Annotated[str, Field(description="Object, such as `stove`.")]
+    probability: Share
+    azimuth_deg: Annotated[
+        SignedDegrees, Field(description="Direction relative to the photograph's centre, clockwise.")
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,15 +292,28 @@ class Answer(_Document):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DroppedFrames:
+    """Frames of a film that were not kept for one reason."""
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
+
+    reason: str
+    frames: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class FilmReading:
     """Frames of a film that were read and kept, and why the others were not."""
 
-    frames_read: int
-    frames_kept: int
-    dropped: list[dict[str, Any]]
-    duration_s: float
-    turned_deg: float
-    warnings: list[str]
+    frames_read: Annotated[int, Field(description="Frames that were decoded.")]
+    frames_kept: Annotated[int, Field(description="Frames that became poses.")]
+    dropped: Annotated[list[DroppedFrames], Field(description="Frames that were not kept, by reason.")]
+    duration_s: Annotated[float, Field(description="Time of the last frame.")]
+    turned_deg: Annotated[float, Field(description="Angle that the camera turned through, by optical flow.")]
+    warnings: Annotated[
+        list[str],
+        Field(description="Faults of the film: the camera walks, shakes or stands still, or nothing can be followed."),
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

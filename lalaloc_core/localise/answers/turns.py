@@ -10,7 +10,7 @@ from typing import Any
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.answers.compose import compose_answer
-from lalaloc_core.localise.answers.documents import Angle, FilmReading, Ground, Spot, TurnAnswer
+from lalaloc_core.localise.answers.documents import Angle, DroppedFrames, FilmReading, Ground, Spot, TurnAnswer
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.query.query import KnownHeading
@@ -255,7 +255,7 @@ def _film_reading(film: Film) -> FilmReading:
     return FilmReading(
         frames_read=film.frames,
         frames_kept=len(film.photographs),
-        dropped=[{"reason": reason, "frames": frames} for reason, frames in film.dropped.items()],
+        dropped=[DroppedFrames(reason=reason, frames=frames) for reason, frames in film.dropped.items()],
         duration_s=film.duration_s,
         turned_deg=math.degrees(film.turned),
         warnings=list(film.warnings),

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field
+
+from lalaloc_core.answer_numbers import Score, Share, SignedDegrees
 from lalaloc_core.bundle import Manifest
 from lalaloc_core.conditions import CONDITIONS, HARDEST, Condition, HeadingState, Photograph, condition_of, parts_of
 from lalaloc_core.conventions import TWO_PI
@@ -124,22 +127,27 @@ def _percent(share: float) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class AdvisedStep:
-    """Step after an answer that is not sure, and what it is expected to tell.
+    """Step after an answer that is not sure, and what it is expected to tell."""
 
-    Attributes:
-        kind: "turn": take another photograph from the same spot; "door": take one from behind a door; "heading": state
-            the heading; "rooms": choose one of `rooms` as a hint.
-        turn_deg: direction of "turn" and "door" relative to the photograph's centre, clockwise.
-        rooms: ids of the probable rooms, the most probable first.
-    """
-
-    kind: StepKind
-    text: str
-    turn_deg: float | None
-    distance_m: float | None
-    rooms: list[str] | None
-    expected_bits: float
-    expected_confidence: float
+    kind: Annotated[
+        StepKind,
+        Field(
+            description="`turn`: take another photograph from the same spot; `door`: take one from behind a door; "
+            "`heading`: state the heading, within 10°; `rooms`: choose one of `rooms` as a hint."
+        ),
+    ]
+    text: Annotated[str, Field(description="The step in words.")]
+    turn_deg: Annotated[
+        SignedDegrees | None,
+        Field(description="Of `turn` and `door`: direction relative to the photograph's centre, clockwise; else null."),
+    ]
+    distance_m: Annotated[Score | None, Field(description="Of `door`: distance to the door; else null.")]
+    rooms: Annotated[
+        list[str] | None,
+        Field(description="Of `rooms`: `id` of each probable room, the most probable first; else null."),
+    ]
+    expected_bits: Annotated[Score, Field(description="Expected increase of `information_bits`.")]
+    expected_confidence: Annotated[Share, Field(description="Expected `confidence` after the step.")]
 
 
 def step_after(
