@@ -18,6 +18,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.export.run_export import export_into, export_run
 from lalaloc_core.learn.training import losses, run
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, SphereBatches, opening_kinds
@@ -85,17 +86,29 @@ def plan(**changes: Any) -> FloorPlan:
     return FloorPlan.from_dict(document | changes)
 
 
+def camera(camera_height_m: float) -> Camera:
+    """Return a camera in the middle of the plan's room."""
+    return Camera(
+        name="",
+        position_m=np.array([2.0, 2.0]),
+        room_index=0,
+        heading=0.0,
+        camera_height_m=camera_height_m,
+        photographs={},
+    )
+
+
 class TestLabels:
     def test_opening_kinds_match_the_plan(self) -> None:
-        kind = opening_kinds(plan(), np.array([2.0, 2.0]), 0, 0.0, 1.5, 64)
+        kind = opening_kinds(plan(), camera(1.5), 0.0, 64)
         azimuth_deg = ((np.arange(64) + 0.5) / 64 - 0.5) * 360.0
         # The window reaches one metre to either side, two metres ahead.
         expected = np.where(np.abs(azimuth_deg) < np.degrees(np.arctan(0.5)), WINDOW, WALL)
         np.testing.assert_array_equal(kind, expected)
-        np.testing.assert_array_equal(opening_kinds(plan(), np.array([2.0, 2.0]), 0, 0.0, 0.8, 64), WALL)
+        np.testing.assert_array_equal(opening_kinds(plan(), camera(0.8), 0.0, 64), WALL)
 
     def test_walls_are_unknown_in_plans_without_all_openings(self) -> None:
-        kind = opening_kinds(plan(opening_kinds=["window"]), np.array([2.0, 2.0]), 0, 0.0, 1.5, 64)
+        kind = opening_kinds(plan(opening_kinds=["window"]), camera(1.5), 0.0, 64)
         assert set(kind) == {UNKNOWN, WINDOW}
 
     def test_batches_hold_openings_and_room_types(self, batch: dict[str, torch.Tensor]) -> None:

@@ -133,14 +133,23 @@ def _vogel_samples() -> Table:
     return replace(_table("vogel-samples", title, "fig:vdr_sample", columns, *rows), form="figure")
 
 
-def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, tuple[float, float, float]]) -> Table:
+# By metric: title, and figures of both grids.
+_METRICS = {
+    "edges": ("Edges", ((0.793, 20.3, 0.836), (0.556, 48.7, 0.592))),
+    "depth": ("Depth", ((0.803, 20.1, 0.840), (0.552, 48.3, 0.595))),
+    "relative-depth": ("Relative depth", ((0.771, 20.1, 0.854), (0.541, 48.5, 0.616))),
+    "chamfer": ("Chamfer *", ((0.908, 20.0, 0.921), (0.718, 42.7, 0.744))),
+}
+_POSE = ((1.0, 19.8, 1.0), (1.0, 40.1, 0.997))
+
+
+def _similarity(name: str, source: str, grid_step_m: float, grid: int) -> Table:
     columns = ("pose_recall", "median_cm", "correct_room")
-    titles = {"edges": "Edges", "depth": "Depth", "relative-depth": "Relative depth", "chamfer": "Chamfer *"}
     common: dict[str, Any] = {"kind": "layout", "grid_step_m": grid_step_m}
-    rows = [_row("", "Pose (nearest grid pose)", RowQuery(method="pose-oracle", **common), columns, *figures["pose"])]
-    for metric, title in titles.items():
+    rows = [_row("", "Pose (nearest grid pose)", RowQuery(method="pose-oracle", **common), columns, *_POSE[grid])]
+    for metric, (title, figures) in _METRICS.items():
         query = RowQuery(method="similarity", settings={"metric": metric}, **common)
-        rows.append(_row("", title, query, columns, *figures[metric]))
+        rows.append(_row("", title, query, columns, *figures[grid]))
     return Table(
         name=name,
         title=f"Layout-similarity metric, {grid_step_m:g} m grid",
@@ -169,30 +178,8 @@ TABLES: tuple[Table, ...] = (
     _furniture(),
     _refinement(),
     _vogel_samples(),
-    _similarity(
-        "similarity",
-        "tab:oracle",
-        0.5,
-        {
-            "pose": (1.0, 19.8, 1.0),
-            "edges": (0.793, 20.3, 0.836),
-            "depth": (0.803, 20.1, 0.840),
-            "relative-depth": (0.771, 20.1, 0.854),
-            "chamfer": (0.908, 20.0, 0.921),
-        },
-    ),
-    _similarity(
-        "similarity-coarse",
-        "tab:1m_oracle",
-        1.0,
-        {
-            "pose": (1.0, 40.1, 0.997),
-            "edges": (0.556, 48.7, 0.592),
-            "depth": (0.552, 48.3, 0.595),
-            "relative-depth": (0.541, 48.5, 0.616),
-            "chamfer": (0.718, 42.7, 0.744),
-        },
-    ),
+    _similarity("similarity", "tab:oracle", 0.5, 0),
+    _similarity("similarity-coarse", "tab:1m_oracle", 1.0, 1),
     _ablation(
         "training",
         "End-to-end and two-stage training",

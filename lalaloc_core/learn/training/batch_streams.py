@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Camera
+from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.training.batches import (
     Batch,
     LoadFailure,
@@ -206,14 +208,7 @@ class SphereBatches(Stream):
 
     def _classes(self, sample: SphereSample, turn: Rotation) -> Row:
         room = sample.plan.rooms[sample.room_index]
-        kind = opening_kinds(
-            sample.plan,
-            sample.position_m,
-            sample.room_index,
-            turn.heading,
-            sample.camera_height_m,
-            self.config.profile_columns,
-        )
+        kind = opening_kinds(sample.plan, sample, turn.heading, self.config.profile_columns)
         type_code = ROOM_TYPES.index(room.type)
         # Code 0 stands for rooms without a type in the plan.
         return {"opening_kind": turn.profile(kind), "room_type": np.array(type_code or UNKNOWN)}
@@ -224,24 +219,19 @@ class SphereBatches(Stream):
 
 
 def opening_kinds(
-    plan: FloorPlan,
-    position_m: Float[np.ndarray, "2"],
-    room_index: int,
-    heading: float,
-    camera_height_m: float,
-    columns: int,
+    plan: FloorPlan, camera: Camera | Shot | SphereSample, heading: float, columns: int
 ) -> Int[np.ndarray, "{columns}"]:
     """Return the code of the wall or opening that a camera sees at each azimuth at eye height.
 
     Walls are `UNKNOWN` in a plan that does not claim to show all openings.
     """
     view = render_layout(
-        position_m[None].astype(np.float32),
+        camera.position_m[None].astype(np.float32),
         np.array([heading], np.float32),
-        np.array([room_index]),
+        np.array([camera.room_index]),
         plan.geometry,
         columns,
-        camera_height_m,
+        camera.camera_height_m,
     )
     kind = view.kind[0].astype(np.int64)
     if not plan.opening_kinds.issuperset(OPENING_CLASSES[1:]):

@@ -202,8 +202,8 @@ class ImageValidation:
         logits = features.structure.opening_logits
         prior = losses.opening_prior(encoder.opening_share, self.balance)
         predicted = (torch.log_softmax(logits, dim=2) - prior.log()).argmax(dim=2).cpu().numpy()
-        true = np.stack([query.opening_kinds(self.columns) for query in queries])
-        return count_classes(true, predicted, logits.shape[2])
+        kinds = [opening_kinds(of.scene.plan, of.camera, of.turn.heading, self.columns) for of in queries]
+        return count_classes(np.stack(kinds), predicted, logits.shape[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,18 +229,6 @@ class _Query:
         camera, plan = self.camera, self.scene.plan
         numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
         return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
-
-    def opening_kinds(self, columns: int) -> Int[np.ndarray, "{columns}"]:
-        """Return the true opening classes of the rotated photograph, see `batch_streams.opening_kinds`."""
-        camera = self.camera
-        return opening_kinds(
-            self.scene.plan,
-            np.asarray(camera.position_m),
-            camera.room_index,
-            self.turn.heading,
-            camera.camera_height_m,
-            columns,
-        )
 
     def layouts(self, poses: PoseSet, columns: int, device: torch.device) -> _Layouts:
         plan = self.scene.plan

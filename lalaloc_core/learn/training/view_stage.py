@@ -162,16 +162,7 @@ class ViewValidation:
             for shot in shots:
                 pose = shot.position_m[None], np.array([shot.room_index]), np.array([shot.heading])
                 profiles.append(profiles_at(home.plan, *pose, config.profile_columns, np.float32)[0])
-                kinds.append(
-                    opening_kinds(
-                        home.plan,
-                        shot.position_m,
-                        shot.room_index,
-                        shot.heading,
-                        shot.camera_height_m,
-                        config.profile_columns,
-                    )
-                )
+                kinds.append(opening_kinds(home.plan, shot, shot.heading, config.profile_columns))
                 heights.append(shot.camera_height_m)
         part = middle(config)
         self._images = torch.cat(images)

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Split
-from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RendererCache, split_renderer_cache
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.data.views import cut_view, tilt_by_hand
 from lalaloc_core.learn.synth.homes.plans import Home, home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import Window
@@ -81,7 +81,11 @@ def taken_album(
             seed=look,
             lighting="raw",
         )
-        pixels = _sphere(shot, renderers) if spheres else _view(shot, renderers, camera, tilt_by_hand(rng))
+        if spheres:
+            pixels = renderers.renderer(*_SPHERE_SIZE, (1, 1)).render([shot])[0].cpu().numpy()
+        else:
+            (pitch, roll), sphere = tilt_by_hand(rng), renderers.part_of_sphere(shot, _WINDOW, _WINDOW_SIZE)
+            pixels = cut_view(sphere, camera, azimuth=0.0, pitch=pitch, roll=roll)
         photographs.append(TakenPhotograph(pixels, spot.position_m, spot.room_index, spot.heading, spot.taken_s))
     return TakenAlbum(home.plan, photographs, field_deg)
 
@@ -171,24 +175,6 @@ def _framed(home: Home, room_index: int, rng: np.random.Generator) -> tuple[Floa
         if ahead_m >= _AHEAD_M:
             break
     return best
-
-
-def _view(
-    shot: Shot, renderers: RendererCache, camera: Perspective, tilt: tuple[float, float]
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return what a camera sees, with a pitch and a roll (radians)."""
-    rows, columns = _WINDOW_SIZE
-    seen = renderers.renderer(rows, columns, (1, 1), _WINDOW).render([shot])[0].cpu().numpy()
-    # The sphere around the part that is rendered, at its resolution.
-    width = round(columns * TWO_PI / _WINDOW.width)
-    sphere = np.full((width // 2, width, 3), 127, np.uint8)
-    top, left = round((0.5 - _WINDOW.top / math.pi) * (width // 2)), (width - columns) // 2
-    sphere[top : top + rows, left : left + columns] = seen
-    return cut_view(sphere, camera, azimuth=0.0, pitch=tilt[0], roll=tilt[1])
-
-
-def _sphere(shot: Shot, renderers: RendererCache) -> UInt8[np.ndarray, "h w 3"]:
-    return renderers.renderer(*_SPHERE_SIZE, (1, 1)).render([shot])[0].cpu().numpy()
 
 
 def two_views(

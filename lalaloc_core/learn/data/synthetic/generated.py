@@ -13,6 +13,7 @@ import shapely
 import torch
 from jaxtyping import Float, UInt8
 
+from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
@@ -136,6 +137,16 @@ class RendererCache:
                 self.materials, height=height, width=width, device=self._device, supersample=supersample, window=window
             )
         return self._renderers[key]
+
+    def part_of_sphere(self, shot: Shot, window: Window, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+        """Return a sphere of which only a window is rendered, (rows, columns) in `size`; the rest is grey."""
+        rows, columns = size
+        seen = self.renderer(rows, columns, (1, 1), window).render([shot])[0].cpu().numpy()
+        width = round(columns * TWO_PI / window.width)
+        sphere = np.full((width // 2, width, 3), 127, np.uint8)
+        top, left = round((0.5 - window.top / np.pi) * (width // 2)), (width - columns) // 2
+        sphere[top : top + rows, left : left + columns] = seen
+        return sphere
 
 
 @lru_cache(maxsize=4)

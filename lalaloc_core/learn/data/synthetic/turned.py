@@ -163,11 +163,4 @@ def _seen_from(shot: Shot, renderers: RendererCache, phone: Phone, heading: floa
     window, size = (_COARSE_WINDOW, _COARSE_WINDOW_SIZE) if is_coarse else (_WINDOW, _WINDOW_SIZE)
     place = shot.position_m + arm_within(shot, phone.arm_m) * np.array([math.sin(heading), math.cos(heading)])
     turned = dataclasses.replace(shot, position_m=place, heading=heading % TWO_PI)
-    seen = renderers.renderer(*size, (1, 1), window).render([turned])[0].cpu().numpy()
-    rows, columns = size
-    # The sphere around the part that is rendered, at its resolution.
-    width = round(columns * TWO_PI / window.width)
-    sphere = np.full((width // 2, width, 3), 127, np.uint8)
-    top, left = round((0.5 - window.top / math.pi) * (width // 2)), (width - columns) // 2
-    sphere[top : top + rows, left : left + columns] = seen
-    return sphere
+    return renderers.part_of_sphere(turned, window, size)
