@@ -7,12 +7,14 @@ caller's `Authorization` header goes to the service.
 
 from __future__ import annotations
 
+import argparse
 import base64
 import binascii
 import dataclasses
 import json
 import logging
 import os
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -72,16 +74,32 @@ def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool)
     return server
 
 
-def serve(base_url: str, api_key: str | None = None, *, address: tuple[str, int] | None = None) -> None:
-    """Serve on stdio, or over streamable HTTP at an address (host, port), path `/mcp`, until interrupted."""
+def main() -> int:
+    """Serve on stdio, or over streamable HTTP at `/mcp`, until interrupted; return 2 for an invalid address or key."""
+    parser = argparse.ArgumentParser(prog="lalaloc mcp")
+    parser.add_argument("--url", required=True)
+    parser.add_argument("--http", type=_address)
+    arguments = parser.parse_args()
     # One line for each request is too much beside the protocol.
     logging.getLogger("httpx").setLevel(logging.WARNING)
-    if address is None:
-        make_server(base_url, api_key, reads_paths=True).run("stdio")
-    else:
+    try:
+        if arguments.http is None:
+            make_server(arguments.url, os.environ.get("LALALOC_API_KEY"), reads_paths=True).run("stdio")
+            return 0
         # Callers must bring keys of their own.
-        server, (host, port) = make_server(base_url, reads_paths=False), address
+        server, (host, port) = make_server(arguments.url, reads_paths=False), arguments.http
         server.run("streamable-http", host=host, port=port, stateless_http=True, max_request_body_size=_MAX_BODY_BYTES)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, separator, port = text.rpartition(":")
+    if not (separator and host and port.isdigit() and 0 < int(port) < 2**16):
+        raise argparse.ArgumentTypeError(f"'{text}' is no address; write 127.0.0.1:8765")
+    return host.strip("[]"), int(port)
 
 
 class _Tools:
@@ -297,3 +315,7 @@ def _place(floorplan_id: str | None, venue_id: str | None) -> dict[str, str | No
 
 def _text(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

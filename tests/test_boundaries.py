@@ -90,6 +90,7 @@ QUERY_SIDE = ("bundle", "floorplan", "importers", "photograph", "render", "nets"
 FORBIDDEN = {
     **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
     "lalaloc_core.learn": ("lalaloc_core.evaluate",),
+    "lalaloc_core": ("lalaloc_client",),
     "service": ("lalaloc_core.learn", "lalaloc_core.evaluate", "lalaloc_core.cli"),
 }
 # Layers of the service, above the layers of the core, lowest first.

@@ -8,7 +8,6 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture, write_text
@@ -23,13 +22,11 @@ _COLUMNS = ("photograph", "room", "x_m", "y_m", "heading_deg", "within_95_m", "c
 _FORMULA = tuple("=+@\t\r")
 
 
-def add_file_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the files."""
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write a table with a row per photograph")
-    parser.add_argument(
-        "--geojson", type=Path, metavar="FILE", help="write the places on Earth, for a plan with an anchor"
-    )
-    parser.add_argument("--map", type=Path, metavar="FILE", help="draw all places on the plan, .png or .svg")
+FILES = """
+--csv FILE: write a table with a row per photograph
+--geojson FILE: write the places on Earth, for a plan with an anchor
+--map FILE: draw all places on the plan, .png or .svg
+"""
 
 
 def check_file_options(arguments: argparse.Namespace, plan: FloorPlan) -> None:
@@ -49,14 +46,7 @@ def write_files(
     answers: Sequence[dict[str, Any]],
     places: Sequence[tuple[str, Marker]],
 ) -> None:
-    """Write the files that the arguments name.
-
-    Args:
-        arguments: those of `add_file_options`.
-        plan: the plan.
-        answers: documents of the answers; one that failed has `photograph` and `error` alone.
-        places: name and camera of the photographs that were found, for the map.
-    """
+    """Write the files that the arguments name, of documents of answers, and of name and camera of those found."""
     from lalaloc_core.draw.plan_overlays import draw_places
 
     if arguments.csv is not None:

@@ -7,43 +7,25 @@ import json
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
+from lalaloc_core.cli.options import add_options
+
 if TYPE_CHECKING:
     from lalaloc_core.photograph import Intrinsics, StatedCamera
 
 
+_OPTIONS = """
+--projection NAME: equirectangular (360° cameras), perspective, cylindrical (a phone's panorama mode) or fisheye
+    (default: by the photographs' metadata, else by the pictures)
+--hfov DEG: horizontal field of view of the upright photographs (default: by their metadata, else estimated)
+--intrinsics JSON: camera matrix and distortion by OpenCV instead, such as '{"fx": 2870, "fy": 2868, "k1": -0.03}'
+--pitch DEG: elevation of the photographs' centres above the horizon (default: estimated)
+--roll DEG: clockwise rotation of the camera about its optical axis (default: estimated)
+"""
+
+
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
     """Add the options about the camera of photographs."""
-    parser.add_argument(
-        "--projection",
-        default="auto",
-        metavar="NAME",
-        help="equirectangular (360° cameras), perspective, cylindrical (a phone's panorama mode) or fisheye (default: "
-        "by the photographs' metadata, else by the pictures)",
-    )
-    parser.add_argument(
-        "--hfov",
-        type=float,
-        metavar="DEG",
-        help="horizontal field of view of the upright photographs (default: by their metadata, else estimated)",
-    )
-    parser.add_argument(
-        "--intrinsics",
-        type=_intrinsics,
-        metavar="JSON",
-        help='camera matrix and distortion by OpenCV instead, such as \'{"fx": 2870, "fy": 2868, "k1": -0.03}\'',
-    )
-    parser.add_argument(
-        "--pitch",
-        type=float,
-        metavar="DEG",
-        help="elevation of the photographs' centres above the horizon (default: estimated)",
-    )
-    parser.add_argument(
-        "--roll",
-        type=float,
-        metavar="DEG",
-        help="clockwise rotation of the camera about its optical axis (default: estimated)",
-    )
+    add_options(parser, _OPTIONS, projection={"default": "auto"}, intrinsics={"type": _intrinsics})
 
 
 def _intrinsics(text: str) -> Intrinsics:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
-from lalaloc_core.cli.options import add_options, positive
+from lalaloc_core.cli.options import BUNDLE, TURN, add_options
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
@@ -20,47 +20,31 @@ if TYPE_CHECKING:
     from lalaloc_core.localise.encode.features import FeatureEncoder
     from lalaloc_core.photograph import StatedCamera
 
-_HEIGHT_M = 1.5
+_ENCODE_OPTIONS = f"""
+photographs PHOTO: photographs, as for `lalaloc localise`
+{TURN}
+-o, --out FILE: file of the features of a single photograph (default: beside each photograph, with the suffix
+    .features); of --turn: folder of the features and of turn.json, the fields to send with them (default: FILM with
+    the suffix .features)
+{BUNDLE}
+"""
+_FEATURES_OPTIONS = f"""
+file FILE: a file that `lalaloc encode` wrote
+--out PICTURE: drawing of the room as the features tell it, .png or .svg
+--camera-height M: metres above the floor, which give lengths their scale (default: %(default)s)
+{BUNDLE}
+"""
 
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     encode = commands.add_parser("encode", help="compute the features of photographs, to send instead of them")
-    encode.add_argument(
-        "photographs", type=Path, nargs="*", metavar="PHOTO", help="photographs, as for `lalaloc localise`"
-    )
-    encode.add_argument(
-        "--turn",
-        type=Path,
-        metavar="FILM",
-        help="film of one slow turn on the spot, or a folder of photographs of one, instead of PHOTO",
-    )
-    encode.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="file of the features of a single photograph (default: beside each photograph, with the suffix "
-        ".features); of --turn: folder of the features and of turn.json, the fields to send with them (default: FILM "
-        "with the suffix .features)",
-    )
+    add_options(encode, _ENCODE_OPTIONS, photographs={"nargs": "*"})
     add_camera_options(encode)
     encode.set_defaults(run=_encode)
     features = commands.add_parser("features", help="show what features reveal of a room")
-    features.add_argument("file", type=Path, metavar="FILE", help="a file that `lalaloc encode` wrote")
-    features.add_argument(
-        "--out", type=Path, metavar="PICTURE", help="drawing of the room as the features tell it, .png or .svg"
-    )
-    features.add_argument(
-        "--camera-height",
-        type=positive,
-        default=_HEIGHT_M,
-        metavar="M",
-        help="metres above the floor, which give lengths their scale (default: %(default)s)",
-    )
+    add_options(features, _FEATURES_OPTIONS, camera_height={"default": 1.5})
     features.set_defaults(run=_features)
-    add_options(encode, "--bundle")
-    add_options(features, "--bundle")
 
 
 def _encode(arguments: argparse.Namespace) -> None:

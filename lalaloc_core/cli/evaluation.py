@@ -8,9 +8,20 @@ import sys
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from lalaloc_core.cli.lab import Command, check_range
+from lalaloc_core.cli.lab import (
+    AsJson,
+    BundleFolder,
+    Command,
+    Homes,
+    Runs,
+    Seed,
+    SkipBad,
+    Textures,
+    Workers,
+    check_range,
+)
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.files import default_bundle
@@ -24,129 +35,86 @@ _SHARES = ("within_10cm", "within_50cm", "within_1m", "within_1m_30deg", "correc
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Localise the queries of a data set or of generated homes, and score the answers.
+    """Localise the queries of a data set or of generated homes, and score the answers."""
 
-    Attributes:
-        bundle: model bundle (default: the shipped one).
-        method: localisation method.
-        kind: kind of query.
-        data: data set (default: generated homes).
-        dataset: format of the data set (default: detected from its files).
-        generator: generator of homes: the one used in training, or sixty out-of-distribution homes.
-        homes: number of generated homes, 4 queries each.
-        seed: random seed of generated homes.
-        textures: folder of material pictures for generated homes (default: procedural materials).
-        split: split.
-        furniture: furniture level (default: by data set).
-        lighting: lighting (default: by data set).
-        heading: heading of queries (default: known; that of albums is unknown).
-        grid_step: step of the pose grid, metres.
-        view: cut views of this field of view, degrees (default: whole spheres).
-        heading_error: largest error of the known heading of views, degrees (default: 0).
-        albums: solve all photographs of a scene together, as `lalaloc pin`; files can be of any projection.
-        refine: last stage of refinement (default: lpo).
-        limit: maximum number of queries (default: all).
-        skip_bad: skip unusable files and samples, and list them.
-        workers: worker processes (default: one per core).
-        out: folder of the run; an existing run is continued.
-        json: print all figures as JSON.
-    """
-
-    bundle: Path = field(default_factory=default_bundle)
-    method: Literal["lalaloc", "oracle", "icp", "explicit", "decode"] = "lalaloc"
-    kind: Literal["layout", "photograph"] = "photograph"
-    data: Path | None = None
-    dataset: Literal["structured3d", "zind", "own", "annotated"] | None = None
-    generator: Literal["synth", "heldout"] = "synth"
-    homes: int = 100
-    seed: int = 0
-    textures: Path | None = None
-    split: Split = "test"
-    furniture: Literal["empty", "simple", "full"] | None = None
-    lighting: Literal["cold", "raw", "warm"] | None = None
-    heading: Literal["known", "unknown"] | None = None
-    grid_step: float = 0.5
-    view: float | None = None
-    heading_error: float | None = None
-    albums: bool = False
-    refine: Literal["none", "vdr", "lpo"] | None = None
-    limit: int | None = None
-    skip_bad: bool = False
-    workers: int | None = None
-    out: Path | None = None
-    json: bool = False
+    bundle: BundleFolder = field(default_factory=default_bundle)
+    method: Annotated[Literal["lalaloc", "oracle", "icp", "explicit", "decode"], "localisation method"] = "lalaloc"
+    kind: Annotated[Literal["layout", "photograph"], "kind of query"] = "photograph"
+    data: Annotated[Path | None, "data set (default: generated homes)"] = None
+    dataset: Annotated[
+        Literal["structured3d", "zind", "own", "annotated"] | None,
+        "format of the data set (default: detected from its files)",
+    ] = None
+    generator: Annotated[
+        Literal["synth", "heldout"], "generator of homes: the one used in training, or sixty out-of-distribution homes"
+    ] = "synth"
+    homes: Homes = 100
+    seed: Seed = 0
+    textures: Textures = None
+    split: Annotated[Split, "split"] = "test"
+    furniture: Annotated[Literal["empty", "simple", "full"] | None, "furniture level (default: by data set)"] = None
+    lighting: Annotated[Literal["cold", "raw", "warm"] | None, "lighting (default: by data set)"] = None
+    heading: Annotated[
+        Literal["known", "unknown"] | None, "heading of queries (default: known; that of albums is unknown)"
+    ] = None
+    grid_step: Annotated[float, "step of the pose grid, metres"] = 0.5
+    view: Annotated[float | None, "cut views of this field of view, degrees (default: whole spheres)"] = None
+    heading_error: Annotated[float | None, "largest error of the known heading of views, degrees (default: 0)"] = None
+    albums: Annotated[
+        bool, "solve all photographs of a scene together, as `lalaloc pin`; files can be of any projection"
+    ] = False
+    refine: Annotated[Literal["none", "vdr", "lpo"] | None, "last stage of refinement (default: lpo)"] = None
+    limit: Annotated[int | None, "maximum number of queries (default: all)"] = None
+    skip_bad: SkipBad = False
+    workers: Workers = None
+    out: Annotated[Path | None, "folder of the run; an existing run is continued"] = None
+    json: AsJson = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Score the stored predictions of runs again, without model or data.
+    """Score the stored predictions of runs again, without model or data."""
 
-    Attributes:
-        runs: folders of runs.
-        json: print all figures as JSON.
-    """
-
-    runs: tuple[Path, ...]
-    json: bool = False
+    runs: Runs
+    json: AsJson = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Write a self-contained HTML report about runs.
+    """Write a self-contained HTML report about runs."""
 
-    Attributes:
-        runs: folders of runs.
-        out: page to write.
-    """
-
-    runs: tuple[Path, ...]
-    out: Path = Path("report.html")
+    runs: Runs
+    out: Annotated[Path, "page to write"] = Path("report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Worst:
-    """List the worst queries of a run and count their properties.
+    """List the worst queries of a run and count their properties."""
 
-    Attributes:
-        folder: folder of the run.
-        count: number of queries.
-        out: folder of results.
-    """
-
-    folder: Path
-    count: int = 100
-    out: Path = Path("worst")
+    folder: Annotated[Path, "folder of the run"]
+    count: Annotated[int, "number of queries"] = 100
+    out: Annotated[Path, "folder of results"] = Path("worst")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Fit a bundle's matching weights and confidence on generated validation homes.
+    """Fit a bundle's matching weights and confidence on generated validation homes."""
 
-    Attributes:
-        bundle: model bundle (default: the shipped one).
-        homes: number of generated homes, 4 queries each.
-        seed: random seed of generated homes.
-        textures: folder of material pictures for generated homes (default: procedural materials).
-        openings_weight: weight of openings relative to walls, such as one tuned on photographs (default: fitted).
-        tail: scale of the errors of walls over the predicted one (default: the bundle's).
-        keep_evidence: keep the bundle's matching weights and fit only confidence.
-        views: calibrate the encoder of views, on views of 55° to 110°, not on spheres.
-        turns: only fit the confidence of turns on the spot, on 2 turns of views and parts of them in each home.
-        errors: only measure the predictions' errors, for `plan check --localisability`.
-        out: folder to store predictions in and to continue from.
-    """
-
-    bundle: Path = field(default_factory=default_bundle)
-    homes: int = 100
-    seed: int = 0
-    textures: Path | None = None
-    openings_weight: float | None = None
-    tail: float | None = None
-    keep_evidence: bool = False
-    views: bool = False
-    turns: bool = False
-    errors: bool = False
-    out: Path | None = None
+    bundle: BundleFolder = field(default_factory=default_bundle)
+    homes: Homes = 100
+    seed: Seed = 0
+    textures: Textures = None
+    openings_weight: Annotated[
+        float | None, "weight of openings relative to walls, such as one tuned on photographs (default: fitted)"
+    ] = None
+    tail: Annotated[float | None, "scale of the errors of walls over the predicted one (default: the bundle's)"] = None
+    keep_evidence: Annotated[bool, "keep the bundle's matching weights and fit only confidence"] = False
+    views: Annotated[bool, "calibrate the encoder of views, on views of 55° to 110°, not on spheres"] = False
+    turns: Annotated[
+        bool, "only fit the confidence of turns on the spot, on 2 turns of views and parts of them in each home"
+    ] = False
+    errors: Annotated[bool, "only measure the predictions' errors, for `plan check --localisability`"] = False
+    out: Annotated[Path | None, "folder to store predictions in and to continue from"] = None
 
 
 def _evaluate(arguments: Evaluate) -> None:

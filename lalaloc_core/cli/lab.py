@@ -1,7 +1,7 @@
 """`lalaloc lab`: commands that train, measure and export models, each with a configuration.
 
-A configuration is a dataclass. Its values come from a TOML or JSON file, from words such as
-`preset=trunk`, and from options, which are made of its fields; later ones win.
+A configuration is a dataclass, whose annotations say what its fields mean. Its values come from a TOML or JSON file,
+from words such as `preset=trunk`, and from options, which are made of its fields; later ones win.
 """
 
 from __future__ import annotations
@@ -9,13 +9,12 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
-import re
 import tomllib
-from collections.abc import Callable
-from dataclasses import Field, dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from lalaloc_core.errors import ConfigError
 
@@ -31,32 +30,37 @@ class Command:
     positional: str
 
 
+Textures = Annotated[Path | None, "folder of material pictures for generated homes (default: procedural materials)"]
+BundleFolder = Annotated[Path, "model bundle (default: the shipped one)"]
+Workers = Annotated[int | None, "worker processes (default: one per core)"]
+SkipBad = Annotated[bool, "skip unusable files and samples, and list them"]
+Homes = Annotated[int, "number of generated homes, 4 queries each"]
+Seed = Annotated[int, "random seed of generated homes"]
+AsJson = Annotated[bool, "print all figures as JSON"]
+Runs = Annotated[tuple[Path, ...], "folders of runs"]
+
+
 def add_command(commands: Any, name: str, command: Command) -> None:
     """Add a command, with an option for each field of its configuration."""
-    text, _, attributes = (inspect.getdoc(command.kind) or "").partition("\n\nAttributes:\n")
-    meanings = {
-        key: " ".join(meaning.split())
-        for key, meaning in re.findall(r"^ {4}(\w+): (.*(?:\n {5,}.*)*)", attributes, re.MULTILINE)
-    }
-    positional = command.positional.rstrip("_")
+    text = inspect.getdoc(command.kind) or ""
     parser = commands.add_parser(name, help=text[0].lower() + text[1:].rstrip("."))
     parser.add_argument(
         "words",
         nargs="*",
         metavar="WORD",
         help="file of the configuration, .toml or .json; values by the names of the options; and the value of "
-        f"--{positional}",
+        f"--{command.positional.rstrip('_')}",
     )
+    hints = get_type_hints(command.kind, include_extras=True)
     for entry in fields(command.kind):
-        key, annotation = entry.name.rstrip("_"), str(entry.type)
-        usual = entry.default
+        key, hint, usual = entry.name.rstrip("_"), hints[entry.name], entry.default
         # argparse reads % in help as a format.
-        meaning = meanings[entry.name].replace("%", "%%")
-        if annotation != "bool" and isinstance(usual, str | int | float | Path):
-            meaning += f" (default: {usual})"
+        meaning = hint.__metadata__[0].replace("%", "%%")
         given: dict[str, Any] = {"action": "append", "metavar": key.upper()}
-        if annotation == "bool":
+        if hint.__origin__ is bool:
             given = {"action": "append_const", "const": "true"}
+        elif isinstance(usual, str | int | float | Path):
+            meaning += f" (default: {usual})"
         parser.add_argument(f"--{key.replace('_', '-')}", dest=entry.name, help=meaning, **given)
     parser.set_defaults(run=partial(_run, command))
 
@@ -66,49 +70,46 @@ def _run(command: Command, arguments: argparse.Namespace) -> None:
 
 
 def configured(command: Command, words: list[str], options: dict[str, list[str] | None]) -> Any:
-    """Return a configuration of files, words and options.
-
-    Raises:
-        ConfigError: a file cannot be read, or a key or value is wrong.
-    """
+    """Return a configuration of files, words and options."""
     from lalaloc_core.configuration import build_config
 
-    known = {entry.name: entry for entry in fields(command.kind)}
+    known = get_type_hints(command.kind)
     raw: dict[str, Any] = {}
     for word in words:
         key, equals, text = word.partition("=")
         if not equals and Path(word).suffix in _FILES:
             raw |= {_field_name(name, known): value for name, value in _read(Path(word)).items()}
         elif equals:
-            _set(raw, known[_field_name(key, known)], text)
+            _set(raw, known, _field_name(key, known), text)
         else:
-            _set(raw, known[command.positional], word)
+            _set(raw, known, command.positional, word)
     for name, texts in options.items():
         for text in (texts or []) if name in known else []:
-            _set(raw, known[name], text)
+            _set(raw, known, name, text)
     return build_config(command.kind, raw, path="the configuration")
 
 
-def _field_name(key: str, known: dict[str, Field[Any]]) -> str:
+def _field_name(key: str, known: Mapping[str, Any]) -> str:
     name = key.replace("-", "_")
     if name not in known and f"{name}_" not in known:
         raise ConfigError(f"the configuration has no key '{key}'; it has {', '.join(known).replace('_,', ',')}")
     return name if name in known else f"{name}_"
 
 
-def _set(raw: dict[str, Any], entry: Field[Any], text: str) -> None:
+def _set(raw: dict[str, Any], known: Mapping[str, Any], name: str, text: str) -> None:
     """Set a value by its text; tables and lists get one more."""
-    annotation = str(entry.type)
-    if annotation.startswith("dict"):
+    kind = get_origin(known[name]) or known[name]
+    types = get_args(known[name]) or (kind,)
+    if kind is dict:
         key, equals, value = text.partition("=")
         if not equals:
-            raise ConfigError(f"--{entry.name.rstrip('_')} is '{text}'; it must be KEY=VALUE")
-        raw[entry.name] = raw.get(entry.name, {}) | {key: value if "dict[str, str]" in annotation else _json(value)}
-    elif annotation.startswith("tuple"):
-        value = _json(text) if text.startswith("[") or "float" in annotation else text
-        raw[entry.name] = [*raw.get(entry.name, []), *(value if isinstance(value, list) else [value])]
+            raise ConfigError(f"--{name.rstrip('_')} is '{text}'; it must be KEY=VALUE")
+        raw[name] = raw.get(name, {}) | {key: value if types == (str, str) else _json(value)}
+    elif kind is tuple:
+        value = _json(text) if text.startswith("[") or float in types else text
+        raw[name] = [*raw.get(name, []), *(value if isinstance(value, list) else [value])]
     else:
-        raw[entry.name] = _json(text) if re.match("bool|int|float", annotation) else text
+        raw[name] = _json(text) if {bool, int, float} & set(types) else text
 
 
 def _json(text: str) -> Any:
@@ -129,11 +130,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def check_range(configuration: Any, least: float, *names: str) -> None:
-    """Check that values are at least `least`, or greater if it is 0 and they are no integers.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Check that values are at least `least`, or greater if it is 0 and they are no integers."""
     for name in names:
         value = getattr(configuration, name)
         if value is not None and (value < least or (isinstance(value, float) and value <= least)):

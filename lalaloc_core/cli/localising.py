@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.cli.answer_files import add_file_options, check_file_options, write_files
+from lalaloc_core.cli.answer_files import FILES, check_file_options, write_files
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
-from lalaloc_core.cli.options import add_options, heading, tolerance
+from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, PLAN, TURN, add_options, heading, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
@@ -23,6 +23,24 @@ if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
     from lalaloc_core.localise.answers.documents import Answer
     from lalaloc_core.photograph import StatedCamera
+
+
+_OPTIONS = f"""
+{PLAN}
+photographs PHOTO: full spheres, ordinary, fisheye or panorama-mode photographs (docs/how-to/take-photographs.md), or
+    their features from `lalaloc encode`
+{TURN}
+--heading DEG: azimuth of the photographs' centres, clockwise from the plan's +y (default: the photographs' compass if
+    the plan has north_deg, otherwise estimated)
+--heading-tolerance DEG: maximum error of --heading, at most 45 degrees (default: 0)
+{CAMERA_HEIGHT}
+--out FILE: picture of the answer to write, .png or .svg; with several photographs their number is appended
+--picture: content of --out: the plan with the posterior, the photograph with the predicted layout, or both
+    (default: %(default)s); of features only the plan
+{FILES}
+--json: print JSON: a list with one answer per photograph
+{BUNDLE}
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,54 +55,15 @@ class _Found:
 def add_commands(commands: Any) -> None:
     """Add this command to the parser."""
     localise = commands.add_parser("localise", help="localise photographs in a plan, without a service")
-    localise.add_argument(
-        "plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/how-to/import-a-plan.md"
+    add_options(
+        localise,
+        _OPTIONS,
+        photographs={"nargs": "*"},
+        heading={"type": heading},
+        heading_tolerance={"type": tolerance},
+        picture={"action": "store", "choices": ("both", "plan", "photograph"), "default": "both"},
     )
-    localise.add_argument(
-        "photographs",
-        type=Path,
-        nargs="*",
-        metavar="PHOTO",
-        help="full spheres, ordinary, fisheye or panorama-mode photographs (docs/how-to/take-photographs.md), or "
-        "their features from `lalaloc encode`",
-    )
-    localise.add_argument(
-        "--turn",
-        type=Path,
-        metavar="FILM",
-        help="film of one slow turn on the spot, or a folder of photographs of one, instead of PHOTO",
-    )
-    localise.add_argument(
-        "--heading",
-        type=heading,
-        metavar="DEG",
-        help="azimuth of the photographs' centres, clockwise from the plan's +y (default: the photographs' "
-        "compass if the plan has north_deg, otherwise estimated)",
-    )
-    localise.add_argument(
-        "--heading-tolerance",
-        type=tolerance,
-        metavar="DEG",
-        help="maximum error of --heading, at most 45 degrees (default: 0)",
-    )
-    add_options(localise, "--camera-height")
     add_camera_options(localise)
-    localise.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="picture of the answer to write, .png or .svg; with several photographs their number is appended",
-    )
-    localise.add_argument(
-        "--picture",
-        choices=("both", "plan", "photograph"),
-        default="both",
-        help="content of --out: the plan with the posterior, the photograph with the predicted layout, or both "
-        "(default: %(default)s); of features only the plan",
-    )
-    add_file_options(localise)
-    localise.add_argument("--json", action="store_true", help="print JSON: a list with one answer per photograph")
-    add_options(localise, "--bundle")
     add_plan_options(localise)
     localise.set_defaults(run=_localise)
 

@@ -7,9 +7,9 @@ import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from lalaloc_core.cli.lab import Command, check_range
+from lalaloc_core.cli.lab import BundleFolder, Command, SkipBad, Textures, Workers, check_range
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import ConfigError, InvalidInputError
 from lalaloc_core.files import default_bundle
@@ -40,77 +40,50 @@ _GROUPS: tuple[Group, ...] = get_args(Group)
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure the figures of the results page and print them as JSON.
+    """Measure the figures of the results page and print them as JSON."""
 
-    Attributes:
-        only: groups of figures (default: all).
-        bundle: model bundle (default: the shipped one).
-        textures: folder of material pictures for generated homes (default: procedural materials).
-        homes: test homes per accuracy figure, 4 queries each.
-        out: also write the JSON to this file; with `only`, update it.
-        annotated: folder of annotated photographs, for albums, bounds and films of real rooms.
-        profile: print the time of each stage of a query instead of measuring figures.
-        queries: queries for `profile`.
-    """
-
-    only: tuple[Group, ...] = ()
-    bundle: Path = field(default_factory=default_bundle)
-    textures: Path | None = None
-    homes: int = 250
-    out: Path | None = None
-    annotated: Path | None = None
-    profile: bool = False
-    queries: int = 10
+    only: Annotated[tuple[Group, ...], "groups of figures (default: all)"] = ()
+    bundle: BundleFolder = field(default_factory=default_bundle)
+    textures: Textures = None
+    homes: Annotated[int, "test homes per accuracy figure, 4 queries each"] = 250
+    out: Annotated[Path | None, "also write the JSON to this file; with `only`, update it"] = None
+    annotated: Annotated[Path | None, "folder of annotated photographs, for albums, bounds and films of real rooms"] = (
+        None
+    )
+    profile: Annotated[bool, "print the time of each stage of a query instead of measuring figures"] = False
+    queries: Annotated[int, "queries for `profile`"] = 10
 
 
 @dataclass(frozen=True, kw_only=True)
 class Photographs:
-    """Measure a model on annotated photographs of real rooms.
+    """Measure a model on annotated photographs of real rooms."""
 
-    Attributes:
-        data: folder of annotated photographs.
-        galleries: number of plans to locate every photograph in; 0 measures walls and openings only.
-        view: also views of these fields, degrees.
-        bundle: model bundle (default: the shipped one).
-        workers: worker processes (default: one per core).
-        out: folder of results.
-    """
-
-    data: Path
-    galleries: int = GALLERIES
-    view: tuple[float, ...] = ()
-    bundle: Path = field(default_factory=default_bundle)
-    workers: int | None = None
-    out: Path = Path("photographs")
+    data: Annotated[Path, "folder of annotated photographs"]
+    galleries: Annotated[int, "number of plans to locate every photograph in; 0 measures walls and openings only"] = (
+        GALLERIES
+    )
+    view: Annotated[tuple[float, ...], "also views of these fields, degrees"] = ()
+    bundle: BundleFolder = field(default_factory=default_bundle)
+    workers: Workers = None
+    out: Annotated[Path, "folder of results"] = Path("photographs")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Measure a table of the paper and print it beside the paper's.
+    """Measure a table of the paper and print it beside the paper's."""
 
-    Attributes:
-        table: tables.
-        list_: list the tables and exit.
-        all_: all tables.
-        data: data set: Structured3D or the output of synth.
-        budget: amount of training and of queries per row.
-        out: folder of models, runs and tables.
-        limit: queries per row (default: by `budget`).
-        skip_bad: skip unusable files and samples, and list them.
-        workers: worker processes (default: one per core).
-        bundle: model bundle of the shipped model's rows (default: the shipped one).
-    """
-
-    table: tuple[str, ...] = ()
-    list_: bool = False
-    all_: bool = False
-    data: Path | None = None
-    budget: Literal["small", "full"] = "small"
-    out: Path = Path("runs/reproduce")
-    limit: int | None = None
-    skip_bad: bool = False
-    workers: int | None = None
-    bundle: Path = field(default_factory=default_bundle)
+    table: Annotated[tuple[str, ...], "tables"] = ()
+    list_: Annotated[bool, "list the tables and exit"] = False
+    all_: Annotated[bool, "all tables"] = False
+    data: Annotated[Path | None, "data set: Structured3D or the output of synth"] = None
+    budget: Annotated[Literal["small", "full"], "amount of training and of queries per row"] = "small"
+    out: Annotated[Path, "folder of models, runs and tables"] = Path("runs/reproduce")
+    limit: Annotated[int | None, "queries per row (default: by `budget`)"] = None
+    skip_bad: SkipBad = False
+    workers: Workers = None
+    bundle: Annotated[Path, "model bundle of the shipped model's rows (default: the shipped one)"] = field(
+        default_factory=default_bundle
+    )
 
 
 def _bench(arguments: Bench) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,19 +33,25 @@ positive = _within("positive", float, "positive", lambda value: 0.0 < value < ma
 heading = _within("heading", float, "between -360 and 360 degrees", lambda value: -360.0 <= value <= 360.0)
 tolerance = _within("tolerance", float, "between 0 and 45 degrees", lambda value: 0.0 <= value <= 45.0)
 
-_OPTIONS: dict[str, dict[str, Any]] = {
-    "--bundle": {"type": Path, "help": "model bundle (default: the shipped one)"},
-    "--camera-height": {
-        "type": positive,
-        "metavar": "M",
-        "help": "metres above the floor (default: the plan's, otherwise estimated)",
-    },
-}
+_PATHS = ("PLAN", "PHOTO", "FILM", "FOLDER", "FILE", "PICTURE", "DIR", "YAML")
+_OPTION = re.compile(r"^(\S+(?:, \S+)?)(?: ([A-Z][A-Z:]*))?: (.*(?:\n .*)*)", re.MULTILINE)
+PLAN = "plan PLAN: a floor plan, in any format of docs/how-to/import-a-plan.md"
+TURN = "--turn FILM: film of one slow turn on the spot, or a folder of photographs of one, instead of PHOTO"
+CAMERA_HEIGHT = "--camera-height M: metres above the floor (default: the plan's, otherwise estimated)"
+BUNDLE = "--bundle DIR: model bundle (default: the shipped one)"
 
 
-def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add shared options by name, such as "--bundle"."""
-    for name in names:
+def add_options(parser: argparse.ArgumentParser, text: str, **more: Mapping[str, Any]) -> None:
+    """Add options and arguments, each by its names, the metavar, a colon, and the meaning, continued on indented lines.
+
+    The metavar tells the type: paths, metres (M), degrees (DEG), else text. An option without one is a switch. `more`
+    has further arguments of `add_argument` by the names of their values.
+    """
+    for names, metavar, meaning in _OPTION.findall(text):
+        kind = Path if metavar in _PATHS else {"M": positive, "DEG": float}.get(metavar, str)
+        given = {"type": kind, "metavar": metavar} if metavar else {"action": "store_true"}
+        given |= more.get(names.split("--")[-1].replace("-", "_"), {})
+        parser.add_argument(*names.split(", "), help=" ".join(meaning.split()), **given)
+    if BUNDLE in text:
         # The path of the shipped model depends on the working folder.
-        default: dict[str, Any] = {"default": default_bundle()} if name == "--bundle" else {}
-        parser.add_argument(name, **_OPTIONS[name], **default)
+        parser.set_defaults(bundle=default_bundle())

@@ -10,11 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
-from lalaloc_core.cli.options import add_options
+from lalaloc_core.cli.options import BUNDLE, PLAN, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 
+_OPTIONS = f"""
+{PLAN}
+folder FOLDER: folder of photographs, up to 500; never changed
+--out DIR: folder to write, which is created
+--previous FILE: pins.json of an earlier run; list what moved since, such as in a new revision of the plan
+--no-copies: write no copies of the photographs
+--json: print JSON instead of a table
+{BUNDLE}
+"""
 _HEAD = ("no", "photograph", "room", "x m", "y m", "heading °", "confidence", "state")
 
 
@@ -23,21 +32,8 @@ def add_commands(commands: Any) -> None:
     pin = commands.add_parser(
         "pin", help="pin a folder of photographs to a plan: tables, a map, a PDF report, and copies with their place"
     )
-    pin.add_argument(
-        "plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/how-to/import-a-plan.md"
-    )
-    pin.add_argument("folder", type=Path, metavar="FOLDER", help="folder of photographs, up to 500; never changed")
-    pin.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, which is created")
-    pin.add_argument(
-        "--previous",
-        type=Path,
-        metavar="FILE",
-        help="pins.json of an earlier run; list what moved since, such as in a new revision of the plan",
-    )
-    pin.add_argument("--no-copies", action="store_true", help="write no copies of the photographs")
-    pin.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_options(pin, _OPTIONS, out={"required": True})
     add_camera_options(pin)
-    add_options(pin, "--bundle")
     add_plan_options(pin)
     pin.set_defaults(run=_pin)
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.cli.options import add_options
+from lalaloc_core.cli.options import BUNDLE, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
@@ -21,38 +21,40 @@ if TYPE_CHECKING:
     from lalaloc_core.importers import ImportedPlan
 
 
+_IMPORT_OPTIONS = """
+-o, --out FILE: file to write (default: standard output)
+--all-levels: write a plan of every level with rooms to the folder --out
+--debug PICTURE: draw what was read from a drawing or picture, .png or .svg
+"""
+_CHECK_OPTIONS = f"""
+--json: print JSON
+--localisability: also predict which photographs of the plan will be found
+--picture FILE: map of that probability, .png or .svg; needs --localisability
+{BUNDLE}
+"""
+_DRAW_OPTIONS = "--out FILE: picture to write, .png or .svg"
+_EXPORT_OPTIONS = """
+--format FORMAT: native, geojson, imdf, dxf, svg or ros
+--out FILE: file to write
+--anchor ANCHOR: latitude,longitude[,north_deg] of the plan's origin, for geojson and imdf
+--like YAML: map whose origin, resolution and size the export has, for ros
+"""
+
+
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     plan = commands.add_parser("plan", help="import, check, draw and export floor plans (docs/how-to/import-a-plan.md)")
     actions = plan.add_subparsers(required=True, metavar="ACTION")
     importing = actions.add_parser("import", help="convert a file of any supported format to a plan, with a report")
-    importing.add_argument("-o", "--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
-    importing.add_argument(
-        "--all-levels", action="store_true", help="write a plan of every level with rooms to the folder --out"
-    )
-    importing.add_argument(
-        "--debug", type=Path, metavar="PICTURE", help="draw what was read from a drawing or picture, .png or .svg"
-    )
+    add_options(importing, _IMPORT_OPTIONS)
     check = actions.add_parser("check", help="print the warnings of a plan")
-    check.add_argument("--json", action="store_true", help="print JSON")
-    check.add_argument(
-        "--localisability", action="store_true", help="also predict which photographs of the plan will be found"
-    )
-    check.add_argument(
-        "--picture", type=Path, metavar="FILE", help="map of that probability, .png or .svg; needs --localisability"
-    )
-    add_options(check, "--bundle")
+    add_options(check, _CHECK_OPTIONS)
     draw = actions.add_parser("draw", help="draw a plan as PNG or SVG")
-    draw.add_argument("--out", type=Path, required=True, metavar="FILE", help="picture to write, .png or .svg")
+    add_options(draw, _DRAW_OPTIONS, out={"required": True})
     export = actions.add_parser("export", help="write a plan in another format")
-    export.add_argument("--format", required=True, help="native, geojson, imdf, dxf, svg or ros")
-    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write")
-    export.add_argument("--anchor", help="latitude,longitude[,north_deg] of the plan's origin, for geojson and imdf")
-    export.add_argument(
-        "--like", type=Path, metavar="YAML", help="map whose origin, resolution and size the export has, for ros"
-    )
+    add_options(export, _EXPORT_OPTIONS, format={"required": True}, out={"required": True})
     for action, run in ((importing, _import), (check, _check), (draw, _draw), (export, _export)):
-        action.add_argument("file", type=Path, help="floor plan, in any supported format")
+        add_options(action, "file FILE: floor plan, in any supported format")
         add_plan_options(action)
         action.set_defaults(run=run)
 

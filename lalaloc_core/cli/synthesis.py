@@ -5,33 +5,23 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from lalaloc_core.cli.lab import Command
+from lalaloc_core.cli.lab import Command, Seed, Textures
 from lalaloc_core.learn.dataset_names import Split
 
 
 @dataclass(frozen=True, kw_only=True)
 class Synth:
-    """Write synthetic scenes in Structured3D's layout.
+    """Write synthetic scenes in Structured3D's layout."""
 
-    Attributes:
-        scenes: number of scenes in total; existing ones are kept.
-        out: folder of the data set.
-        split: split.
-        height: height of a sphere in pixels, half its width.
-        seed: random seed of generated homes.
-        textures: folder of material pictures for generated homes (default: procedural materials).
-        workers: rendering processes.
-    """
-
-    scenes: int
-    out: Path
-    split: Literal["all"] | Split = "all"
-    height: int = 256
-    seed: int = 0
-    textures: Path | None = None
-    workers: int = 1
+    scenes: Annotated[int, "number of scenes in total; existing ones are kept"]
+    out: Annotated[Path, "folder of the data set"]
+    split: Annotated[Literal["all"] | Split, "split"] = "all"
+    height: Annotated[int, "height of a sphere in pixels, half its width"] = 256
+    seed: Seed = 0
+    textures: Textures = None
+    workers: Annotated[int, "rendering processes"] = 1
 
 
 def _synth(arguments: Synth) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
-from lalaloc_core.cli.options import add_options, heading
+from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture, write_text
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
@@ -21,42 +21,28 @@ if TYPE_CHECKING:
     from lalaloc_core.localise.tracking.trajectories import Trajectory
     from lalaloc_core.photograph import StatedCamera
 
+_OPTIONS = f"""
+plan PLAN: a floor plan, as for `lalaloc localise`
+folder FOLDER: photographs named by their time in seconds, such as 12.50.jpg
+--odometry FILE: poses of the robot: TUM lines, or CSV with time_s, x_m, y_m and yaw_deg, counter-clockwise from +x
+--odometry-frame: axes of TUM poses: rep103 (x forward, z up) or optical (z forward, y down), as of visual SLAM
+    (default: by the direction that stays upright)
+--mount DEG: azimuth of the photographs' centre relative to the odometry's x, clockwise (default: 0)
+{CAMERA_HEIGHT}
+--trajectory FILE: TUM file of the poses in the plan to write
+--out FILE: picture of the path to write, .png or .svg
+--json: print JSON: a list with one pose per photograph
+{BUNDLE}
+"""
 _HEAD = ("photograph", "mode", "room", "x m", "y m", "heading °", "probability")
 
 
 def add_commands(commands: Any) -> None:
     """Add this command to the parser."""
     track = commands.add_parser("track", help="follow a camera through a folder of photographs, without a service")
-    track.add_argument("plan", type=Path, metavar="PLAN", help="a floor plan, as for `lalaloc localise`")
-    track.add_argument(
-        "folder", type=Path, metavar="FOLDER", help="photographs named by their time in seconds, such as 12.50.jpg"
-    )
-    track.add_argument(
-        "--odometry",
-        type=Path,
-        metavar="FILE",
-        help="poses of the robot: TUM lines, or CSV with time_s, x_m, y_m and yaw_deg, counter-clockwise from +x",
-    )
-    track.add_argument(
-        "--odometry-frame",
-        choices=("auto", "optical", "rep103"),
-        default="auto",
-        help="axes of TUM poses: rep103 (x forward, z up) or optical (z forward, y down), as of visual SLAM (default: "
-        "by the direction that stays upright)",
-    )
-    track.add_argument(
-        "--mount",
-        type=heading,
-        default=0.0,
-        metavar="DEG",
-        help="azimuth of the photographs' centre relative to the odometry's x, clockwise (default: 0)",
-    )
-    add_options(track, "--camera-height")
+    frames = {"action": "store", "choices": ("auto", "optical", "rep103"), "default": "auto"}
+    add_options(track, _OPTIONS, odometry_frame=frames, mount={"type": heading, "default": 0.0})
     add_camera_options(track)
-    track.add_argument("--trajectory", type=Path, metavar="FILE", help="TUM file of the poses in the plan to write")
-    track.add_argument("--out", type=Path, metavar="FILE", help="picture of the path to write, .png or .svg")
-    track.add_argument("--json", action="store_true", help="print JSON: a list with one pose per photograph")
-    add_options(track, "--bundle")
     add_plan_options(track)
     track.set_defaults(run=_track)
 

@@ -8,9 +8,9 @@ import os
 import platform
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from lalaloc_core.cli.lab import Command, check_range
+from lalaloc_core.cli.lab import Command, SkipBad, Textures, check_range
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
@@ -25,96 +25,77 @@ _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a stage: the layout encoder, then the image encoder.
+    """Train a stage: the layout encoder, then the image encoder."""
 
-    Attributes:
-        stage: the encoder of layouts, of spheres (image), of views (preset trunk), or the first two at once.
-        preset: networks and schedule.
-        out: folder of the run, shared by both stages.
-        data: data set (default: homes generated during training).
-        skip_bad: skip unusable files and samples, and list them.
-        textures: folder of material pictures for generated homes (default: procedural materials).
-        minutes: training time, instead of `steps`.
-        steps: number of updates (default: the preset's).
-        seed: random seed (default: the preset's).
-        set_: setting of the preset as KEY=VALUE, such as image.uses_per_sphere=4 or image.supersample=[2,1].
-        from_: start from the weights of a bundle or of another run (default: random weights).
-        layout_from: image stage: bundle or run with the layout encoder to use if `out` has none.
-        photographs: image stages: folders of spheres; `teacher` predicts walls and openings of those without an
-            annotation (preset trunk).
-        teacher: TensorFlow Lite segmenter with ADE20K's classes, or bundle whose encoder of spheres reads them.
-        resume: continue from the checkpoint in `out`.
-        device: cpu or cuda (default: cuda if available).
-        workers: processes that make batches; 0 uses none.
-        render: renderer of generated homes: the worker processes, or `device`, which then receives scenes instead of
-            pixels (default: device if it is a GPU).
-        validation_homes: maximum number of homes or scenes for validation.
-    """
-
-    stage: Literal["layout", "image", "view", "end-to-end"]
-    preset: Literal["ring", "trunk", "paper", "tiny", "tiny-trunk"] = "ring"
-    out: Path
-    data: Path | None = None
-    skip_bad: bool = False
-    textures: Path | None = None
-    minutes: float | None = None
-    steps: int | None = None
-    seed: int | None = None
-    set_: dict[str, Any] = field(default_factory=dict)
-    from_: Path | None = None
-    layout_from: Path | None = None
-    photographs: tuple[Path, ...] = ()
-    teacher: tuple[Path, ...] = ()
-    resume: bool = False
-    device: str | None = None
-    workers: int = 1
-    render: Literal["workers", "device"] | None = None
-    validation_homes: int = _VALIDATION_HOMES
+    stage: Annotated[
+        Literal["layout", "image", "view", "end-to-end"],
+        "the encoder of layouts, of spheres (image), of views (preset trunk), or the first two at once",
+    ]
+    preset: Annotated[Literal["ring", "trunk", "paper", "tiny", "tiny-trunk"], "networks and schedule"] = "ring"
+    out: Annotated[Path, "folder of the run, shared by both stages"]
+    data: Annotated[Path | None, "data set (default: homes generated during training)"] = None
+    skip_bad: SkipBad = False
+    textures: Textures = None
+    minutes: Annotated[float | None, "training time, instead of `steps`"] = None
+    steps: Annotated[int | None, "number of updates (default: the preset's)"] = None
+    seed: Annotated[int | None, "random seed (default: the preset's)"] = None
+    set_: Annotated[
+        dict[str, Any], "setting of the preset as KEY=VALUE, such as image.uses_per_sphere=4 or image.supersample=[2,1]"
+    ] = field(default_factory=dict)
+    from_: Annotated[Path | None, "start from the weights of a bundle or of another run (default: random weights)"] = (
+        None
+    )
+    layout_from: Annotated[
+        Path | None, "image stage: bundle or run with the layout encoder to use if `out` has none"
+    ] = None
+    photographs: Annotated[
+        tuple[Path, ...],
+        "image stages: folders of spheres; `teacher` predicts walls and openings of those without an annotation "
+        "(preset trunk)",
+    ] = ()
+    teacher: Annotated[
+        tuple[Path, ...],
+        "TensorFlow Lite segmenter with ADE20K's classes, or bundle whose encoder of spheres reads them",
+    ] = ()
+    resume: Annotated[bool, "continue from the checkpoint in `out`"] = False
+    device: Annotated[str | None, "cpu or cuda (default: cuda if available)"] = None
+    workers: Annotated[int, "processes that make batches; 0 uses none"] = 1
+    render: Annotated[
+        Literal["workers", "device"] | None,
+        "renderer of generated homes: the worker processes, or `device`, which then receives scenes instead of pixels "
+        "(default: device if it is a GPU)",
+    ] = None
+    validation_homes: Annotated[int, "maximum number of homes or scenes for validation"] = _VALIDATION_HOMES
 
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Export a trained run to a model bundle.
+    """Export a trained run to a model bundle."""
 
-    Attributes:
-        run_: folder of the run.
-        out: folder of the bundle.
-        name: name of the model (default: name of the folder `out`).
-        version: version of the model.
-        note: note for the manifest as KEY=VALUE.
-        into: copy this bundle with the run's encoder of spheres or of views in place of its own; calibrate the copy.
-        last: export the last weights instead of the best by validation.
-    """
-
-    run_: Path
-    out: Path
-    name: str | None = None
-    version: str
-    note: dict[str, str] = field(default_factory=dict)
-    into: Path | None = None
-    last: bool = False
+    run_: Annotated[Path, "folder of the run"]
+    out: Annotated[Path, "folder of the bundle"]
+    name: Annotated[str | None, "name of the model (default: name of the folder `out`)"] = None
+    version: Annotated[str, "version of the model"]
+    note: Annotated[dict[str, str], "note for the manifest as KEY=VALUE"] = field(default_factory=dict)
+    into: Annotated[
+        Path | None,
+        "copy this bundle with the run's encoder of spheres or of views in place of its own; calibrate the copy",
+    ] = None
+    last: Annotated[bool, "export the last weights instead of the best by validation"] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportAgain:
-    """Export the networks of a model bundle again from its own weights.
+    """Export the networks of a model bundle again from its own weights."""
 
-    Attributes:
-        bundle: folder of the bundle.
-    """
-
-    bundle: Path
+    bundle: Annotated[Path, "folder of the bundle"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class AddObjects:
-    """Add the pretrained classifier of objects, which tells types of rooms, to a model bundle.
+    """Add the pretrained classifier of objects, which tells types of rooms, to a model bundle."""
 
-    Attributes:
-        bundle: folder of the bundle.
-    """
-
-    bundle: Path
+    bundle: Annotated[Path, "folder of the bundle"]
 
 
 def _train(arguments: Train) -> None:
