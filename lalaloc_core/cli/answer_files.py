@@ -6,7 +6,7 @@ import argparse
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -50,20 +50,24 @@ def write_files(
     from lalaloc_core.draw.plan_overlays import draw_places
 
     if arguments.csv is not None:
-        write_text(arguments.csv, _csv(answers))
+        write_text(arguments.csv, csv_text(_COLUMNS, map(_row, answers)))
     if arguments.geojson is not None:
         write_text(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
     if arguments.map is not None:
         write_picture(draw_places(plan, places), arguments.map, "--map")
 
 
-def _csv(answers: Sequence[dict[str, Any]]) -> str:
+def csv_text(columns: Iterable[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as CSV."""
     text = io.StringIO()
     writer = csv.writer(text)
-    writer.writerow(_COLUMNS)
-    for answer in answers:
-        writer.writerow([unread(answer["photograph"]), *_cells(answer), unread(answer.get("error", ""))])
+    writer.writerow(columns)
+    writer.writerows(rows)
     return text.getvalue()
+
+
+def _row(answer: dict[str, Any]) -> list[str]:
+    return [unread(answer["photograph"]), *_cells(answer), unread(answer.get("error", ""))]
 
 
 def _cells(answer: dict[str, Any]) -> list[str]:

@@ -17,7 +17,6 @@ from lalaloc_core.cli import (
     measuring,
     pinning,
     plans,
-    synthesis,
     tracking,
     training,
 )
@@ -26,7 +25,7 @@ from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError
 # The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130
 
-_LAB = training.COMMANDS | synthesis.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS
+_LAB = training.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS
 
 
 def main(argv: list[str] | None = None) -> int:

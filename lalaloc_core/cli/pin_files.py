@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lalaloc_core.cli.answer_files import EarthPlace, place_feature, place_on_earth, unread
+from lalaloc_core.cli.answer_files import EarthPlace, csv_text, place_feature, place_on_earth, unread
 from lalaloc_core.cli.plan_files import write_text
 from lalaloc_core.errors import InvalidPhotographError
 
@@ -22,19 +20,19 @@ if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
     from lalaloc_core.localise.answers.pinned import PinnedAlbum
 
-_COLUMNS = (
-    "number",
-    "photograph",
-    "taken",
-    "plan",
-    "room",
-    "x_m",
-    "y_m",
-    "heading_deg",
-    "confidence",
-    "state",
-    "reason",
-)
+_COLUMNS: Mapping[str, Callable[[dict[str, Any]], object]] = {
+    "number": lambda entry: entry["number"],
+    "photograph": lambda entry: unread(entry["photograph"]),
+    "taken": lambda entry: entry["taken"] or "",
+    "plan": lambda entry: unread(entry["plan"] or ""),
+    "room": lambda entry: unread(entry["room"] or ""),
+    "x_m": lambda entry: "" if entry["position"] is None else f"{entry['position']['x_m']:.3f}",
+    "y_m": lambda entry: "" if entry["position"] is None else f"{entry['position']['y_m']:.3f}",
+    "heading_deg": lambda entry: "" if entry["heading_deg"] is None else f"{entry['heading_deg']:.1f}",
+    "confidence": lambda entry: f"{entry['confidence']:.4f}",
+    "state": lambda entry: entry["state"],
+    "reason": lambda entry: unread(entry["reason"]),
+}
 COPIES = "photographs"
 
 
@@ -59,7 +57,7 @@ def write_pin_files(
     copied = _write_copies(out / COPIES, plans, paths, entries) if copies else []
     notes += copied
     write_text(out / "pins.json", json.dumps(document, indent=2) + "\n")
-    write_text(out / "pins.csv", _csv(entries))
+    write_text(out / "pins.csv", csv_text(_COLUMNS, [[cell(entry) for cell in _COLUMNS.values()] for entry in entries]))
     rows = [_report_row(list(plans), path, entry) for path, entry in zip(paths, entries, strict=True)]
     for number, plan in enumerate(pinned.plans):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
@@ -75,30 +73,6 @@ def _summary(document: dict[str, Any], copied: Sequence[str]) -> list[str]:
     if document["camera_height_m"] is not None:
         lines.append(f"Cameras were {document['camera_height_m']:.2f} m above the floor.")
     return [*lines, *copied]
-
-
-def _csv(entries: Sequence[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(_COLUMNS)
-    for entry in entries:
-        position, heading = entry["position"], entry["heading_deg"]
-        place = ["", ""] if position is None else [f"{position['x_m']:.3f}", f"{position['y_m']:.3f}"]
-        writer.writerow(
-            [
-                entry["number"],
-                unread(entry["photograph"]),
-                entry["taken"] or "",
-                unread(entry["plan"] or ""),
-                unread(entry["room"] or ""),
-                *place,
-                "" if heading is None else f"{heading:.1f}",
-                f"{entry['confidence']:.4f}",
-                entry["state"],
-                unread(entry["reason"]),
-            ]
-        )
-    return text.getvalue()
 
 
 def _on_earth(plan: FloorPlan, entry: dict[str, Any]) -> EarthPlace | None:
@@ -124,13 +98,7 @@ def _report_row(plan_ids: Sequence[str], path: Path, entry: dict[str, Any]) -> R
     pin = None
     if entry["room"] is not None:
         position = entry["position"]
-        pin = DrawnPin(
-            number=entry["number"],
-            x_m=position["x_m"],
-            y_m=position["y_m"],
-            heading_deg=entry["heading_deg"],
-            state=entry["state"],
-        )
+        pin = DrawnPin(entry["number"], position["x_m"], position["y_m"], entry["heading_deg"], entry["state"])
     return ReportRow(
         number=entry["number"],
         name=entry["photograph"],

@@ -1,4 +1,4 @@
-"""`lalaloc lab train` and `lalaloc lab export`."""
+"""`lalaloc lab synth`, `train`, `export`, `export-again` and `add-objects`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import ctypes
 import dataclasses
 import os
 import platform
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from lalaloc_core.cli.lab import Command, SkipBad, Textures, check_range
+from lalaloc_core.cli.lab import Command, Seed, SkipBad, Textures, check_range
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.learn.dataset_names import Split
 
 if TYPE_CHECKING:
     from lalaloc_core.learn.training.config import TrainConfig
@@ -96,6 +98,19 @@ class AddObjects:
     """Add the pretrained classifier of objects, which tells types of rooms, to a model bundle."""
 
     bundle: Annotated[Path, "folder of the bundle"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synth:
+    """Write synthetic scenes in Structured3D's layout."""
+
+    scenes: Annotated[int, "number of scenes in total; existing ones are kept"]
+    out: Annotated[Path, "folder of the data set"]
+    split: Annotated[Literal["all"] | Split, "split"] = "all"
+    height: Annotated[int, "height of a sphere in pixels, half its width"] = 256
+    seed: Seed = 0
+    textures: Textures = None
+    workers: Annotated[int, "rendering processes"] = 1
 
 
 def _train(arguments: Train) -> None:
@@ -210,7 +225,22 @@ def _add_objects(arguments: AddObjects) -> None:
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
 
 
+def _synth(arguments: Synth) -> None:
+    from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
+
+    settings = Synthesis(root=arguments.out, seed=arguments.seed, height=arguments.height, textures=arguments.textures)
+    numbers = share_out(arguments.scenes, arguments.split)
+    try:
+        written = synthesise(settings, numbers, workers=arguments.workers)
+    except KeyboardInterrupt:
+        print("run the same command again to continue", file=sys.stderr)
+        raise
+    counts = ", ".join(f"{len(scenes)} {split}" for split, scenes in numbers.items())
+    print(f"{arguments.out}: {counts}; {written} of them new")
+
+
 COMMANDS = {
+    "synth": Command(Synth, _synth, "out"),
     "train": Command(Train, _train, "stage"),
     "export": Command(Export, _export, "run_"),
     "export-again": Command(ExportAgain, _export_again, "bundle"),

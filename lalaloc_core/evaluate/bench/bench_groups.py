@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import ConfigError
 from lalaloc_core.evaluate.bench.accuracy import (
     GROUPS,
     bench_azimuths,
@@ -44,8 +45,11 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
 def run_bench(
     bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None, annotated: Path | None = None
 ) -> dict[str, Any]:
-    """Measure groups of figures with one bundle; see `Setting`."""
+    """Measure groups of figures, by default all, with one bundle; see `Setting`."""
+    for number, group in enumerate(groups):
+        if group not in _BENCHMARKS:
+            raise ConfigError(f"only[{number}] is '{group}'; the groups are {', '.join(_BENCHMARKS)}")
     bundle = Bundle.open(bundle_folder)
     setting = Setting(bundle, homes, textures, annotated)
     machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
-    return machine | {group: _BENCHMARKS[group](setting) for group in groups}
+    return machine | {group: _BENCHMARKS[group](setting) for group in groups or _BENCHMARKS}
