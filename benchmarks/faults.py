@@ -7,27 +7,14 @@
     python -m benchmarks.faults sessions --sessions 12
     python -m benchmarks.faults durability --writes 500 --folder /var/lib/lalaloc
 
-`crash` kills the service while plans are uploaded, and starts it again. Clients repeat unanswered uploads with the same
-`Idempotency-Key`, as the client library does. In the end every plan is stored exactly once and usable, no other plan is
-stored, and the database has no orphaned rows.
-
-`overload` has ten times more clients than the service accepts at once: first one client alone, then the crowd, whose
-refused clients retry after about a second, then one client again. Accepted queries must be nearly as fast as alone,
-refusals must come at once, and the service must recover.
-
-`soak` has clients for minutes while workers are killed. No answer may be lost or wrong, and the memory of the service's
-own process must not grow. Answers at stage `vdr` count: the service falls back to them when a worker dies late in a
-query.
-
-`outage` stops PostgreSQL for some seconds, whose server programs it needs (Debian: `apt-get install postgresql`).
-Cached plans localise, other requests get 503, all recovers.
-
-`sessions` sends photographs to several sessions in a venue at once. Beyond the service's capacity they get 503 with
-`Retry-After` within seconds, not 504.
-
-`durability` measures storing a plan and claiming a lease on SQLite, with `synchronous=FULL`, as the service does, and
-`NORMAL`, which can lose the last commits in a power failure. The disk of the folder decides: with FULL it confirms
-every commit. Both take turns, so that other load on the disk affects both.
+`crash` kills the service while plans are uploaded and repeated with their `Idempotency-Key`: in the end every plan is
+stored exactly once and usable, and no row is orphaned. `overload` sends ten times more clients than are accepted at
+once: accepted queries must be nearly as fast as alone, and refusals come at once. `soak` kills workers for minutes: no
+answer may be lost or wrong (stage `vdr` counts), and memory must not grow. `outage` stops PostgreSQL for some seconds
+(Debian: `apt-get install postgresql`): cached plans localise, other requests get 503, all recovers. `sessions` follows
+sessions in a venue at once: beyond the capacity they get 503 with `Retry-After`, not 504. `durability` measures storing
+a plan and claiming a lease on SQLite with `synchronous=FULL`, as the service does, and `NORMAL`, in turns; the disk of
+the folder decides.
 """
 
 from __future__ import annotations
@@ -100,11 +87,7 @@ def main() -> int:
 
 
 class Uploads:
-    """Uploads of plans by name, each repeated until it is answered.
-
-    `url` changes when the service is started again; `plan_ids` are those of the answered uploads by name; `refused`
-    counts refusals by status.
-    """
+    """Uploads of plans by name, each repeated until it is answered; `url` changes with every start of the service."""
 
     def __init__(self) -> None:
         self.url = ""
@@ -187,16 +170,9 @@ def _inspect(url: str, uploads: Uploads, names: list[str], data: Path) -> dict[s
         "uploads were interrupted": uploads.repeated > 0,
         "no rows are orphaned": not any(orphans.values()) and integrity == "ok",
     }
-    return {
-        "uploads": len(names),
-        "answered": len(uploads.plan_ids),
-        "repeated": uploads.repeated,
-        "refused": dict(uploads.refused),
-        "stored": len(stored),
-        "usable": usable,
-        "orphaned_rows": orphans,
-        "expected": expected,
-    }
+    counts = {"uploads": len(names), "answered": len(uploads.plan_ids), "repeated": uploads.repeated}
+    counts |= {"refused": dict(uploads.refused), "stored": len(stored), "usable": usable}
+    return counts | {"orphaned_rows": orphans, "expected": expected}
 
 
 def overload(options: argparse.Namespace) -> dict[str, Any]:
@@ -254,7 +230,9 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
         stop.set()
         for thread in threads:
             thread.join()
-        restarted = _workers_restart(service.url)
+        with suppress(TimeoutError):
+            harness.wait_until(lambda: _all_are_ready(service.url), "workers restart", _RESTART_TIMEOUT_S, 0.2)
+        restarted = _all_are_ready(service.url)
     warm = memory_mb[int(_WARM_UP_SHARE * len(memory_mb)) :]
     answered = result.answered
     return {
@@ -288,15 +266,9 @@ def _worker_processes(process: psutil.Process) -> list[psutil.Process]:
     return workers
 
 
-def _workers_restart(url: str) -> bool:
-    """Return whether all workers are ready again within the timeout."""
-    deadline = time.monotonic() + _RESTART_TIMEOUT_S
-    while time.monotonic() < deadline:
-        pools = httpx.get(f"{url}/readyz").json()
-        if all(pools[pool]["ready"] == pools[pool]["workers"] for pool in ("lpo_pool", "decode_pool")):
-            return True
-        time.sleep(0.2)
-    return False
+def _all_are_ready(url: str) -> bool:
+    pools = httpx.get(f"{url}/readyz").json()
+    return all(pools[pool]["ready"] == pools[pool]["workers"] for pool in ("lpo_pool", "decode_pool"))
 
 
 def outage(options: argparse.Namespace) -> dict[str, Any]:

@@ -138,13 +138,7 @@ class Answer:
 
 
 class Caller:
-    """One persistent connection of a tenant.
-
-    Args:
-        url: address of the service.
-        key: API key; None without keys.
-        count: called with the status of every answer.
-    """
+    """One persistent connection of a tenant; `count` is called with the status of every answer."""
 
     def __init__(self, url: str, key: str | None = None, count: Callable[[int], None] = lambda _status: None) -> None:
         self._connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=_REQUEST_TIMEOUT_S)
@@ -172,10 +166,7 @@ class Caller:
         return answer
 
     def send_bytes(self, head: str, content: bytes = b"", hold_s: float = 0.0) -> Answer:
-        """Send a head, which is completed, and bytes after it on a connection of its own; return the status.
-
-        For `hold_s` after the status, nothing else of the answer is read.
-        """
+        """Send a completed head and bytes on a connection of its own; read only the status, and wait for `hold_s`."""
         lines = [head, f"Host: {self._connection.host}", *(f"{name}: {value}" for name, value in self._headers.items())]
         answer = b""
         with suppress(OSError), socket.socket() as connection:

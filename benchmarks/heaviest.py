@@ -47,16 +47,9 @@ Work = Callable[[Caller, Stored, int], None]
 
 @dataclass(frozen=True)
 class Load:
-    """Work of one tenant on a route.
+    """Work of one tenant: the requests of one round, proportional to a size, by default that of the largest input.
 
-    Attributes:
-        routes: method and path as in `openapi.yaml` of the requests.
-        title: the input, for the table.
-        work: sends the requests of one round.
-        size: size of the largest input that is accepted; the work is proportional to it.
-        plan: the stored plan in the benchmark.
-        connections: connections that repeat the work.
-        refusals: statuses of a refusal of the input itself, besides those for too many requests.
+    `routes` are as in `openapi.yaml`; `refusals` refuse the input itself, besides too many requests.
     """
 
     routes: tuple[str, ...]
@@ -68,15 +61,11 @@ class Load:
     refusals: frozenset[int] = frozenset()
 
 
-def documented_routes() -> set[str]:
-    """Return method and path of every operation in `openapi.yaml`."""
-    paths = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))["paths"]
-    return {f"{method.upper()} {path}" for path, operations in paths.items() for method in operations}
-
-
 def missing_routes() -> list[str]:
-    """Return the documented routes without an entry in `LOADS`."""
-    return sorted(documented_routes() - {route for load in LOADS for route in load.routes})
+    """Return method and path of the operations in `openapi.yaml` without an entry in `LOADS`."""
+    paths = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))["paths"]
+    documented = {f"{method.upper()} {path}" for path, operations in paths.items() for method in operations}
+    return sorted(documented - {route for load in LOADS for route in load.routes})
 
 
 def building(rooms: int, corners: int = 4, openings_per_room: int = 0) -> dict[str, Any]:
@@ -87,18 +76,13 @@ def building(rooms: int, corners: int = 4, openings_per_room: int = 0) -> dict[s
     turns = [2.0 * math.pi * number / corners for number in range(corners)]
     ring = [(0, 0), (1, 0), (1, 1), (0, 1)] if corners == 4 else [(math.cos(t), math.sin(t)) for t in turns]
     lines = [((0.1, 0.0), (0.9, 0.0)), ((0.0, 0.1), (0.0, 0.9))][:openings_per_room]
-    return {
-        "name": "building",
-        "ceiling_height_m": 2.5,
-        "camera_height_m": 1.5,
-        "anchor": _ANCHOR,
-        "rooms": [{"polygon": [[round(x + a, 9), round(y + b, 9)] for a, b in ring]} for x, y in places],
-        "openings": [
-            {"kind": "door", "line": [[round(x + a, 9), round(y + b, 9)] for a, b in line]}
-            for x, y in places
-            for line in lines
-        ],
-    }
+
+    def moved(points: Sequence[tuple[float, float]], x: float, y: float) -> list[list[float]]:
+        return [[round(x + a, 9), round(y + b, 9)] for a, b in points]
+
+    plan = {"name": "building", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "anchor": _ANCHOR}
+    doors = [{"kind": "door", "line": moved(line, *place)} for place in places for line in lines]
+    return plan | {"rooms": [{"polygon": moved(ring, *place)} for place in places], "openings": doors}
 
 
 def home(number: int) -> dict[str, Any]:
@@ -238,7 +222,7 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **field
 
 
 def _sequence(*, padded: bool, venue: bool = False) -> Work:
-    """Return the work of a sequence in a plan or venue, `padded` to `size` tenths of a megabyte in total."""
+    """Return the work of a sequence, `padded` to `size` tenths of a megabyte in total."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
         files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS if padded else 0)),)
@@ -249,7 +233,6 @@ def _sequence(*, padded: bool, venue: bool = False) -> Work:
 
 
 def _batch(caller: Caller, stored: Stored, _size: int) -> None:
-    # More photographs take longer, but no more at a time.
     files = _PHOTOGRAPHS * (("photo", _sphere()),)
     caller.send("POST", "/localise/batch", *form((("floorplan_id", stored.plan_id),), files))
 
@@ -462,11 +445,7 @@ LOADS = (
     Load(("POST /localise/sequence",), f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
     Load(("POST /localise/sequence",), "10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
     Load(
-        ("POST /localise/sequence",),
-        "10 photographs of {sequence_mb} MB in total",
-        _sequence(padded=True),
-        1_000,
-        connections=44,
+        ("POST /localise/sequence",), "10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44
     ),
     Load(
         (*_SESSIONS, f"GET {_SESSION}", f"DELETE {_SESSION}"),

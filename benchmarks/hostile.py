@@ -71,12 +71,9 @@ Point = list[float]
 
 @dataclass(frozen=True)
 class Attack:
-    """Hostile request.
+    """Hostile request: `send` returns the statuses of all answers, 0 for a broken connection.
 
-    Attributes:
-        send: sends it and returns the statuses of all answers, 0 for a broken connection.
-        expected: "accepted" for a localisation, "refused" for a status in the 400s, "any" for both.
-        is_slow: whether the client itself takes longer than an answer may take.
+    "accepted" expects a localisation, "refused" a status in the 400s; `is_slow` if the client itself takes long.
     """
 
     name: str
@@ -180,14 +177,8 @@ def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
 
     yield picture("PNG of 60,000 x 30,000 pixels of one colour", _png(60_000, 30_000, full=True))
     yield picture("PNG with a header of 2^31 x 2^30 pixels", _png(1 << 31, 1 << 30, full=False))
-    yield picture("JPEG with a header of 65,500 x 32,750 pixels", _jpeg_with_size(65_500, 32_750))
-    yield picture(
-        "WebP of 16,383 x 8,191 pixels of one colour",
-        harness.plain_picture(16_383, 8_191, "WEBP", lossless=True, method=0),
-    )
-    yield picture(
-        "PNG of 14,140 x 7,070 pixels, the largest allowed", harness.plain_picture(14_140, 7_070, "PNG"), accepted=True
-    )
+    largest = harness.plain_picture(14_140, 7_070, "PNG")
+    yield picture("PNG of 14,140 x 7,070 pixels, the largest allowed", largest, accepted=True)
     yield picture("WebP of 9,000 frames", _animation(9_000), accepted=True)
     yield picture("PNG with 100 MB of compressed text", _png_with_text(100_000_000))
     jpeg = harness.plain_picture(256, 128, "JPEG")
@@ -199,15 +190,9 @@ def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
     yield Attack("body of one byte a second", 100_000, lambda: _send_slowly(url), "refused", is_slow=True)
 
     ring = np.linspace(0.0, 2.0 * np.pi, 1_000_000, endpoint=False)
-    yield plan(
-        "plan of a million vertices",
-        _document([np.stack([np.cos(ring), np.sin(ring)], axis=1).tolist()], 2),
-        refused=True,
-    )
-    sparse = 5.0 * np.stack([np.cos(ring[::20]), np.sin(ring[::20])], axis=1)
-    yield plan("plan of 50,000 vertices", _document([sparse.tolist()], 1), refused=True)
+    circle = _document([np.stack([np.cos(ring), np.sin(ring)], axis=1).tolist()], 2)
+    yield plan("plan of a million vertices", circle, refused=True)
     yield plan("JSON nested a million deep", b"[" * 1_000_000, refused=True)
-    yield plan("JSON nested 900,000 deep, closed", b"[" * 900_000 + b"]" * 900_000, refused=True)
     yield plan("JSON number of a million digits", b'{"ceiling_height_m": ' + b"9" * 1_000_000 + b"}", refused=True)
     for size in (30_000, 200_000, 2_000_000):
         yield plan("JSON that is one string without an end", b'"' + b'\\"' * (size // 2))
@@ -243,14 +228,6 @@ def _png_with_text(size: int) -> bytes:
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-
-def _jpeg_with_size(width: int, height: int) -> bytes:
-    """Return a small JPEG with another size in its header."""
-    content = bytearray(harness.plain_picture(256, 128, "JPEG"))
-    place = content.index(b"\xff\xc0") + 5
-    content[place : place + 4] = struct.pack(">HH", height, width)
-    return bytes(content)
 
 
 def _segment(marker: int, content: bytes) -> bytes:

@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Sequence
 
-from benchmarks.hostile_files import MODELS, PICTURES, Point, boxes, chords, lattice, plan, rounded, star, stars
+from benchmarks.hostile_files import MODELS, PICTURES, Point, boxes, chords, circle, lattice, plan, rounded, star, stars
 from lalaloc_core.importers import ImportOptions
 
 _POINTS = ImportOptions(metres_per_pixel=0.02)
@@ -30,6 +30,11 @@ def _svg_rings(rings: Sequence[Sequence[Point]], attributes: str = "") -> bytes:
 def _svg_many(rings: Sequence[Sequence[Point]], attributes: str = "") -> bytes:
     path = ("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in ring) + "z" for ring in rings)
     return _svg("".join(f'<path {attributes} d="{line}"/>' for line in path))
+
+
+def _svg_lattices(size: int) -> bytes:
+    path = '<path fill="none" stroke="#000" stroke-width=".2" d="M{:.1f} {:.1f}L{:.1f} {:.1f}"/>'
+    return _svg("".join(path.format(*start, *end) for start, end in lattice(size // 80, 150.0)))
 
 
 def _svg_patches(size: int) -> bytes:
@@ -67,6 +72,9 @@ def _svg_copied(attributes: str, copies: int) -> bytes:
     return _svg(f'<defs><path id="a" {attributes}/></defs>' + '<use href="#a"/>' * copies)
 
 
+_Pairs = list[tuple[int, object]]
+
+
 def _dxf_pairs(*pairs: tuple[int, object]) -> str:
     return "".join(f"{code}\n{value}\n" for code, value in pairs)
 
@@ -90,15 +98,7 @@ def _dxf_ring(points: Sequence[Point], layer: str = "0") -> str:
 
 
 def _dxf_hatch(rings: Sequence[Sequence[Point]]) -> str:
-    pairs: list[tuple[int, object]] = [
-        (0, "HATCH"),
-        (100, "AcDbEntity"),
-        (8, "0"),
-        (100, "AcDbHatch"),
-        (10, 0),
-        (20, 0),
-        (30, 0),
-    ]
+    pairs: _Pairs = [(0, "HATCH"), (100, "AcDbEntity"), (8, "0"), (100, "AcDbHatch"), (10, 0), (20, 0), (30, 0)]
     pairs += [(210, 0), (220, 0), (230, 1), (2, "SOLID"), (70, 1), (71, 0), (91, len(rings))]
     for ring in rings:
         pairs += [(92, 2), (72, 0), (73, 1), (93, len(ring))]
@@ -109,15 +109,8 @@ def _dxf_hatch(rings: Sequence[Sequence[Point]]) -> str:
 
 def _dxf_spline(size: int) -> str:
     count = size // 30
-    pairs: list[tuple[int, object]] = [
-        (0, "SPLINE"),
-        (100, "AcDbEntity"),
-        (8, "0"),
-        (100, "AcDbSpline"),
-        (70, 8),
-        (71, min(count - 1, 200)),
-    ]
     order = min(count - 1, 200) + 1
+    pairs: _Pairs = [(0, "SPLINE"), (100, "AcDbEntity"), (8, "0"), (100, "AcDbSpline"), (70, 8), (71, order - 1)]
     pairs += [(72, count + order), (73, count), (74, 0)]
     pairs += [(40, k) for k in range(count + order)]
     for k in range(count):
@@ -145,11 +138,8 @@ def _dxf_copies(size: int) -> bytes:
 
 
 def _dxf_text(size: int) -> bytes:
-    return _dxf(
-        _dxf_pairs(
-            (0, "MTEXT"), (100, "AcDbEntity"), (8, "0"), (100, "AcDbMText"), (10, 0), (20, 0), (1, "{\\f" * (size // 3))
-        )
-    )
+    text: _Pairs = [(0, "MTEXT"), (100, "AcDbEntity"), (8, "0"), (100, "AcDbMText"), (10, 0), (20, 0)]
+    return _dxf(_dxf_pairs(*text, (1, "{\\f" * (size // 3))))
 
 
 def pdf(content: bytes, width: float = 800.0, height: float = 800.0, resources: str = "", more: str = "") -> bytes:
@@ -235,11 +225,8 @@ def _ifc_chain(size: int) -> bytes:
 
 def _ifc_clippings(size: int) -> bytes:
     count = size // 60
-    lines: list[str] = list(_IFC_BASE)
     clipped = [f"IFCBOOLEANRESULT(.DIFFERENCE.,#{k + 1},#{13 + count})" for k in range(13, 13 + count)]
-    lines += clipped
-    lines += [f"IFCCSGSOLID(#{14 + count})", "IFCBLOCK(#4,5.,5.,5.)"]
-    return _ifc(*lines)
+    return _ifc(*_IFC_BASE, *clipped, f"IFCCSGSOLID(#{14 + count})", "IFCBLOCK(#4,5.,5.,5.)")
 
 
 def _ifc_disks(size: int) -> bytes:
@@ -254,16 +241,7 @@ DRAWINGS = (
     plan("svg", "lines that cross", lambda s: _svg_lines(chords(s // 22))),
     plan("svg", "a lattice", lambda s: _svg_lines(lattice(s // 24))),
     plan("svg", "a lattice of thick lines", lambda s: _svg_lines(lattice(s // 24, 200.0), 'stroke-width=".2"')),
-    plan(
-        "svg",
-        "lattices of thick lines",
-        lambda s: _svg(
-            "".join(
-                f'<path fill="none" stroke="#000" stroke-width=".2" d="M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}"/>'
-                for (a, b), (c, d) in lattice(s // 80, 150.0)
-            )
-        ),
-    ),
+    plan("svg", "lattices of thick lines", _svg_lattices),
     plan("svg", "an outline that crosses itself", lambda s: _svg_rings([star(s // 16)])),
     plan("svg", "stars of 15 corners", lambda s: _svg_many(stars(s, 15, 16))),
     plan("svg", "subpaths that coincide", lambda s: _svg_rings(boxes(s // 50))),
@@ -359,13 +337,7 @@ DRAWINGS = (
     plan("ifc", "numbers of 1e308", lambda s: ifc_space([(0, 0), (5, 0), (5, 5), (0, 5)], "1.E308")),
     plan("ifc", "a number of 1.E400", lambda s: ifc_space([(0, 0), (5, 0), (5, 5), (0, 5)], "1.E400")),
     plan("ifc", "a space that crosses itself", lambda s: ifc_space(star(s // 50))),
-    plan(
-        "ifc",
-        "a round space",
-        lambda s: ifc_space(
-            [(9 * math.cos(6.28 * k / (s // 50)), 9 * math.sin(6.28 * k / (s // 50))) for k in range(s // 50)]
-        ),
-    ),
+    plan("ifc", "a round space", lambda s: ifc_space(circle(s // 50, 9.0))),
     plan("ifc", "clippings of clippings", _ifc_clippings),
     plan("ifc", "a tube that crosses itself", _ifc_disks),
     plan("ifc", "nested lists", lambda s: _ifc("IFCPOLYLINE(" + "(" * s + ")" * s + ")")),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from lalaloc_core.importers import ImportOptions
@@ -22,14 +23,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class HostilePlan:
-    """Kind of hostile files.
-
-    Attributes:
-        format: format of the file.
-        title: what the file has, for the table.
-        make: returns a file of about a size in bytes.
-        options: options of the import.
-    """
+    """Kind of hostile files: `make` returns one of about a size in bytes."""
 
     format: str
     title: str
@@ -46,6 +40,11 @@ def star(points: int, size: float = 20.0) -> list[Point]:
     """Return a ring whose edges all cross one another."""
     step = 2.0 * math.pi * ((points - 1) // 2) / points
     return [(size * math.cos(k * step), size * math.sin(k * step)) for k in range(points)]
+
+
+def circle(points: int, radius: float) -> list[Point]:
+    """Return a ring that is nearly round."""
+    return [(radius * math.cos(math.tau * k / points), radius * math.sin(math.tau * k / points)) for k in range(points)]
 
 
 def chords(count: int, size: float = 20.0) -> list[tuple[Point, Point]]:
@@ -142,9 +141,13 @@ def _merges(size: int) -> bytes:
     return _ros(_MAP + "\n".join([*lines, ""]).encode())
 
 
-def _noise(side: int, values: int = 2) -> bytes:
+def _noise(side: int) -> bytes:
     rng = random.Random(side)
-    return bytes(255 * rng.randrange(values) // (values - 1) for _ in range(side * side))
+    return bytes(255 * rng.randrange(2) for _ in range(side * side))
+
+
+def _noise_picture(side: int) -> Image.Image:
+    return Image.frombytes("L", (side, side), _noise(side))
 
 
 def _png(gray: Image.Image) -> bytes:
@@ -153,29 +156,24 @@ def _png(gray: Image.Image) -> bytes:
     return stream.getvalue()
 
 
-def _tiled(pattern: Image.Image, width: int, height: int) -> Image.Image:
-    """Return a picture that repeats a pattern, which takes few bytes."""
-    row = Image.new("L", (width, pattern.height))
-    for x in range(0, width, pattern.width):
-        row.paste(pattern, (x, 0))
-    whole = Image.new("L", (width, height))
-    for y in range(0, height, pattern.height):
-        whole.paste(row, (0, y))
-    return whole
+def _tiled(pattern: Image.Image) -> Image.Image:
+    """Return a picture of 36 megapixels that repeats a square pattern, which takes few bytes."""
+    times = -(-6000 // pattern.width)
+    return Image.fromarray(np.tile(np.asarray(pattern), (times, times))[:6000, :6000])
 
 
-def _checkerboard(cell: int, width: int = 6000, height: int = 6000) -> Image.Image:
+def _checkerboard(cell: int) -> Image.Image:
     pattern = Image.new("L", (2 * cell, 2 * cell), 255)
     for x, y in ((0, 0), (cell, cell)):
         pattern.paste(0, (x, y, x + cell, y + cell))
-    return _tiled(pattern, width, height)
+    return _tiled(pattern)
 
 
-def _grid(pitch: int, line: int, width: int = 6000, height: int = 6000) -> Image.Image:
+def _grid(pitch: int, line: int) -> Image.Image:
     pattern = Image.new("L", (pitch, pitch), 255)
     pattern.paste(0, (0, 0, line, pitch))
     pattern.paste(0, (0, 0, pitch, line))
-    return _tiled(pattern, width, height)
+    return _tiled(pattern)
 
 
 def _osm(ways: Sequence[Sequence[Point]], more: str = "", tags: str = '<tag k="indoor" v="room"/>') -> bytes:
@@ -194,8 +192,7 @@ def _multipolygons(size: int) -> bytes:
     points = size // 400
     relation = f'<member type="way" ref="{points}" role="outer"/><tag k="type" v="multipolygon"/>'
     relations = [f'<relation id="{k}">{relation}<tag k="indoor" v="room"/></relation>' for k in range(size // 200)]
-    ring = [(20 * math.cos(2 * math.pi * k / points), 20 * math.sin(2 * math.pi * k / points)) for k in range(points)]
-    return _osm([ring], "".join(relations))
+    return _osm([circle(points, 20.0)], "".join(relations))
 
 
 def _geojson(rings: Sequence[Sequence[Point]], **properties: Any) -> bytes:
@@ -300,16 +297,6 @@ PICTURES = (
     plan("picture", "lattice of 100 pixels", lambda s: _png(_grid(100, 20)), _DRAFT),
     plan("picture", "lattice of 300 pixels", lambda s: _png(_grid(300, 20)), _DRAFT),
     plan("picture", "lattice of two lines", lambda s: _png(_grid(60, 3)), _DRAFT),
-    plan(
-        "picture",
-        "noise",
-        lambda s: _png(Image.frombytes("L", ((side := math.isqrt(8 * s)), side), _noise(side))),
-        _DRAFT,
-    ),
-    plan(
-        "picture",
-        "coarse noise",
-        lambda s: _png(Image.frombytes("L", (300, 300), _noise(300)).resize((6000, 6000), 0)),
-        _DRAFT,
-    ),
+    plan("picture", "noise", lambda s: _png(_noise_picture(math.isqrt(8 * s))), _DRAFT),
+    plan("picture", "coarse noise", lambda s: _png(_noise_picture(300).resize((6000, 6000), 0)), _DRAFT),
 )

@@ -52,12 +52,8 @@ from service.settings import Settings
 from service.storage import open_store
 
 MAX_RATIO = 3.0
-_SETTINGS = {
-    "LALALOC_API_KEYS": "on",
-    "LALALOC_RATE_PER_MINUTE": "0",
-    "LALALOC_RATE_BURST": "0",
-    "LALALOC_KEEP_ANSWERS_S": "3600",
-}
+_SETTINGS = {"LALALOC_API_KEYS": "on", "LALALOC_KEEP_ANSWERS_S": "3600"}
+_SETTINGS |= {"LALALOC_RATE_PER_MINUTE": "0", "LALALOC_RATE_BURST": "0"}
 _TOO_MANY = frozenset({0, 429, 503, 507})
 _ACCEPTED = frozenset({200, 201, 204, 304})
 _PAUSE_S, _LEAD_S, _WARM_QUERIES = 0.05, 1.0, 5
@@ -89,11 +85,8 @@ class Latency:
 
 @dataclass(frozen=True)
 class Row:
-    """Measurement of one load.
-
-    Attributes:
-        answers: number of the heavy tenant's answers by status; 0 is a broken connection.
-        busy_s: time for which the service computed on after the heavy tenant was gone, 10 s at most.
+    """Measurement of one load: `answers` of the heavy tenant by status (0: a broken connection), and how long the
+    service computed on after it, 10 s at most.
     """
 
     routes: Sequence[str]
@@ -115,17 +108,12 @@ def main() -> int:
     )
     parser.add_argument("--seconds", type=float, default=4.0, help="time beside the other tenant, and alone")
     parser.add_argument("--homes", type=int, default=100, help="homes of the venue; 10000 are accepted")
-    parser.add_argument("--sequence-mb", type=int, default=100, help="size of a padded sequence; 100 are accepted")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     if missing := missing_routes():
         parser.exit(1, f"no entry in benchmarks/heaviest.py for: {', '.join(missing)}\n")
     loads = [
-        replace(
-            load,
-            title=load.title.format(homes=options.homes, sequence_mb=options.sequence_mb),
-            size=10 * options.sequence_mb if "{sequence_mb}" in load.title else load.size,
-        )
+        replace(load, title=load.title.format(homes=options.homes))
         for load in LOADS
         if any(re.search(options.rows, f"{route}, {load.title}") for route in load.routes)
     ]

@@ -148,31 +148,15 @@ def _turn() -> list[bytes]:
     return [encode_jpeg(cut_view(sphere, camera, azimuth=float(a), pitch=0.0, roll=0.0)) for a in angles]
 
 
-def _can_film() -> bool:
-    """Return whether FFmpeg is installed."""
-    return shutil.which("ffmpeg") is not None
-
-
 @cache
 def _film() -> bytes:
-    """Return a film of 10 s in 1080p of a turn once around; needs FFmpeg ."""
+    """Return a film of 10 s in 1080p of a turn once around; needs FFmpeg."""
     camera, sphere = Perspective.of_hfov(540, 960, math.radians(_FIELD_DEG)), _living_room()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "turn.mp4"
-        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "540x960", "-r", f"{_FRAMES_PER_S}", "-i", "-"]
-        coded = [
-            "-vf",
-            "fps=30,scale=1080:1920",
-            "-c:v",
-            "libx264",
-            "-preset",
-            "ultrafast",
-            "-pix_fmt",
-            "yuv420p",
-            "-threads",
-            "1",
-        ]
-        command = ["ffmpeg", "-v", "error", "-y", *source, *coded, str(path)]
+        source = f"ffmpeg -v error -y -f rawvideo -pix_fmt rgb24 -s 540x960 -r {_FRAMES_PER_S} -i -"
+        coded = "-vf fps=30,scale=1080:1920 -c:v libx264 -preset ultrafast -pix_fmt yuv420p -threads 1"
+        command = [*source.split(), *coded.split(), str(path)]
         with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
             assert process.stdin is not None
             for index in range(_FRAMES):
@@ -281,7 +265,7 @@ def _print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[s
     before, after = (checkout.name for checkout in checkouts)
     harness.print_table_head("figure", before, after, "ratio", f"CPU, {before}", f"CPU, {after}", "ratio")
     for name in names:
-        if name.startswith("film") and not _can_film():
+        if name.startswith("film") and shutil.which("ffmpeg") is None:
             print(harness.table_row(name, *["needs FFmpeg"] * 2, *[""] * 4), flush=True)
             continue
         found: list[list[Spent]] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -41,6 +41,13 @@ class OpeningSymbol:
     cut: BaseGeometry
 
 
+def encoded(picture: UInt8[np.ndarray, "h w 3"], format: str, **options: Any) -> bytes:
+    """Return the file of a picture."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, format, **options)
+    return stream.getvalue()
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnPlan:
     """Picture with its rooms, openings and symbols, in metres from its lower left corner."""
@@ -67,15 +74,11 @@ class DrawnPlan:
 
     def png(self) -> bytes:
         """Return the picture as PNG."""
-        stream = io.BytesIO()
-        Image.fromarray(self.picture).save(stream, "PNG")
-        return stream.getvalue()
+        return encoded(self.picture, "PNG")
 
-    def jpeg(self, quality: int = 60) -> bytes:
+    def jpeg(self) -> bytes:
         """Return the picture as JPEG."""
-        stream = io.BytesIO()
-        Image.fromarray(self.picture).save(stream, "JPEG", quality=quality)
-        return stream.getvalue()
+        return encoded(self.picture, "JPEG", quality=60)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +104,8 @@ def draw_plan(
 ) -> DrawnPlan:
     """Draw a generated home in one of the styles; the same for the same seed.
 
-    Args:
-        style: style of drawing.
-        seed: seed of the home and of the drawing.
-        has_texts: write names, areas and dimensions in the styles that have them.
-        is_furnished: draw furniture in every style.
-        has_symbols: draw symbols of fixtures and furniture instead of boxes and circles.
-        pixels_per_m: resolution; that of the style by default.
+    `has_texts` writes names and dimensions in the styles that have them. `is_furnished` draws furniture
+    in every style, and `has_symbols` symbols of fixtures and furniture instead of boxes and circles.
     """
     rng = np.random.default_rng([seed, STYLES.index(style)])
     thickness = float(rng.uniform(0.1, 0.25))
@@ -142,17 +140,9 @@ def model_of(home: Home, thickness: float) -> Model:
     inside = shapely.unary_union(rooms)
     openings = _openings(home, origin, thickness, inside)
     walls = shapely.unary_union([room.buffer(thickness, join_style="mitre") for room in rooms]).difference(inside)
-    walls = walls.difference(
-        shapely.unary_union([opening.cut.buffer(1e-4, join_style="mitre") for opening in openings])
-    )
-    return Model(
-        rooms,
-        [room.name for room in home.plan.rooms],
-        openings,
-        walls,
-        (float(size[0]), float(size[1])),
-        (float(origin[0]), float(origin[1])),
-    )
+    walls = walls.difference(shapely.unary_union([o.cut.buffer(1e-4, join_style="mitre") for o in openings]))
+    names, width, height = [room.name for room in home.plan.rooms], *map(float, size)
+    return Model(rooms, names, openings, walls, (width, height), (float(origin[0]), float(origin[1])))
 
 
 def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeometry) -> list[OpeningSymbol]:
@@ -256,9 +246,8 @@ class _Sheet:
         kind = rng.integers(3)
         if kind == 0:
             radius = round(0.45 * min(x1 - x0, y1 - y0) * self.pixels_per_m)
-            cv2.circle(
-                self.picture, self._pixel((0.5 * (x0 + x1), 0.5 * (y0 + y1))), radius, (90, 90, 90), 1, cv2.LINE_AA
-            )
+            middle = self._pixel((0.5 * (x0 + x1), 0.5 * (y0 + y1)))
+            cv2.circle(self.picture, middle, radius, (90, 90, 90), 1, cv2.LINE_AA)
         else:
             self._outline(piece, (90, 90, 90), 1)
         if kind == 2:
@@ -270,12 +259,8 @@ class _Sheet:
             size = 0.006 * self.pixels_per_m
             (width, height), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
             x, y = self._pixel((centre[0], centre[1]))
-            for text, row, scale in (
-                (name, y + height // 2, size),
-                (f"{room.area:.1f} m2", y + 2 * height, 0.8 * size),
-            ):
-                left, font = (x - width // 2, row), cv2.FONT_HERSHEY_SIMPLEX
-                cv2.putText(self.picture, text, left, font, scale, (40, 40, 40), 1, cv2.LINE_AA)
+            self._write(name, (x - width // 2, y + height // 2), size, 40)
+            self._write(f"{room.area:.1f} m2", (x - width // 2, y + 2 * height), 0.8 * size, 40)
 
     def dimension(self) -> None:
         """Draw dimension lines below and to the left, with ticks and numbers."""
@@ -287,10 +272,10 @@ class _Sheet:
             self._line((ax, ay), (bx, by), (60, 60, 60), 1)
             for x, y in ((ax, ay), (bx, by)):
                 self._line((x - 0.1, y - 0.1), (x + 0.1, y + 0.1), (60, 60, 60), 1)
-            place = self._pixel((0.5 * (ax + bx) + 0.05, 0.5 * (ay + by) + 0.08))
-            cv2.putText(
-                self.picture, f"{length:.2f}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (60, 60, 60), 1, cv2.LINE_AA
-            )
+            self._write(f"{length:.2f}", self._pixel((0.5 * (ax + bx) + 0.05, 0.5 * (ay + by) + 0.08)), 0.5, 60)
+
+    def _write(self, text: str, left: tuple[int, int], scale: float, tone: int) -> None:
+        cv2.putText(self.picture, text, left, cv2.FONT_HERSHEY_SIMPLEX, scale, (tone, tone, tone), 1, cv2.LINE_AA)
 
     def draw_walls(self, style: Style, rng: np.random.Generator) -> None:
         parts = [part for part in shapely.get_parts(self._model.walls) if part.area > 1e-4]
@@ -300,13 +285,10 @@ class _Sheet:
                 self._fill(part, (tone, tone, tone))
             return
         if style == "hatched":
-            self._hatch(parts, spacing_m=0.09)
+            for line in hatch_lines(shapely.unary_union(parts), self._model.size_m, 0.09):
+                self._line(line.coords[0], line.coords[-1], (0, 0, 0), 1)
         for part in parts:
             self._outline(part, (0, 0, 0), 2)
-
-    def _hatch(self, parts: list[BaseGeometry], spacing_m: float) -> None:
-        for line in hatch_lines(shapely.unary_union(parts), self._model.size_m, spacing_m):
-            self._line(line.coords[0], line.coords[-1], (0, 0, 0), 1)
 
     def draw_openings(self) -> None:
         for opening in self._model.openings:
@@ -317,7 +299,6 @@ class _Sheet:
                 self._door(opening)
 
     def _door(self, opening: OpeningSymbol) -> None:
-        """Draw leaf and arc into the room of the opening; wide doors have two leaves."""
         for hinge, direction, inward, radius in door_leaves(opening):
             self._line(hinge, hinge + radius * inward, (0, 0, 0), 1)
             angles = np.linspace(0.0, 0.5 * np.pi, 25)[:, None]
@@ -344,9 +325,8 @@ class _Sheet:
 
     def _fixed(self, points: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """Return OpenCV's fixed-point coordinates, with pixel centres at integers and `_SHIFT` fractional bits."""
-        pixels = (
-            np.column_stack([points[:, 0], self._rows / self.pixels_per_m - points[:, 1]]) * self.pixels_per_m - 0.5
-        )
+        from_top = np.column_stack([points[:, 0], self._rows / self.pixels_per_m - points[:, 1]])
+        pixels = from_top * self.pixels_per_m - 0.5
         return np.round(pixels * 2**_SHIFT).astype(np.int32)
 
     def _pixel(self, point: tuple[float, float]) -> tuple[int, int]:

@@ -98,7 +98,8 @@ def _report_row(plan_ids: Sequence[str], path: Path, entry: dict[str, Any]) -> R
     pin = None
     if entry["room"] is not None:
         position = entry["position"]
-        pin = DrawnPin(entry["number"], position["x_m"], position["y_m"], entry["heading_deg"], entry["state"])
+        named = {name: entry[name] for name in ("number", "heading_deg", "state")}
+        pin = DrawnPin(x_m=position["x_m"], y_m=position["y_m"], **named)
     return ReportRow(
         number=entry["number"],
         name=entry["photograph"],
