@@ -374,7 +374,7 @@ def durability(options: argparse.Namespace) -> dict[str, Any]:
         # The pool has one connection, which keeps the mode.
         stores = {mode: Store(f"sqlite:///{folder}/{mode}.sqlite3", connections=1) for mode in ("NORMAL", "FULL")}
         for mode, store in stores.items():
-            with store._database._driver_cursor() as cursor:
+            with store.database._driver_cursor() as cursor:
                 cursor.execute(f"PRAGMA synchronous={mode}")
         for _ in range(options.writes):
             for mode, store in stores.items():

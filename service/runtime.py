@@ -110,7 +110,9 @@ def start_runtime(
         telemetry.tracing = closed_at_end(cleanup, Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
     store = closed_at_end(cleanup, open_store(settings))
-    telemetry.gauge("lalaloc_database_up", "1 while the database answers.", lambda: float(store.state == "answers"))
+    telemetry.gauge(
+        "lalaloc_database_up", "1 while the database answers.", lambda: float(store.database.state == "answers")
+    )
     access_control = closed_at_end(cleanup, AccessControl(store.keys, settings))
     audit_trail = closed_at_end(cleanup, AuditTrail(store.audit_log))
     audit_trail.start()

@@ -70,7 +70,7 @@ def _list(arguments: argparse.Namespace) -> int:
 def _purge(arguments: argparse.Namespace) -> int:
     with configured_store() as store:
         count = store.purge_tenant(arguments.tenant)
-        store.give_back()
+        store.database.give_back()
         audit(store, arguments.tenant, "tenants purge", arguments.tenant, floorplans=count)
     print(f"deleted {count} floor plans of tenant '{arguments.tenant}', and all else that it stored")
     return 0
@@ -78,7 +78,7 @@ def _purge(arguments: argparse.Namespace) -> int:
 
 def _compact(_arguments: argparse.Namespace) -> int:
     with configured_store() as store:
-        store.compact()
+        store.database.compact()
     return 0
 
 

@@ -77,7 +77,7 @@ class Sweeper:
                     self._store.tenant_limits.refresh()
                     self._measure()
                     self.sweep()
-                    self._store.give_back(self._stop.is_set)
+                    self._store.database.give_back(self._stop.is_set)
                 # A backlog, as after a new model, continues as soon as the queued grids are done.
                 if due or (more and self._grids.pending == 0):
                     more = self._grids.queue_missing()

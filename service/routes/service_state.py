@@ -60,7 +60,7 @@ async def get_readiness(runtime: Running, response: Response) -> ReadyAnswer:
         lpo_pool=_pool(runtime.optimiser.state),
         decode_pool=_pool(runtime.decoder.state),
         import_pool=_pool(runtime.converter.state),
-        database=runtime.store.state,
+        database=runtime.store.database.state,
         plans_preparing=runtime.grids.preparing,
     )
 

@@ -72,8 +72,7 @@ class AlbumJobs:
             .subquery()
         )
         query = select(waiting.c.tenant, waiting.c.id).where(waiting.c.place == 1).order_by(waiting.c.updated_at)
-        with self._database.reading() as connection:
-            return [(row.tenant, row.id) for row in connection.execute(query.limit(limit))]
+        return [(row.tenant, row.id) for row in self._database.rows(query.limit(limit))]
 
     def claim(self, album_id: str, owner: str, lease_s: float) -> AlbumJob | None:
         """Take the lease on a due album; None if another owner holds it, or there is nothing to do."""
@@ -127,13 +126,8 @@ class AlbumJobs:
     ) -> bool:
         """Store the solution of an album, or the reason why there is none, and release the lease.
 
-        Args:
-            job: the album as it was claimed. If it has changed since, it stays due.
-            owner: owner of the lease.
-            place_revision_id: revision of the plan or venue.
-            pins: pin of each photograph as JSON, by id; photographs that were deleted meanwhile are left out.
-            solution: the common part as JSON; None keeps the one before.
-            failure: the reason.
+        An album that has changed since its claim stays due. `place_revision_id` is of the plan or venue, `pins` are
+        JSON by id of the photographs, of which some may be deleted; without a common `solution`, the one before stays.
 
         Returns:
             False if the owner lost the lease, or the album was deleted.

@@ -10,13 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import Connection, delete, func, select, update
 
-from service.errors import (
-    RevisionMismatchError,
-    TooManyAlbumsError,
-    TooManyPhotographsError,
-    UnknownFloorPlanError,
-    UnknownVenueError,
-)
+from service.errors import RevisionMismatchError, TooManyAlbumsError, TooManyPhotographsError
 from service.storage.album_rows import (
     AlbumRecord,
     NewAlbum,
@@ -34,9 +28,9 @@ from service.storage.album_rows import (
 )
 from service.storage.database import Database
 from service.storage.records import Cursor
-from service.storage.statements import newest_first
+from service.storage.statements import lock_place, newest_first
 from service.storage.stored_bytes import StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, FLOORPLANS, VENUES
+from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS
 
 # Albums deleted per transaction of `purge`.
 _PURGED_AT_ONCE = 100
@@ -50,16 +44,10 @@ class Albums:
         self._quota = quota
 
     def add(self, tenant: str, album_id: str, new: NewAlbum, *, ttl_s: float, limit: int) -> AlbumRecord:
-        """Store an album; return the one that exists under this id, if the request is repeated.
-
-        Raises:
-            TooManyAlbumsError: the tenant has `limit` albums.
-            UnknownFloorPlanError, UnknownVenueError: the plan or venue was deleted.
-            StorageQuotaError: the tenant would store too many bytes.
-        """
+        """Store an album; return the one that exists under this id, if the request is repeated."""
         now, size, own = datetime.now(UTC), album_bytes(new), ALBUMS.c.tenant == tenant
         with self._database.writing(grows_by=size) as connection:
-            _lock_place(connection, tenant, new)
+            lock_place(connection, tenant, new.plan_id, new.venue_id)
             if connection.scalar(select(ALBUMS.c.id).where(own, ALBUMS.c.id == album_id)) is not None:
                 return find_album(connection, tenant, album_id, now)
             freed = delete_albums(connection, own, ALBUMS.c.expires_at < now)
@@ -89,11 +77,7 @@ class Albums:
             return find_album(connection, tenant, album_id, now)
 
     def get(self, tenant: str, album_id: str) -> AlbumRecord:
-        """Return an album.
-
-        Raises:
-            UnknownAlbumError: no such album, or it has expired.
-        """
+        """Return an album."""
         with self._database.reading() as connection:
             return find_album(connection, tenant, album_id, datetime.now(UTC))
 
@@ -102,15 +86,13 @@ class Albums:
     ) -> list[AlbumRecord]:
         """Return albums, newest first; arguments as for `Venues.list_venues`."""
         query = select_albums().where(ALBUMS.c.tenant == tenant, ALBUMS.c.expires_at >= datetime.now(UTC))
-        with self._database.reading() as connection:
-            rows = connection.execute(newest_first(query, ALBUMS, limit=limit, after=after, name=name))
-            return [album_record(row) for row in rows]
+        rows = self._database.rows(newest_first(query, ALBUMS, limit=limit, after=after, name=name))
+        return [album_record(row) for row in rows]
 
     def by_ids(self, album_ids: set[str]) -> list[AlbumRecord]:
         """Return the albums that exist among some ids, regardless of tenant. Callers check access first."""
         query = select_albums().where(ALBUMS.c.id.in_(album_ids), ALBUMS.c.expires_at >= datetime.now(UTC))
-        with self._database.reading() as connection:
-            return [album_record(row) for row in connection.execute(query)]
+        return [album_record(row) for row in self._database.rows(query)]
 
     def delete(self, tenant: str, album_id: str, *, expected: str | None = None) -> None:
         """Delete an album with its photographs."""
@@ -127,8 +109,7 @@ class Albums:
         expired = select(ALBUMS.c.tenant, ALBUMS.c.id).where(ALBUMS.c.expires_at < datetime.now(UTC))
         count = 0
         while True:
-            with self._database.reading() as connection:
-                rows = connection.execute(expired.order_by(ALBUMS.c.tenant, ALBUMS.c.id).limit(_PURGED_AT_ONCE)).all()
+            rows = self._database.rows(expired.order_by(ALBUMS.c.tenant, ALBUMS.c.id).limit(_PURGED_AT_ONCE))
             for tenant in sorted({row.tenant for row in rows}):
                 own = ALBUMS.c.id.in_([row.id for row in rows if row.tenant == tenant])
                 self._database.freeing(lambda connection, tenant=tenant, own=own: self._drop(connection, tenant, own))
@@ -142,37 +123,26 @@ class Albums:
         self._quota.settle(connection, tenant, StoredBytes(albums=-freed))
 
     def photographs(self, album_id: str, *, limit: int, after: int = 0) -> list[PhotographRecord]:
-        """Return photographs by number, regardless of tenant. Callers check access first.
-
-        `after` is the number of the last photograph of the previous page.
-        """
+        """Return photographs with numbers beyond `after`, regardless of tenant. Callers check access first."""
         own = ALBUM_PHOTOGRAPHS.c.album_id == album_id, ALBUM_PHOTOGRAPHS.c.number > after
-        with self._database.reading() as connection:
-            rows = connection.execute(select_photographs(*own).limit(limit))
-            return [PhotographRecord(**row._mapping) for row in rows]
+        rows = self._database.rows(select_photographs(*own).limit(limit))
+        return [PhotographRecord(**row._mapping) for row in rows]
 
     def photograph(self, album_id: str, photograph_id: str) -> PhotographRecord:
-        """Return a photograph, regardless of tenant. Callers check access first.
-
-        Raises:
-            UnknownAlbumPhotographError: the album has no such photograph.
-        """
+        """Return a photograph, regardless of tenant. Callers check access first."""
         with self._database.reading() as connection:
             return find_photograph(connection, album_id, photograph_id)
 
     def same_picture(self, album_id: str, sha256: str) -> PhotographRecord | None:
         """Return the photograph with a digest, regardless of tenant; None without one."""
         own = ALBUM_PHOTOGRAPHS.c.album_id == album_id, ALBUM_PHOTOGRAPHS.c.sha256 == sha256
-        with self._database.reading() as connection:
-            row = connection.execute(select_photographs(*own)).one_or_none()
+        row = self._database.row(select_photographs(*own))
         return None if row is None else PhotographRecord(**row._mapping)
 
     def add_photograph(
         self, tenant: str, album_id: str, new: NewPhotograph, *, ttl_s: float, limit: int
     ) -> tuple[PhotographRecord, bool]:
-        """Add a photograph to an album, unless it has the same picture already.
-
-        The album then lives for `ttl_s` (s).
+        """Add a photograph to an album, which then lives for `ttl_s` (s), unless it has the same picture already.
 
         Returns:
             the photograph, and True if it was added.
@@ -244,14 +214,3 @@ class Albums:
 def _check_revision(found: PhotographRecord, expected: str | None) -> None:
     if expected not in (None, found.revision_id):
         raise RevisionMismatchError(found.id, expected, found.revision_id, what="photograph")
-
-
-def _lock_place(connection: Connection, tenant: str, new: NewAlbum) -> None:
-    """Lock the plan or venue of a new album against deletion until the transaction ends."""
-    table, place_id, error = (FLOORPLANS, new.plan_id, UnknownFloorPlanError)
-    if place_id is None:
-        table, place_id, error = (VENUES, new.venue_id, UnknownVenueError)
-    assert place_id is not None
-    query = select(table.c.id).where(table.c.id == place_id, table.c.tenant == tenant)
-    if connection.scalar(query.with_for_update(read=True)) is None:
-        raise error(place_id)

@@ -48,12 +48,9 @@ class ApiKeys:
             return _key(connection.execute(API_KEYS.insert().values(**values).returning(API_KEYS)).one())
 
     def rotate(self, key_id: str, key_hash: str, *, overlap: timedelta) -> ApiKey | None:
-        """Store a successor with the same tenant, name, scopes, rate and lifetime.
+        """Store a successor with the same tenant, name, scopes, rate and lifetime; None without a valid key.
 
         Both keys are valid for the overlap, unless the replaced one expires before.
-
-        Returns:
-            the successor; None if the key does not exist, was revoked or has expired.
         """
         now = datetime.now(UTC)
         alive = or_(API_KEYS.c.expires_at.is_(None), API_KEYS.c.expires_at > now)
@@ -75,15 +72,13 @@ class ApiKeys:
         query = select(API_KEYS).order_by(API_KEYS.c.created_at, API_KEYS.c.id)
         if tenant is not None:
             query = query.where(API_KEYS.c.tenant == tenant)
-        with self._database.reading() as connection:
-            return [_key(row) for row in connection.execute(query)]
+        return [_key(row) for row in self._database.rows(query)]
 
     def page(self, *, limit: int, after: Cursor | None, tenant: str | None) -> list[ApiKey]:
         """Return a page of the keys, newest first; arguments as of `newest_first`."""
         query = select(API_KEYS) if tenant is None else select(API_KEYS).where(API_KEYS.c.tenant == tenant)
-        with self._database.reading() as connection:
-            rows = connection.execute(newest_first(query, API_KEYS, limit=limit, after=after))
-            return [_key(row) for row in rows]
+        rows = self._database.rows(newest_first(query, API_KEYS, limit=limit, after=after))
+        return [_key(row) for row in rows]
 
     def revoke(self, key_id: str) -> ApiKey | None:
         """Revoke a key for good; None if it does not exist or was revoked before."""
@@ -95,15 +90,13 @@ class ApiKeys:
 
     def get(self, key_id: str) -> ApiKey | None:
         """Return a key in any state; None if it does not exist."""
-        with self._database.reading() as connection:
-            row = connection.execute(select(API_KEYS).where(API_KEYS.c.id == key_id)).one_or_none()
+        row = self._database.row(select(API_KEYS).where(API_KEYS.c.id == key_id))
         return None if row is None else _key(row)
 
     def find(self, key_hash: str) -> ApiKey | None:
         """Return the key with this hash, unless it was revoked; callers check its end."""
         query = select(API_KEYS).where(API_KEYS.c.hash == key_hash, API_KEYS.c.revoked_at.is_(None))
-        with self._database.reading() as connection:
-            row = connection.execute(query).one_or_none()
+        row = self._database.row(query)
         return None if row is None else _key(row)
 
     def touch(self, key_id: str) -> None:
@@ -114,18 +107,8 @@ class ApiKeys:
 
 
 def _key(row: Row[Any]) -> ApiKey:
-    return ApiKey(
-        id=row.id,
-        tenant=row.tenant,
-        name=row.name,
-        scopes=frozenset(row.scopes.split()),
-        rate_per_minute=row.rate_per_minute,
-        created_at=row.created_at,
-        revoked_at=row.revoked_at,
-        last_used_at=row.last_used_at,
-        expires_at=row.expires_at,
-        replaces=row.replaces,
-    )
+    values = {name: getattr(row, name) for name in ApiKey.__dataclass_fields__}
+    return ApiKey(**values | {"scopes": frozenset(row.scopes.split())})
 
 
 # Column of each attribute of `OperatorLimits`.
@@ -148,8 +131,7 @@ class Tenants:
         query = select(TENANTS).where(or_(*(column.is_not(None) for column in _LIMITS.values())))
         if among is not None:
             query = query.where(TENANTS.c.tenant.in_(among))
-        with self._database.reading() as connection:
-            return {row.tenant: _limits(row) for row in connection.execute(query)}
+        return {row.tenant: _limits(row) for row in self._database.rows(query)}
 
     def change_limits(self, tenant: str, **limits: float | None) -> OperatorLimits:
         """Change limits of a tenant, and return all of them.
@@ -178,8 +160,7 @@ class TenantLimits:
     def refresh(self) -> None:
         """Read the limits; `Sweeper` calls this every 5 s.
 
-        Raises:
-            StoreUnavailableError: the database is away; the limits of before stay.
+        Without the database, the limits of before stay.
         """
         self._limits = self._tenants.limits()
 

@@ -55,8 +55,7 @@ class AuditLog:
         `after` is the last entry of the previous page; only those of a tenant or actor, or between two times.
         """
         query = _filtered(tenant, actor, since, until)
-        with self._database.reading() as connection:
-            return [_entry(row) for row in connection.execute(newest_first(query, AUDIT_LOG, limit=limit, after=after))]
+        return [_entry(row) for row in self._database.rows(newest_first(query, AUDIT_LOG, limit=limit, after=after))]
 
     def export(
         self, *, tenant: str | None = None, since: datetime | None = None, until: datetime | None = None
@@ -65,8 +64,7 @@ class AuditLog:
         query = _filtered(tenant, None, since, until).order_by(_COLUMNS.created_at, _COLUMNS.id).limit(_BATCH_SIZE)
         last: Row[Any] | None = None
         while True:
-            with self._database.reading() as connection:
-                rows = connection.execute(query if last is None else query.where(_is_after(last))).all()
+            rows = self._database.rows(query if last is None else query.where(_is_after(last)))
             yield from map(_entry, rows)
             if len(rows) < _BATCH_SIZE:
                 return
@@ -83,8 +81,7 @@ class AuditLog:
     def _surplus(self, kind: ColumnElement[bool], limit: int) -> ColumnElement[bool] | None:
         """Return the condition of the entries of a kind beyond the newest `limit`; None without any."""
         query = select(_COLUMNS.created_at).where(kind).order_by(_COLUMNS.created_at.desc()).offset(limit).limit(1)
-        with self._database.reading() as connection:
-            last = connection.scalar(query)
+        last = self._database.value(query)
         return None if last is None else and_(kind, _COLUMNS.created_at <= last)
 
     def _delete(self, condition: ColumnElement[bool] | None) -> int:

@@ -10,7 +10,7 @@ import logging
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any, Literal, TypeVar
 
@@ -20,6 +20,7 @@ from sqlalchemy import (
     Connection,
     Double,
     Engine,
+    Row,
     and_,
     cast,
     create_engine,
@@ -66,9 +67,6 @@ class Database:
         """Prepare the pool, which connects on first use.
 
         `wait_s` (s) limits waiting for a free connection, and making one.
-
-        Raises:
-            ConfigError: the URL is not that of an SQLite file or of PostgreSQL.
         """
         parsed = _parsed(url)
         self.is_postgresql = parsed.get_backend_name() == "postgresql"
@@ -115,6 +113,21 @@ class Database:
         with self._transaction(self._engine_for_reading) as connection:
             yield connection
 
+    def rows(self, query: Any) -> Sequence[Row[Any]]:
+        """Return the rows of a query, in a transaction of its own."""
+        with self.reading() as connection:
+            return connection.execute(query).all()
+
+    def row(self, query: Any) -> Row[Any] | None:
+        """Return the only row of a query, or None; as `rows`."""
+        with self.reading() as connection:
+            return connection.execute(query).one_or_none()
+
+    def value(self, query: Any) -> Any:
+        """Return the first column of the first row of a query, or None; as `rows`."""
+        with self.reading() as connection:
+            return connection.scalar(query)
+
     @contextmanager
     def writing(self, *, grows_by: int = 0) -> Iterator[Connection]:
         """Run a writing transaction; on SQLite it waits for other writers when it begins, not half-way through.
@@ -147,9 +160,6 @@ class Database:
         """Return free space of an SQLite file to the disk, in short transactions, and restore the reserve.
 
         `is_stopped` is asked before each; the rest stays for the next call.
-
-        Raises:
-            StoreUnavailableError, StoreBusyError: see `reading`.
         """
         if (disk := self._disk) is None:
             return
@@ -183,9 +193,7 @@ class Database:
     def is_live(self, until_s: Column[float], length_s: Column[float]) -> ColumnElement[bool]:
         """Return the condition that a lease holds; an end too far in the future comes from a clock that was ahead.
 
-        Args:
-            until_s: column of the lease's end, by `now_s`.
-            length_s: column of the lease's length (s); where it is NULL, no end is too far.
+        The end is by `now_s`; where the length (s) is NULL, no end is too far.
         """
         now_s = self.now_s()
         return and_(until_s > now_s, or_(length_s.is_(None), until_s <= now_s + length_s + _CLOCK_SLACK_S))

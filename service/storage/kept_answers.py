@@ -30,18 +30,12 @@ class IdempotencyKeys:
     def __init__(
         self, database: Database, quota: StorageQuota, lease_s: float = MIN_LEASE_S, *, max_bytes: int = 64 * 2**20
     ) -> None:
-        """Create the access to the table.
-
-        Args:
-            database: the database.
-            quota: counts the stored bytes.
-            lease_s: time limit (s) of a request, after which the next attempt takes over. If the first one is still
-                alive, both work under the same token: work is done twice, nothing is stored twice.
-            max_bytes: limit of the bytes of a tenant's keys and answers; the oldest are deleted first.
-        """
         self._database = database
         self._quota = quota
+        # Time limit of a request, after which the next attempt takes over. If the first one is still alive, both work
+        # under the same token: work is done twice, nothing is stored twice.
         self._lease_s = lease_s
+        # Limit of a tenant's keys and answers; the oldest are deleted first.
         self._max_bytes = max_bytes
 
     def begin(self, tenant: str, route: str, key: str, body_sha256: str) -> Claim:
@@ -161,17 +155,10 @@ class KeptAnswers:
     def add(self, tenant: str, plan_id: str, content_of: Callable[[str], str], *, limit: int) -> str | None:
         """Keep an answer, and delete the tenant's oldest ones beyond `limit`.
 
-        Args:
-            tenant: owner of the answer.
-            plan_id: plan of the answer.
-            content_of: function from the answer's id to its text, which contains the id.
-            limit: maximum number of answers of the tenant.
+        `content_of` returns the text for the answer's id, which it contains.
 
         Returns:
             The answer's id; None if the plan was deleted meanwhile.
-
-        Raises:
-            StorageQuotaError: the tenant would store too many bytes.
         """
         answer_id, now = uuid.uuid4().hex, datetime.now(UTC)
         own = _ANSWERS.tenant == tenant
@@ -196,8 +183,7 @@ class KeptAnswers:
         """Return the text of an answer that is no older than `kept_s` (s); None without one."""
         oldest = datetime.now(UTC) - timedelta(seconds=kept_s)
         wanted = (_ANSWERS.tenant == tenant, _ANSWERS.id == answer_id, _ANSWERS.created_at >= oldest)
-        with self._database.reading() as connection:
-            return connection.scalar(select(_ANSWERS.content).where(*wanted))
+        return self._database.value(select(_ANSWERS.content).where(*wanted))
 
     def delete(self, tenant: str, answer_id: str) -> bool:
         """Delete an answer; False without one."""

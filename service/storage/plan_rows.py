@@ -21,9 +21,9 @@ from service.plan_documents import PlanDocument
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.records import JSON, GridKey, NewPlan, Original, PlanRecord
-from service.storage.statements import damaged, read_chunks, write_all_chunks, write_chunks
+from service.storage.statements import damaged, read_chunks, write_chunks
 from service.storage.stored_bytes import ROW_BYTES, StoredBytes
-from service.storage.stored_grids import grid_bytes, insert_grid, insert_grids
+from service.storage.stored_grids import grid_bytes, insert_grids
 from service.storage.tables import FLOORPLANS, ORIGINAL_CHUNKS, REVISIONS
 
 # Plans per statement, so that copies of their files and grids are few.
@@ -97,21 +97,16 @@ def insert_plan(connection: Connection, database: Database, record: PlanRecord, 
     statement = database.insert(FLOORPLANS).values(_plan_values(record)).on_conflict_do_nothing()
     if connection.scalar(statement.returning(FLOORPLANS.c.id)) is None:
         return False
-    insert_revision(connection, record, content)
+    insert_revisions(connection, [record], [content])
     return True
 
 
 def insert_plans(connection: Connection, records: Sequence[PlanRecord], contents: Sequence[PlanContent]) -> None:
     """Insert new plans with their first revisions, a few statements for many plans at a time."""
     for first in range(0, len(records), _TOGETHER):
-        part = list(zip(records[first : first + _TOGETHER], contents[first : first + _TOGETHER], strict=True))
-        connection.execute(FLOORPLANS.insert(), [_plan_values(record) for record, _ in part])
-        connection.execute(REVISIONS.insert(), [_revision_row(record, content) for record, content in part])
-        originals = [
-            ({"revision_id": record.revision_id}, memoryview(content.original.content)) for record, content in part
-        ]
-        write_all_chunks(connection, ORIGINAL_CHUNKS, originals)
-        insert_grids(connection, [content.grid for _, content in part if content.grid is not None])
+        part = slice(first, first + _TOGETHER)
+        connection.execute(FLOORPLANS.insert(), [_plan_values(record) for record in records[part]])
+        insert_revisions(connection, records[part], contents[part])
 
 
 def _plan_values(record: PlanRecord) -> dict[str, Any]:
@@ -130,12 +125,15 @@ def revision_values(record: PlanRecord) -> dict[str, Any]:
     }
 
 
-def insert_revision(connection: Connection, record: PlanRecord, content: PlanContent) -> None:
-    """Insert a revision of a plan that exists."""
-    connection.execute(REVISIONS.insert(), _revision_row(record, content))
-    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
-    if content.grid is not None:
-        insert_grid(connection, *content.grid)
+def insert_revisions(connection: Connection, records: Sequence[PlanRecord], contents: Sequence[PlanContent]) -> None:
+    """Insert one revision each of plans that exist."""
+    pairs = list(zip(records, contents, strict=True))
+    connection.execute(REVISIONS.insert(), [_revision_row(record, content) for record, content in pairs])
+    originals = (
+        ({"revision_id": record.revision_id}, memoryview(content.original.content)) for record, content in pairs
+    )
+    write_chunks(connection, ORIGINAL_CHUNKS, originals)
+    insert_grids(connection, [content.grid for content in contents if content.grid is not None])
 
 
 def _revision_row(record: PlanRecord, content: PlanContent) -> dict[str, Any]:
@@ -180,8 +178,7 @@ class Originals:
 
     def digest(self, revision_id: str) -> str | None:
         """Return the SHA-256 digest of a revision's file."""
-        with self._database.reading() as connection:
-            return connection.scalar(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
+        return self._database.value(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
 
     def checked(self, revision_id: str) -> OriginalFile | None:
         """Compare a revision's file with its digest, and return the file."""
@@ -202,18 +199,14 @@ class Originals:
     def chunk(self, revision_id: str, number: int) -> bytes | None:
         """Return one chunk of a revision's file; None after the last, and if the revision was deleted."""
         own, place = ORIGINAL_CHUNKS.c.revision_id == revision_id, ORIGINAL_CHUNKS.c.number == number
-        with self._database.reading() as connection:
-            return connection.scalar(select(ORIGINAL_CHUNKS.c.content).where(own, place))
+        return self._database.value(select(ORIGINAL_CHUNKS.c.content).where(own, place))
 
 
 class PlanCache:
     """Plans by tenant and id, bounded in bytes; safe to share between threads."""
 
     def __init__(self, limit_bytes: int) -> None:
-        """Create an empty cache.
-
-        `limit_bytes` is approximate; 0 keeps no plans.
-        """
+        """Create an empty cache of about `limit_bytes`; 0 keeps no plans."""
         self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
             limit_bytes, lambda entry: plan_bytes(entry[0].plan) + len(entry[0].report or "")
         )

@@ -20,7 +20,7 @@ from service.storage.plan_rows import (
     PlanContent,
     count_plans,
     insert_plan,
-    insert_revision,
+    insert_revisions,
     new_record,
     revision_values,
 )
@@ -52,11 +52,8 @@ class Plans:
     """Plans of all tenants; calls treat plans of other tenants as missing."""
 
     def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
-        """Use a database.
-
-        The cache receives every plan that is read or stored at its current revision.
-        """
         self._database = database
+        # Receives every plan that is read or stored at its current revision.
         self._cache = cache
         self._quota = quota
         self._parse: Callable[[PlanDocument], FloorPlan | None] = PlanDocument.plan
@@ -69,17 +66,8 @@ class Plans:
     def add(self, tenant: str, plan_id: str, new: NewPlan, *, limit: int) -> PlanRecord:
         """Store a plan, its uploaded file, and its grid if it is already computed.
 
-        An existing id is a repeated upload whose first answer was lost; the stored plan is returned.
-
-        Args:
-            tenant: owner of the plan.
-            plan_id: a new id, or the id of a repeated upload; callers never choose it.
-            new: the plan.
-            limit: maximum number of the tenant's plans.
-
-        Raises:
-            TooManyFloorPlansError: the tenant has `limit` plans already.
-            StorageQuotaError: the tenant would store too many bytes.
+        An existing id is a repeated upload whose first answer was lost; the stored plan is returned. Callers never
+        choose ids. `limit` is the maximum number of the tenant's plans.
         """
         record = new_record(new, plan_id, tenant, datetime.now(UTC))
         content = PlanContent.prepare(record.revision_id, new)
@@ -125,7 +113,7 @@ class Plans:
             freed = _delete_revisions(connection, own, grids_before=number - 1, before=number - keep + 1)
             change = content.stored - freed
             self._quota.check(connection, tenant, change.total + new.later_bytes)
-            insert_revision(connection, record, content)
+            insert_revisions(connection, [record], [content])
             connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**revision_values(record)))
             self._quota.settle(connection, tenant, change, changed_plan=plan_id)
         self._cache.put(record)
@@ -188,8 +176,7 @@ class Plans:
 
     def has_revision(self, revision_id: str) -> bool:
         """Tell whether a revision exists, regardless of tenant."""
-        with self._database.reading() as connection:
-            return connection.scalar(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
+        return self._database.value(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
 
     def summary(self, tenant: str, plan_id: str, revision_id: str | None = None) -> PlanSummary | None:
         """Return a plan without its document, even if that is damaged, at its current or another stored revision."""
@@ -210,16 +197,12 @@ class Plans:
 
     def any_stored(self) -> bool:
         """Tell whether any tenant has a plan."""
-        with self._database.reading() as connection:
-            return connection.scalar(select(FLOORPLANS.c.id).limit(1)) is not None
+        return self._database.value(select(FLOORPLANS.c.id).limit(1)) is not None
 
     def list_plans(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[PlanSummary]:
-        """Return plans, newest first.
-
-        `name` is a part of the name, case-insensitive.
-        """
+        """Return plans, newest first; `name` is a part of the name, case-insensitive."""
         query = select_summaries().where(FLOORPLANS.c.tenant == tenant)
         return self._summaries(newest_first(query, FLOORPLANS, limit=limit, after=after, name=name))
 
@@ -230,10 +213,7 @@ class Plans:
     def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
         """Delete a plan with its revisions, files, grids, sessions and albums, and remove it from its venues.
 
-        The plan must be at the revision `expected`, if there is one.
-
-        Returns:
-            True if the plan existed.
+        The plan must be at the revision `expected`, if there is one. False without the plan.
         """
         deleted = self._database.freeing(lambda connection: self._delete(connection, tenant, plan_id, expected))
         self._cache.forget(tenant, plan_id)
@@ -286,8 +266,7 @@ class Plans:
         return True
 
     def _summaries(self, query: Any) -> list[PlanSummary]:
-        with self._database.reading() as connection:
-            return [PlanSummary(**row._mapping) for row in connection.execute(query)]
+        return [PlanSummary(**row._mapping) for row in self._database.rows(query)]
 
     def _read(self, query: Any, *, current: bool = False) -> FoundPlan | None:
         with self._database.reading() as connection:

@@ -55,7 +55,6 @@ class Original:
     """Uploaded file of a plan's revision.
 
     Attributes:
-        content: the file.
         media_type: media type, detected from the content.
         report: import report as JSON text; None for plans of an earlier version of the service.
     """
@@ -70,8 +69,6 @@ class NewPlan:
     """Plan, or revision of one, that is stored.
 
     Attributes:
-        plan: the plan.
-        original: the uploaded file.
         document: the plan's stored form, if it is made already.
         grid: its own grid, if it is computed already.
         later_bytes: expected size of its own grid if that is computed later; there must be room for it.
@@ -91,8 +88,6 @@ class PlanRecord(PlanHead):
     """Stored floor plan at one of its revisions.
 
     Attributes:
-        tenant: owner of the plan.
-        plan: the plan.
         failure: error of the last computation of its pose grid, if it failed.
     """
 
@@ -136,15 +131,10 @@ class VenueRecord:
     """Stored venue.
 
     Attributes:
-        id: id of the venue.
-        tenant: owner of the venue.
         revision_id: id of the revision, which changes with name, anchor and plans.
         revision: number of the revision, from 1.
-        name: name of the venue.
         anchor: anchor of plans without their own, which then share one frame.
         plans: number of plans.
-        created_at: time when the venue was first stored.
-        updated_at: time when the revision was stored.
     """
 
     id: str
@@ -208,13 +198,7 @@ class ApiKey:
     """API key, without its secret, of which only a hash is stored.
 
     Attributes:
-        id: id of the key.
-        tenant: tenant of its callers.
-        name: name of the key.
-        scopes: permissions of the key.
         rate_per_minute: limit of requests per minute; 0 for none, None for the limit in the settings.
-        created_at: time of creation.
-        revoked_at: time of revocation.
         last_used_at: approximate time of the last request.
         expires_at: time from which the key is rejected; None for a key without an end.
         replaces: id of the key that this one replaces.
@@ -285,7 +269,6 @@ class OperatorLimits:
     """Limits that the operator set for a tenant; None for the limit in the settings.
 
     Attributes:
-        stored_bytes: limit of stored bytes.
         bytes_in_flight: limit of the bytes of request bodies in memory and on disk.
         cpu_share: weight of the tenant in queues: with 2.0 its CPU seconds count half. None counts as 1.0.
     """

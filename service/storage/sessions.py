@@ -17,14 +17,13 @@ from service.errors import (
     SessionBusyError,
     SessionOutdatedError,
     TooManySessionsError,
-    UnknownFloorPlanError,
     UnknownSessionError,
-    UnknownVenueError,
 )
 from service.storage.database import Database
 from service.storage.records import PlanRecord, VenueRecord
+from service.storage.statements import lock_place
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import FLOORPLANS, SESSIONS, VENUES
+from service.storage.tables import SESSIONS
 
 _COLUMNS = SESSIONS.c
 
@@ -60,80 +59,55 @@ class Sessions:
     """Sessions of all tenants, each visible to its own tenant."""
 
     def __init__(self, database: Database, quota: StorageQuota, claim_s: float) -> None:
-        """Create the access to the table.
-
-        Args:
-            database: the database.
-            quota: counts the stored bytes.
-            claim_s: time limit (s) of a photograph, after which another one can be sent.
-        """
         self._database = database
         self._quota = quota
+        # Time limit (s) of a photograph, after which another one can be sent.
         self._claim_s = claim_s
 
     def add(
         self, tenant: str, session_id: str, place: PlanRecord | VenueRecord, options: str, *, ttl_s: float, limit: int
     ) -> SessionRecord:
-        """Store a session in a plan or venue; return the one that exists under this id, if the request is repeated.
-
-        Raises:
-            TooManySessionsError: the tenant has `limit` sessions.
-            UnknownFloorPlanError, UnknownVenueError: the plan or venue was deleted.
-            StorageQuotaError: the tenant would store too many bytes.
-        """
+        """Store a session in a plan or venue; return the one that exists under this id, if the request is repeated."""
         now, own = datetime.now(UTC), _COLUMNS.tenant == tenant
         size = ROW_BYTES + len(options.encode())
+        values = {
+            "id": session_id,
+            "tenant": tenant,
+            "plan_id": place.id if isinstance(place, PlanRecord) else None,
+            "venue_id": place.id if isinstance(place, VenueRecord) else None,
+            "revision_id": place.revision_id,
+            "created_at": now,
+            "expires_at": now + timedelta(seconds=ttl_s),
+            "options": options,
+            "photographs": 0,
+            "claim": "",
+            "claimed_until_s": 0.0,
+            "stored_bytes": size,
+        }
         with self._database.writing(grows_by=size) as connection:
-            _lock(connection, tenant, place)
+            lock_place(connection, tenant, values["plan_id"], values["venue_id"])
             row = connection.execute(select(SESSIONS).where(own, _COLUMNS.id == session_id)).one_or_none()
             if row is not None:
                 return _record(row)
             freed = deleted_bytes(connection, delete(SESSIONS).where(own, _COLUMNS.expires_at < now))
             if (connection.scalar(select(func.count()).select_from(SESSIONS).where(own)) or 0) >= limit:
                 raise TooManySessionsError(limit)
-            values = {
-                "id": session_id,
-                "tenant": tenant,
-                "plan_id": place.id if isinstance(place, PlanRecord) else None,
-                "venue_id": place.id if isinstance(place, VenueRecord) else None,
-                "revision_id": place.revision_id,
-                "created_at": now,
-                "expires_at": now + timedelta(seconds=ttl_s),
-                "options": options,
-                "photographs": 0,
-                "claim": "",
-                "claimed_until_s": 0.0,
-                "stored_bytes": size,
-            }
             row = connection.execute(SESSIONS.insert().values(values).returning(SESSIONS)).one()
             self._quota.settle(connection, tenant, StoredBytes(sessions=size - freed))
         return _record(row)
 
     def get(self, tenant: str, session_id: str) -> SessionRecord:
-        """Return a session.
-
-        Raises:
-            UnknownSessionError: no such session, or it has expired.
-        """
+        """Return a session."""
         with self._database.reading() as connection:
             return _record(self._find(connection, tenant, session_id))
 
     def claim(self, tenant: str, session_id: str, number: int | None, token: str) -> SessionRecord:
         """Claim a session for its next photograph; the caller then calls `finish` or `release`.
 
-        Args:
-            tenant: owner of the session.
-            session_id: its id.
-            number: number of the photograph, from 1; None for the next one.
-            token: token of the request, the same for all attempts.
+        `number` is that of the photograph, from 1; None for the next one. `token` is the same for all attempts.
 
         Returns:
             The session; with `token` as its claim if the request was the last one to be answered, and nothing is to do.
-
-        Raises:
-            UnknownSessionError: no such session, or it has expired.
-            SessionBusyError: another photograph holds the claim.
-            PhotographOutOfOrderError: another photograph is next.
         """
         free = ~self._database.is_live(_COLUMNS.claimed_until_s, _COLUMNS.claim_s)
         own = _COLUMNS.tenant == tenant, _COLUMNS.id == session_id, _COLUMNS.expires_at >= datetime.now(UTC)
@@ -157,11 +131,7 @@ class Sessions:
             return _record(row)
 
     def finish(self, record: SessionRecord, token: str, state: bytes, pose: str, *, ttl_s: float) -> SessionRecord:
-        """Store the state after the photograph of the request with a token, and end the claim.
-
-        Raises:
-            StorageQuotaError: the tenant would store too many bytes.
-        """
+        """Store the state after the photograph of the request with a token, and end the claim."""
         size = ROW_BYTES + len(record.options.encode()) + len(state) + len(pose.encode())
         own = _COLUMNS.tenant == record.tenant, _COLUMNS.id == record.id
         with self._database.writing(grows_by=size) as connection:
@@ -204,14 +174,6 @@ class Sessions:
         if row is None:
             raise UnknownSessionError(session_id)
         return row
-
-
-def _lock(connection: Connection, tenant: str, place: PlanRecord | VenueRecord) -> None:
-    """Lock a plan or venue against deletion until the transaction ends."""
-    table, error = (FLOORPLANS, UnknownFloorPlanError) if isinstance(place, PlanRecord) else (VENUES, UnknownVenueError)
-    query = select(table.c.id).where(table.c.id == place.id, table.c.tenant == tenant)
-    if connection.scalar(query.with_for_update(read=True)) is None:
-        raise error(place.id)
 
 
 def _record(row: Row[tuple[object, ...]]) -> SessionRecord:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Any, TypeVar
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, and_, or_, select
 
-from service.errors import DamagedDataError
+from service.errors import DamagedDataError, UnknownFloorPlanError, UnknownVenueError
 from service.storage.records import Cursor
-from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS
+from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUES
 from service.telemetry import LOGGER_NAME
 
 # Large values are stored in pieces, so that neither database nor driver handles one of them whole.
 CHUNK_BYTES = 2**20
+# Chunks per statement.
+_CHUNKS_TOGETHER = 16
 
 Query = TypeVar("Query", bound=Select[Any])
 
@@ -32,20 +35,11 @@ def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None
     return query.order_by(age.desc(), own_id.desc()).limit(limit)
 
 
-def write_chunks(connection: Connection, table: Table, owner: dict[str, Any], content: memoryview) -> None:
-    """Write a value, one statement per chunk.
-
-    `owner` is name and value of the column that identifies it.
-    """
-    for row in _chunk_rows(owner, content):
-        connection.execute(table.insert(), row)
-
-
-def write_all_chunks(connection: Connection, table: Table, values: Sequence[tuple[dict[str, Any], memoryview]]) -> None:
-    """Write several small values at once as `write_chunks` does, each with its owner."""
-    rows = [row for owner, content in values for row in _chunk_rows(owner, content)]
-    if rows:
-        connection.execute(table.insert(), rows)
+def write_chunks(connection: Connection, table: Table, values: Iterable[tuple[dict[str, Any], memoryview]]) -> None:
+    """Write values, each with name and value of the column that identifies it."""
+    rows = (row for owner, content in values for row in _chunk_rows(owner, content))
+    while part := list(islice(rows, _CHUNKS_TOGETHER)):
+        connection.execute(table.insert(), part)
 
 
 def _chunk_rows(owner: dict[str, Any], content: memoryview) -> Iterator[dict[str, Any]]:
@@ -55,13 +49,9 @@ def _chunk_rows(owner: dict[str, Any], content: memoryview) -> Iterator[dict[str
 
 def read_chunks(connection: Connection, table: Table, owner: dict[str, Any]) -> Iterator[bytes]:
     """Yield the chunks of a value in order, one statement each."""
-    conditions = [table.c[name] == value for name, value in owner.items()]
+    query = select(table.c.content).where(*(table.c[name] == value for name, value in owner.items()))
     number = 0
-    while True:
-        query = select(table.c.content).where(*conditions, table.c.number == number)
-        content = connection.scalar(query)
-        if content is None:
-            return
+    while (content := connection.scalar(query.where(table.c.number == number))) is not None:
         yield content
         number += 1
 
@@ -109,6 +99,16 @@ def lock_plan_of(connection: Connection, revision_id: str) -> Any:
     plan_id = select(REVISIONS.c.plan_id).where(REVISIONS.c.id == revision_id).scalar_subquery()
     query = select(FLOORPLANS.c.id, FLOORPLANS.c.tenant).where(FLOORPLANS.c.id == plan_id)
     return connection.execute(query.with_for_update(key_share=True)).one_or_none()
+
+
+def lock_place(connection: Connection, tenant: str, plan_id: str | None, venue_id: str | None) -> None:
+    """Lock a plan or venue against deletion until the transaction ends."""
+    table, place_id, error = FLOORPLANS, plan_id, UnknownFloorPlanError
+    if place_id is None:
+        table, place_id, error = VENUES, venue_id or "", UnknownVenueError
+    query = select(table.c.id).where(table.c.id == place_id, table.c.tenant == tenant)
+    if connection.scalar(query.with_for_update(read=True)) is None:
+        raise error(place_id)
 
 
 def is_complete_grid() -> ColumnElement[bool]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from time import monotonic
 
@@ -24,7 +23,7 @@ from service.storage.album_jobs import AlbumJobs
 from service.storage.albums import Albums
 from service.storage.api_keys import ApiKeys, TenantLimits, Tenants
 from service.storage.audit_log import AuditLog
-from service.storage.database import CircuitBreaker, Database, State
+from service.storage.database import CircuitBreaker, Database
 from service.storage.kept_answers import MIN_LEASE_S, IdempotencyKeys, KeptAnswers
 from service.storage.plan_rows import Originals, PlanCache
 from service.storage.plans import Plans
@@ -52,19 +51,9 @@ class Store:
     Every call can raise `StoreUnavailableError`; the next call reconnects.
 
     Attributes:
-        plans: floor plans with revisions.
         originals: uploaded files of the plans.
-        plan_cache: plans in memory.
-        venues: venues.
         venue_imports: venues that are stored together with their plans.
-        grids: pose grids.
         leases: leases on the computation of grids.
-        idempotency_keys: answers by idempotency key.
-        keys: API keys.
-        audit_log: actions of callers and operators.
-        answers: kept answers.
-        sessions: sessions of tracked cameras.
-        albums: albums.
         album_jobs: leases on the solution of albums.
         quota: stored bytes of tenants.
         tenants: the operator's limits per tenant.
@@ -96,9 +85,6 @@ class Store:
             idempotency_bytes: limit of the bytes of a tenant's idempotency keys and their answers.
             audit_keep_s: time (s) after which entries of the audit log are deleted.
             max_audit_entries: limit of the entries of the audit log.
-
-        Raises:
-            ConfigError: the URL is invalid, or the database cannot be opened.
         """
         try:
             database = Database(url, connections=connections, wait_s=wait_s)
@@ -108,7 +94,7 @@ class Store:
             raise ConfigError(
                 f"cannot open the database (LALALOC_DATABASE_URL): {reason}; if its file is damaged, restore a backup"
             ) from error
-        self._database = database
+        self.database = database
         self.plan_cache = PlanCache(plan_cache_bytes)
         self.quota = StorageQuota(database, stored_bytes)
         self.plans = Plans(database, self.plan_cache, self.quota)
@@ -127,15 +113,6 @@ class Store:
         self.tenants = Tenants(database)
         self.tenant_limits = TenantLimits(self.tenants)
 
-    @property
-    def state(self) -> State:
-        """Outcome of the last transaction; the sweeper makes one every `sweep_s`."""
-        return self._database.state
-
-    def answered_since(self, moment_s: float) -> bool:
-        """Tell whether the database completed a transaction after a moment (`monotonic`)."""
-        return self._database.answered_since(moment_s)
-
     def purge_tenant(self, tenant: str) -> int:
         """Delete all that a tenant stored, but not its API keys and limits, and return the number of plans.
 
@@ -150,17 +127,9 @@ class Store:
         self.idempotency_keys.delete_all(tenant)
         return count
 
-    def compact(self) -> None:
-        """Write an SQLite file anew without free space; afterwards it returns space after deletions."""
-        self._database.compact()
-
-    def give_back(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
-        """Return free space of an SQLite file to the disk, until `is_stopped`."""
-        self._database.give_back(is_stopped)
-
     def close(self) -> None:
         """Close all connections."""
-        self._database.close()
+        self.database.close()
 
 
 def open_store(settings: Settings) -> Store:
@@ -216,7 +185,6 @@ class PlanLookup:
     """Lookup of plans for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, max_age_s: float) -> None:
-        """Create the lookup."""
         self._store = store
         self._max_age_s = max_age_s
         self._breaker = CircuitBreaker()
@@ -235,7 +203,7 @@ class PlanLookup:
         try:
             found = await reads.run(tenant, self._store.plans.find, tenant, plan_id)
         except StoreUnavailableError as error:
-            if isinstance(error, StoreBusyError) or self._store.answered_since(begin_s):
+            if isinstance(error, StoreBusyError) or self._store.database.answered_since(begin_s):
                 # The database answers, so the plan may have been deleted.
                 raise
             self._breaker.trip()

@@ -40,8 +40,6 @@ class StoredBytes:
         plans: plans with their uploaded files and reports, all revisions.
         grids: pose grids and prototypes.
         venues: venues and the rows of their plans.
-        answers: kept answers.
-        sessions: sessions of tracked cameras.
         albums: albums and their photographs.
         idempotency: idempotency keys and their answers.
     """
@@ -72,11 +70,7 @@ class Account:
     own_limit: bool = False
 
     def check(self, growth: int) -> None:
-        """Check that a tenant can store more.
-
-        Args:
-            growth: additional bytes, which `used` does not contain.
-        """
+        """Check that a tenant can store more bytes, which `used` does not contain."""
         if growth > 0 and self.used.total + growth > self.limit:
             setting = "`lalaloc-service tenants limit`" if self.own_limit else "LALALOC_MAX_STORED_BYTES"
             raise StorageQuotaError(self.used.total, growth, self.limit, setting)
@@ -86,11 +80,8 @@ class StorageQuota:
     """Counters of stored bytes, and their limits."""
 
     def __init__(self, database: Database, default_bytes: int) -> None:
-        """Use the counters in a database.
-
-        `default_bytes` is the limit of tenants without one of their own.
-        """
         self._database = database
+        # Limit of tenants without one of their own.
         self._default_bytes = default_bytes
 
     def account(self, tenant: str) -> Account:
@@ -101,8 +92,7 @@ class StorageQuota:
     def accounts(self, *, after: str = "", limit: int | None = None) -> dict[str, Account]:
         """Return the stored bytes of the tenants that stored anything or have limits, by name from `after` on."""
         query = select(TENANTS).where(TENANTS.c.tenant > after).order_by(TENANTS.c.tenant).limit(limit)
-        with self._database.reading() as connection:
-            return {row.tenant: self._account(row) for row in connection.execute(query)}
+        return {row.tenant: self._account(row) for row in self._database.rows(query)}
 
     def check(self, connection: Connection, tenant: str, growth: int) -> None:
         """Check early that a write fits, before it writes much; only `settle` is exact."""
@@ -117,7 +107,7 @@ class StorageQuota:
         refuse: bool = True,
         changed_plan: str | None = None,
     ) -> Account:
-        """Count a change; the last call of its transaction.
+        """Count a change in the last call of its transaction, and return the tenant's account after it.
 
         Args:
             connection: the transaction.
@@ -127,9 +117,6 @@ class StorageQuota:
             changed_plan: id of a plan whose row the transaction has locked, and whose revision, grid or failure it
                 changed: the plan gets the number of this change. Numbers rise in the order of the commits, as the
                 tenant's row stays locked until then.
-
-        Returns:
-            The tenant's account after the change.
         """
         counted = {_column(name): value for name, value in asdict(change).items() if value}
         searched_bytes = change.plans + change.grids + change.venues

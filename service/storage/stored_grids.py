@@ -30,7 +30,6 @@ from service.storage.statements import (
     lock_plan_of,
     read_exactly,
     select_summaries,
-    write_all_chunks,
     write_chunks,
 )
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
@@ -50,19 +49,10 @@ class StoredGrids:
 
     def get(self, key: GridKey) -> PoseGrid | None:
         """Return a grid; None if it is not stored, or damaged and to be computed again."""
-        columns = LATENT_GRIDS.c
-        with self._database.reading() as connection:
-            query = select(columns.id, columns.size_bytes, columns.sha256).where(
-                *_where(LATENT_GRIDS, key), is_complete_grid()
-            )
-            row = connection.execute(query).one_or_none()
-            if row is None:
-                return None
-            content = read_exactly(connection, GRID_CHUNKS, {"grid_id": row.id}, row.size_bytes)
-        return _unpacked(key, content, row.sha256)
+        return self.get_all([key]).get(key)
 
     def get_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:
-        """Return the grids among `keys` that are stored and not damaged, as `get` does; keys are of one model."""
+        """Return the grids among `keys` that are stored and not damaged; keys are of one model."""
         left, found, columns = list(keys), dict[GridKey, PoseGrid](), LATENT_GRIDS.c
         for first in range(0, len(left), _BATCH_SIZE):
             part = {(key.revision_id, key.camera_height_mm): key for key in left[first : first + _BATCH_SIZE]}
@@ -73,20 +63,18 @@ class StoredGrids:
             query = query.where(columns.revision_id.in_({name for name, _ in part}), *same_model, is_complete_grid())
             with self._database.reading() as connection:
                 rows = [row for row in connection.execute(query) if (row.revision_id, row.camera_height_mm) in part]
-                small = [row for row in rows if row.size_bytes <= CHUNK_BYTES]
-                chunks = select(GRID_CHUNKS.c.grid_id, GRID_CHUNKS.c.content)
-                ids = [row.id for row in small]
-                contents = {
-                    row.grid_id: row.content for row in connection.execute(chunks.where(GRID_CHUNKS.c.grid_id.in_(ids)))
-                }
-            for row in small:
-                key, content = part[row.revision_id, row.camera_height_mm], contents.get(row.id, b"")
-                if (grid := _unpacked(key, content, row.sha256)) is not None:
-                    found[key] = grid
-            # Large grids are few, and assembled in place.
+                small = [row.id for row in rows if row.size_bytes <= CHUNK_BYTES]
+                chunks = select(GRID_CHUNKS.c.grid_id, GRID_CHUNKS.c.content).where(GRID_CHUNKS.c.grid_id.in_(small))
+                read = connection.execute(chunks).all() if small else []
+                contents: dict[int, Any] = {row.grid_id: row.content for row in read}
+                # Large grids are few, and assembled in place.
+                for row in rows:
+                    if row.size_bytes > CHUNK_BYTES:
+                        owner = {"grid_id": row.id}
+                        contents[row.id] = read_exactly(connection, GRID_CHUNKS, owner, row.size_bytes)
             for row in rows:
                 key = part[row.revision_id, row.camera_height_mm]
-                if row.size_bytes > CHUNK_BYTES and (grid := self.get(key)) is not None:
+                if (grid := _unpacked(key, contents.get(row.id), row.sha256)) is not None:
                     found[key] = grid
         return found
 
@@ -98,8 +86,7 @@ class StoredGrids:
             query = select(columns.id, columns.prototypes).where(
                 columns.id.in_(grid_ids[first : first + _BATCH_SIZE]), columns.prototypes.is_not(None)
             )
-            with self._database.reading() as connection:
-                rows = connection.execute(query).all()
+            rows = self._database.rows(query)
             for row in rows:
                 if (prototypes := unpack_prototypes(row.prototypes)) is not None:
                     found[row.id] = prototypes
@@ -137,8 +124,7 @@ class StoredGrids:
         )
         if revision_ids is not None:
             query = query.where(columns.revision_id.in_(revision_ids))
-        with self._database.reading() as connection:
-            return {(row.revision_id, row.camera_height_mm): row.poses for row in connection.execute(query)}
+        return {(row.revision_id, row.camera_height_mm): row.poses for row in self._database.rows(query)}
 
     def put(
         self,
@@ -152,21 +138,10 @@ class StoredGrids:
         """Store a grid, delete the oldest of its revision beyond `keep`, and end its lease.
 
         The latest grids for one other model or grid step are kept: while a model is replaced, replicas with the old
-            and the
-        new one serve the same plans.
-
-        Args:
-            key: key of the grid.
-            grid: the grid.
-            keep: maximum number of grids of the revision.
-            always_keep_mm: camera height (mm) of the grid that is never deleted.
-            prototypes: prototypes of the plan; None if they are made on demand.
+        and the new one serve the same plans. The grid for the camera height `always_keep_mm` is never deleted.
 
         Returns:
             False if the revision was deleted; the grid is then not stored.
-
-        Raises:
-            StorageQuotaError: the tenant would store too many bytes.
         """
         packed = pack(grid, prototypes)
         revision = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id)
@@ -182,7 +157,7 @@ class StoredGrids:
             freed += _make_room(connection, key, keep=keep, always_keep_mm=always_keep_mm)
             change = StoredBytes(grids=grid_bytes(packed) - freed)
             self._quota.check(connection, plan.tenant, change.total)
-            insert_grid(connection, key, packed)
+            insert_grids(connection, [(key, packed)])
             self._quota.settle(connection, plan.tenant, change, changed_plan=plan.id)
         return True
 
@@ -197,14 +172,12 @@ class StoredGrids:
         )
         query = select_summaries().where(*_unprepared(model_sha256, step_m), ~exists().where(*leased))
         query = query.order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id).limit(limit)
-        with self._database.reading() as connection:
-            return [PlanSummary(**row._mapping) for row in connection.execute(query)]
+        return [PlanSummary(**row._mapping) for row in self._database.rows(query)]
 
     def count_unprepared(self, model_sha256: str, step_m: float) -> int:
         """Return the number of plans without an own grid or a failure."""
         query = select_summaries().where(*_unprepared(model_sha256, step_m))
-        with self._database.reading() as connection:
-            return connection.scalar(select(func.count()).select_from(query.subquery())) or 0
+        return self._database.value(select(func.count()).select_from(query.subquery())) or 0
 
 
 class GridLeases:
@@ -259,8 +232,7 @@ class GridLeases:
             columns.revision_id.in_(revision_ids),
             self._database.is_live(columns.lease_until_s, columns.length_s),
         )
-        with self._database.reading() as connection:
-            return {(row.revision_id, row.camera_height_mm): row.progress for row in connection.execute(query)}
+        return {(row.revision_id, row.camera_height_mm): row.progress for row in self._database.rows(query)}
 
 
 def grid_bytes(packed: PackedGrid) -> int:
@@ -268,21 +240,15 @@ def grid_bytes(packed: PackedGrid) -> int:
     return ROW_BYTES + len(packed.content) + len(packed.prototypes or b"")
 
 
-def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> None:
-    """Insert a packed grid within a transaction."""
-    statement = LATENT_GRIDS.insert().values(_row(key, packed)).returning(LATENT_GRIDS.c.id)
-    write_chunks(connection, GRID_CHUNKS, {"grid_id": connection.scalar(statement)}, memoryview(packed.content))
-
-
 def insert_grids(connection: Connection, grids: Sequence[tuple[GridKey, PackedGrid]]) -> None:
-    """Insert the packed grids of several revisions within a transaction."""
+    """Insert packed grids, one per revision, within a transaction."""
     if not grids:
         return
     statement = LATENT_GRIDS.insert().returning(LATENT_GRIDS.c.id, LATENT_GRIDS.c.revision_id)
     inserted = connection.execute(statement, [_row(key, packed) for key, packed in grids])
     ids = {row.revision_id: row.id for row in inserted}
     chunks = [({"grid_id": ids[key.revision_id]}, memoryview(packed.content)) for key, packed in grids]
-    write_all_chunks(connection, GRID_CHUNKS, chunks)
+    write_chunks(connection, GRID_CHUNKS, chunks)
 
 
 def _row(key: GridKey, packed: PackedGrid) -> dict[str, Any]:

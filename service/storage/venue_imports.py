@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import hashlib
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Connection, select
 
 from service.errors import TooManyFloorPlansError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_rows import PlanCache, PlanContent, count_plans, insert_plans, new_record
 from service.storage.records import NewPlan, PlanRecord, VenueMember, VenueRecord
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
-from service.storage.tables import FLOORPLANS, VENUES
-from service.storage.venue_rows import check_count, check_members, find_venue, insert_members, insert_venue, lock_venue
+from service.storage.tables import FLOORPLANS
+from service.storage.venue_rows import (
+    check_count,
+    check_members,
+    find_venue,
+    insert_members,
+    insert_venue,
+    lock_venue,
+    touch_venue,
+)
 
 
 class VenueImports:
     """Venues of all tenants with their plans."""
 
     def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
-        """Use a database.
-
-        The cache receives the plans, as far as it has room for unread ones.
-        """
         self._database = database
+        # Receives the plans, as far as it has room for unread ones.
         self._cache = cache
         self._quota = quota
 
@@ -40,10 +44,6 @@ class VenueImports:
 
         Returns:
             The venue, and the records of its plans in order; none if an earlier request stored them.
-
-        Raises:
-            TooManyFloorPlansError, TooManyVenuesError: the tenant would have too many plans or venues.
-            StorageQuotaError: the tenant would store too many bytes.
         """
         batch = _Batch.of(tenant, venue_id, plans)
         size = replace(batch.size, venues=ROW_BYTES * (1 + len(plans)))
@@ -75,15 +75,9 @@ class VenueImports:
     ) -> tuple[VenueRecord, list[PlanRecord]]:
         """Store plans and add them to a venue in one transaction.
 
-        Args:
-            tenant: owner of the venue.
-            venue_id: id of the venue.
-            token: 32 hexadecimal digits, the same for every attempt of the request; plans of an earlier attempt, whose
-                answer was lost, are not stored again.
-            plans: the plans.
-            max_plans: limit of the tenant's plans.
-            max_venue_plans: limit of the venue's plans.
-            expected: id of the revision that the venue must have; None for any.
+        `token` has 32 hexadecimal digits, the same for every attempt of the request; plans of an earlier attempt, whose
+        answer was lost, are not stored again. The limits are of the tenant's and of the venue's plans. The venue must
+        have the revision `expected`, if there is one.
 
         Returns:
             The venue, and the records of the plans in order; none if an earlier attempt stored them.
@@ -94,15 +88,14 @@ class VenueImports:
             is_new = not batch.is_stored(connection)
             if is_new:
                 # Waits for an attempt that runs beside.
-                row = lock_venue(connection, tenant, venue_id, expected)
+                lock_venue(connection, tenant, venue_id, expected)
                 is_new = not batch.is_stored(connection)
                 if is_new:
                     self._check(connection, batch, size, max_plans)
                     insert_plans(connection, batch.records, batch.contents)
                     insert_members(connection, venue_id, batch.members)
                     check_members(connection, venue_id, max_venue_plans)
-                    values = {"revision_id": uuid.uuid4().hex, "number": row.number + 1, "updated_at": batch.now}
-                    connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
+                    touch_venue(connection, venue_id, batch.now)
                     self._settle(connection, tenant, size, max_plans)
             stored = find_venue(connection, tenant, venue_id)
         if stored is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from typing import Any
 
@@ -50,20 +51,20 @@ def check_count(connection: Connection, tenant: str, limit: int) -> None:
 
 
 def remove_from_venues(connection: Connection, plan_id: str) -> int:
-    """Remove a plan from its venues, which get new revisions, before the same transaction deletes it.
-
-    Returns:
-        The number of deleted rows.
-    """
+    """Remove a plan, which the transaction deletes, from its venues with new revisions; return the number of rows."""
     own = select(VENUE_PLANS.c.venue_id).where(VENUE_PLANS.c.plan_id == plan_id)
     venues = select(VENUES.c.id).where(VENUES.c.id.in_(own)).order_by(VENUES.c.id).with_for_update()
     ids = connection.scalars(venues).all()
     rows = connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.plan_id == plan_id)).rowcount
-    now = datetime.now(UTC)
     for venue_id in ids:
-        values = {"revision_id": uuid.uuid4().hex, "number": VENUES.c.number + 1, "updated_at": now}
-        connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
+        touch_venue(connection, venue_id, datetime.now(UTC))
     return rows
+
+
+def touch_venue(connection: Connection, venue_id: str, now: datetime) -> None:
+    """Give a locked venue a new revision, because its plans have changed."""
+    values = {"revision_id": uuid.uuid4().hex, "number": VENUES.c.number + 1, "updated_at": now}
+    connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
 
 
 def revision_values(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:
@@ -73,10 +74,7 @@ def revision_values(name: str, anchor: Anchor | None, now: datetime) -> dict[str
         "folded_name": name.casefold(),
         "revision_id": uuid.uuid4().hex,
         "updated_at": now,
-        "latitude": None if anchor is None else anchor.latitude,
-        "longitude": None if anchor is None else anchor.longitude,
-        "altitude_m": None if anchor is None else anchor.altitude_m,
-        "north_deg": None if anchor is None else anchor.north_deg,
+        **{field.name: anchor and getattr(anchor, field.name) for field in fields(Anchor)},
     }
 
 

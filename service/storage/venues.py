@@ -79,13 +79,7 @@ class Venues:
         *,
         limit: int,
     ) -> VenueRecord:
-        """Store a venue; if the id exists already, its first request was stored and the answer was lost.
-
-        Raises:
-            TooManyVenuesError: the tenant has `limit` venues already.
-            InvalidRequestError: a plan is not the tenant's.
-            StorageQuotaError: the tenant would store too many bytes.
-        """
+        """Store a venue; if the id exists already, its first request was stored and the answer was lost."""
         size = ROW_BYTES * (1 + len(members))
         with self._database.writing(grows_by=size) as connection:
             if (stored := find_venue(connection, tenant, venue_id)) is None:
@@ -154,13 +148,9 @@ class Venues:
     def list_venues(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[VenueRecord]:
-        """Return venues, newest first.
-
-        `name` is a part of the name, case-insensitive.
-        """
+        """Return venues, newest first; `name` is a part of the name, case-insensitive."""
         page = newest_first(select_venues(VENUES.c.tenant == tenant), VENUES, limit=limit, after=after, name=name)
-        with self._database.reading() as connection:
-            return [venue_record(row) for row in connection.execute(page)]
+        return [venue_record(row) for row in self._database.rows(page)]
 
     def plans(
         self, venue_id: str, *, limit: int, after: VenuePlace | None = None, level: float | None = None
@@ -175,9 +165,8 @@ class Venues:
             query = query.where(own_level == level)
         if after is not None:
             query = query.where(or_(own_level > after.level, and_(own_level == after.level, plan_id > after.plan_id)))
-        with self._database.reading() as connection:
-            rows = connection.execute(query.order_by(own_level, plan_id).limit(limit))
-            return [VenueMember(**row._mapping) for row in rows]
+        rows = self._database.rows(query.order_by(own_level, plan_id).limit(limit))
+        return [VenueMember(**row._mapping) for row in rows]
 
     def counts(self, venue_id: str, model_sha256: str, step_m: float) -> VenueCounts:
         """Return the numbers of a venue's plans, for a model and a grid step; they are counted once per state."""
@@ -206,16 +195,14 @@ class Venues:
         numbers = (func.coalesce(number, 0) for number in (TENANTS.c.changes, sum(counted) - TENANTS.c.counted_bytes))
         tenants = VENUES.outerjoin(TENANTS, TENANTS.c.tenant == VENUES.c.tenant)
         query = select(VENUES.c.revision_id, *numbers).select_from(tenants)
-        with self._database.reading() as connection:
-            row = connection.execute(query.where(VENUES.c.id == venue_id)).one_or_none()
+        row = self._database.row(query.where(VENUES.c.id == venue_id))
         return VenueState(None, 0, 0) if row is None else VenueState(*row)
 
     def members(self, venue_id: str) -> Sequence[Any]:
         """Return `level`, `plan_id` and `name`, None for the plan's own one, of every plan of a venue."""
         columns = VENUE_PLANS.c
         query = select(columns.level, columns.plan_id, columns.name).where(columns.venue_id == venue_id)
-        with self._database.reading() as connection:
-            return connection.execute(query).all()
+        return self._database.rows(query)
 
     def changed_plans(self, tenant: str, after: int) -> Sequence[str]:
         """Return the ids of a tenant's plans that changed after the change with a number, see `VenueState`."""

@@ -191,7 +191,7 @@ def test_invalid_lifetime_is_a_usage_error(options: list[str]) -> None:
 
 def test_migration_lets_readers_read_metrics(store: Store) -> None:
     keys = [id_of(make_key(store, scopes=scopes)) for scopes in (("read", "write"), ("localise",), ("read",))]
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         # The migrations 0012 and 0013 came later.
         for table in ("album_photographs", "albums"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
@@ -206,7 +206,7 @@ def test_migration_lets_readers_read_metrics(store: Store) -> None:
         for column in ("expires_at", "lifetime_s", "replaces"):
             connection.exec_driver_sql(f"ALTER TABLE api_keys DROP COLUMN {column}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0010'")
-    moved = Store(store._database._engine.url.render_as_string(hide_password=False))
+    moved = Store(store.database._engine.url.render_as_string(hide_password=False))
     scopes = {key.id: key.scopes for key in moved.keys.list_keys()}
     assert [scopes[key] for key in keys] == [{"read", "write", "metrics"}, {"localise"}, {"read", "metrics"}]
     assert all(key.expires_at is None for key in moved.keys.list_keys())
@@ -371,7 +371,7 @@ def test_flood_of_refusals_has_few_entries(admin: httpx.Client) -> None:
 
 def test_entries_cannot_be_changed(store: Store) -> None:
     store.audit_log.add([_entry()])
-    with pytest.raises(DBAPIError, match="append-only"), store._database.writing() as connection:
+    with pytest.raises(DBAPIError, match="append-only"), store.database.writing() as connection:
         connection.execute(update(AUDIT_LOG).values(actor="b"))
     assert [entry.actor for entry in store.audit_log.page(limit=9)] == ["a"]
 
@@ -423,7 +423,7 @@ def test_counted_entries_of_an_actor_are_bounded() -> None:
 
 def test_entries_wait_for_the_database(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.security.audit._MAX_WAITING", 3)
-    waiting = Store(store._database._engine.url.render_as_string(hide_password=False), connections=1, wait_s=0.05)
+    waiting = Store(store.database._engine.url.render_as_string(hide_password=False), connections=1, wait_s=0.05)
     trail = AuditTrail(waiting.audit_log)
     # The only connection is in use.
     with waiting._database.reading():

@@ -362,7 +362,7 @@ def test_stored_album_has_no_picture_position_or_owner(
         assert "Mustermann" not in json.dumps(photographs(client, album_id))
         store = Store(database_of(tmp_path))
         store.album_jobs.release(album_id, "")
-        with store._database.writing() as connection:
+        with store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(solved_number=0))
         job = store.album_jobs.claim(album_id, "test", 10.0)
         assert job is not None
@@ -534,7 +534,7 @@ def test_album_of_another_model_can_only_be_read(
         (line,) = add(own, album_id, pictures[:1])
         wait_until_solved(own, album_id)
         store = Store(database_of(tmp_path))
-        with store._database.writing() as connection:
+        with store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(model_sha256="0" * 64))
         assert own.get(f"/albums/{album_id}").json()["state"] == "outdated"
         assert photographs(own, album_id)[0]["pin"]["place"] is not None
@@ -566,7 +566,7 @@ def test_expired_lease_is_taken_over(
         # Held by the app: another replica gets nothing, nor does it store what it found.
         assert store.album_jobs.due(client.get(f"/albums/{album_id}").json()["model_sha256"], [], 9) == []
         assert store.album_jobs.claim(album_id, "other", 10.0) is None
-        with store._database.writing() as connection:
+        with store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(lease_until_s=0.0))
         job = store.album_jobs.claim(album_id, "other", 10.0)
         assert job is not None

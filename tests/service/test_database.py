@@ -30,7 +30,7 @@ def store(open_store: OpenStore) -> Store:
 
 
 def test_migrations_match_the_tables(store: Store) -> None:
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, METADATA) == []
 
@@ -45,7 +45,7 @@ def test_concurrent_starts_migrate_once(url: str) -> None:
 
 
 def test_newer_database_is_rejected(store: Store, url: str) -> None:
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     with pytest.raises(ConfigError, match="9999"):
         Store(url)
@@ -92,7 +92,7 @@ def test_migration_from_the_first_version(tmp_path: Path, grids: str) -> None:
     assert original_of(store, "1" * 32) == original
     # Grids are computed again.
     assert [summary.name for summary in store.grids.missing("m1", 0.5, 10)] == ["Flat 1", "Flat 2"]
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, METADATA) == []
     store.close()
@@ -103,7 +103,7 @@ def test_migration_from_the_first_version(tmp_path: Path, grids: str) -> None:
 
 def test_sqlite_uses_foreign_keys_and_wal(tmp_path: Path) -> None:
     store = Store(_url(tmp_path))
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert connection.exec_driver_sql("PRAGMA foreign_keys").scalar() == 1
         # Commits reach the disk before they are acknowledged.
@@ -129,7 +129,7 @@ def test_unusable_database_is_a_config_error(url: str) -> None:
 
 def test_connections_and_waiting_are_limited(url: str) -> None:
     store = Store(url, connections=2, wait_s=0.2)
-    with store._database.reading(), store._database.reading(), pytest.raises(StoreUnavailableError):
+    with store.database.reading(), store.database.reading(), pytest.raises(StoreUnavailableError):
         store.plans.list_plans("default", limit=1)
     assert store.plans.list_plans("default", limit=1) == []
     store.close()
@@ -140,7 +140,7 @@ def test_database_that_answers_others_is_busy(url: str) -> None:
 
     def use(_number: int) -> StoreUnavailableError | None:
         try:
-            with store._database.reading():
+            with store.database.reading():
                 time.sleep(0.1)
         except StoreUnavailableError as error:
             return error
@@ -150,7 +150,7 @@ def test_database_that_answers_others_is_busy(url: str) -> None:
         refused = [error for error in threads.map(use, range(10)) if error is not None]
     assert refused
     assert all(isinstance(error, StoreBusyError) for error in refused)
-    with store._database.reading(), pytest.raises(StoreUnavailableError) as caught:
+    with store.database.reading(), pytest.raises(StoreUnavailableError) as caught:
         store.plans.list_plans("default", limit=1)
     assert not isinstance(caught.value, StoreBusyError)
     store.close()
@@ -181,7 +181,7 @@ def test_store_reconnects_after_an_outage(postgres: PostgresServer) -> None:
 def test_cached_plan_needs_one_query(store: Store) -> None:
     _add(store, "p")
     statements: list[str] = []
-    event.listen(store._database._engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))
+    event.listen(store.database._engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))
     assert store.plans.get("default", "p") is not None
     assert len([statement for statement in statements if statement.startswith("SELECT floorplans")]) == 1
     assert not any("document" in statement for statement in statements)

@@ -52,7 +52,7 @@ def _make_old(folder: Path) -> None:
 def test_deletion_writes_a_fraction_of_the_deleted_bytes(tmp_path: Path) -> None:
     store = _open(tmp_path)
     _add(store, "p", 20 * MIB)
-    with store._database._driver_cursor() as cursor:
+    with store.database._driver_cursor() as cursor:
         cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
     assert store.plans.delete("a", "p")
     log = _file(tmp_path).with_name("lalaloc.sqlite3-wal")
@@ -65,14 +65,14 @@ def test_file_shrinks_after_deletions(tmp_path: Path) -> None:
     store = _open(tmp_path)
     for number in range(3):
         _add(store, f"p{number}", 10 * MIB)
-    store.give_back()
+    store.database.give_back()
     assert _file(tmp_path).stat().st_size > 30 * MIB
     # Not the last ones, so that pages are moved.
     for number in range(2):
         assert store.plans.delete("a", f"p{number}")
-    store.give_back(lambda: True)
+    store.database.give_back(lambda: True)
     assert _file(tmp_path).stat().st_size > 30 * MIB
-    store.give_back()
+    store.database.give_back()
     assert _file(tmp_path).stat().st_size < 16 * MIB
     assert original_of(store, "p2") == bytes(10 * MIB)
     store.close()
@@ -85,14 +85,14 @@ def test_old_file_shrinks_after_it_was_compacted(tmp_path: Path, monkeypatch: py
     store = _open(tmp_path)
     _add(store, "p", 20 * MIB)
     assert store.plans.delete("a", "p")
-    store.give_back()
+    store.database.give_back()
     assert _file(tmp_path).stat().st_size > 20 * MIB
     assert main(["compact"]) == 0
-    store.give_back()
+    store.database.give_back()
     assert _file(tmp_path).stat().st_size < 5 * MIB
     _add(store, "p", 20 * MIB)
     assert store.plans.delete("a", "p")
-    store.give_back()
+    store.database.give_back()
     assert _file(tmp_path).stat().st_size < 10 * MIB
     store.close()
 
@@ -137,19 +137,19 @@ def test_upload_needs_room_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_deletion_on_a_full_disk_uses_the_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk, store = _Disk(monkeypatch), _open(tmp_path)
-    store.give_back()
+    store.database.give_back()
     for plan_id in ("p", "q"):
         _add(store, plan_id, 3 * MIB)
     reserve = _file(tmp_path).with_name("lalaloc.sqlite3-reserve")
     assert reserve.stat().st_size == 4 * MIB
-    transaction = store._database._transaction
+    transaction = store.database._transaction
 
     def full_without_reserve(engine: Any) -> Any:
         if reserve.stat().st_size:
             raise StoreFullError
         return transaction(engine)
 
-    monkeypatch.setattr(store._database, "_transaction", full_without_reserve)
+    monkeypatch.setattr(store.database, "_transaction", full_without_reserve)
     disk.free = 0
     assert store.plans.delete("a", "p")
     # Nothing is stored until the reserve is whole again, so that the next deletion works, too.
@@ -158,7 +158,7 @@ def test_deletion_on_a_full_disk_uses_the_reserve(tmp_path: Path, monkeypatch: p
         _add(store, "r", 1)
     assert store.plans.delete("a", "q")
     monkeypatch.undo()
-    store.give_back()
+    store.database.give_back()
     assert reserve.stat().st_size == 4 * MIB
     _add(store, "r", 1)
     store.close()

@@ -580,13 +580,13 @@ def test_busy_database_does_not_serve_cached_plans(tmp_path: Path) -> None:
     known = PlanLookup(store, max_age_s=600.0)
     record = _add(store)
     assert _looked_up(known, "default", "p") == record
-    with store._database.reading():
+    with store.database.reading():
         # As if the database answered other callers meanwhile.
-        store._database._answered_s = float("inf")
+        store.database._answered_s = float("inf")
         for _ in range(2):
             with pytest.raises(StoreBusyError):
                 _looked_up(known, "default", "p")
-        store._database._answered_s = 0.0
+        store.database._answered_s = 0.0
         assert _looked_up(known, "default", "p") == record
     store.close()
 

@@ -178,7 +178,7 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
         store = Store(database_of(tmp_path))
         # State after a crash: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": UploadedFile.of(CONTENT)}))
-        claim = IdempotencyKeys(store._database, store.quota, lease_s=1.0).begin(
+        claim = IdempotencyKeys(store.database, store.quota, lease_s=1.0).begin(
             "default", "POST /floorplans", "a", digest
         )
         assert isinstance(claim, Claimed)
@@ -311,7 +311,7 @@ def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
     async def ask() -> None:
         reads = BoundedReads(threads=1, max_pending=4, wait_s=30.0 if leaves else 0.2)
         # Writers wait for the lock.
-        with store._database.writing():
+        with store.database.writing():
             asking = asyncio.create_task(_idempotent(store).run_async(NOTHING, never, reads))
             await asyncio.sleep(0.3)
             asking.cancel()
@@ -327,7 +327,7 @@ def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
 
 
 def _token_of(store: Store) -> str | None:
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         return connection.scalar(select(IDEMPOTENCY.c.token))
 
 

@@ -575,7 +575,7 @@ def cached(tmp_path: Path) -> Iterator[CachedKey]:
 
 def test_key_is_cached_ten_minutes_without_database(cached: CachedKey) -> None:
     # The only connection is in use.
-    with cached.store._database.reading():
+    with cached.store.database.reading():
         for cached.clock_s in (1004.0, 1006.0, 1300.0, 1600.0):
             key = cached.find()
             assert key is not None
@@ -589,9 +589,9 @@ def test_key_is_cached_ten_minutes_without_database(cached: CachedKey) -> None:
 
 
 def test_busy_database_does_not_extend_the_key_cache(cached: CachedKey) -> None:
-    with cached.store._database.reading():
+    with cached.store.database.reading():
         # Other queries succeed in the meantime.
-        cached.store._database._answered_s = float("inf")
+        cached.store.database._answered_s = float("inf")
         cached.clock_s = 1006.0
         with pytest.raises(StoreBusyError):
             cached.find()

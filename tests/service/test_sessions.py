@@ -385,7 +385,7 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
         assert first.status_code == 200
         assert_problem(photograph(), 409, "idempotency-in-progress")
         store = Store(database_of(tmp_path))
-        with store._database.writing() as connection:
+        with store.database.writing() as connection:
             connection.execute(update(IDEMPOTENCY).values(lease_until_s=0.0))
         store.close()
         assert photograph().json() == first.json()

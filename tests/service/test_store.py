@@ -91,7 +91,7 @@ def _assert_same(found: PoseGrid | None, grid: PoseGrid) -> None:
 
 
 def _rows(store: Store, table: object) -> int:
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         return connection.scalar(select(func.count()).select_from(table)) or 0  # pyright: ignore[reportArgumentType]
 
 
@@ -219,7 +219,7 @@ def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore) -> None:
         store = open_store()
 
         def watched(document: PlanDocument) -> FloorPlan | None:
-            in_use.append(store._database._engine.pool.checkedout())  # pyright: ignore[reportAttributeAccessIssue]
+            in_use.append(store.database._engine.pool.checkedout())  # pyright: ignore[reportAttributeAccessIssue]
             return document.plan()
 
         store.plans.parse_with(watched)
@@ -243,7 +243,7 @@ def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> N
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms})
     store = open_store()
     store.plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.execute(update(REVISIONS).values(document_sha256=None, warnings=None))
     found = open_store().plans.get("default", "p")
     assert found is not None
@@ -254,7 +254,7 @@ def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> N
 def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[str], str]) -> None:
     store = open_store()
     _add(store, "p")
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         document = connection.scalar(select(REVISIONS.c.document))
         assert document is not None
         connection.execute(update(REVISIONS).values(document=damage(document)))
@@ -272,7 +272,7 @@ def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[s
 @pytest.mark.parametrize("cut_off", [True, False])
 def test_damaged_original_is_an_error(store: Store, cut_off: bool) -> None:
     added = store.plans.add("default", "p", NewPlan(PLAN, Original(bytes(CHUNK_BYTES + 1))), limit=10)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         last = ORIGINAL_CHUNKS.c.number == 1
         connection.execute(
             delete(ORIGINAL_CHUNKS).where(last) if cut_off else update(ORIGINAL_CHUNKS).where(last).values(content=b"x")
@@ -438,12 +438,12 @@ def test_idempotency_keys_expire_after_a_day(store: Store) -> None:
         claim = store.idempotency_keys.begin("t", "r", key, "body")
         assert isinstance(claim, Claimed)
         store.idempotency_keys.finish("t", "r", key, claim.token, ANSWER)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         yesterday = datetime.now(UTC) - KEPT_FOR - timedelta(minutes=1)
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
     # Expired keys are not returned even before they are purged.
     assert isinstance(store.idempotency_keys.begin("t", "r", "old", "another"), Claimed)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
     assert store.idempotency_keys.purge() == 1
     assert store.idempotency_keys.begin("t", "r", "new", "body") == ANSWER
@@ -470,7 +470,7 @@ def test_claim_of_a_fast_clock_is_expired(store: Store) -> None:
     claim = store.idempotency_keys.begin("t", "r", "k", "body")
     assert isinstance(claim, Claimed)
     assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).values(lease_until_s=IDEMPOTENCY.c.lease_until_s + 48 * 3600.0))
     assert store.idempotency_keys.begin("t", "r", "k", "body") == claim
     assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)

@@ -113,7 +113,7 @@ def _assert_unread(store: Store, damage: Callable[[bytes], bytes], *, fits: bool
     """Check that a damaged grid counts as missing and can be stored anew; `fits`: with its size and digest."""
     key = _key(_add(store))
     _put(store, key)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         content = connection.scalar(select(GRID_CHUNKS.c.content))
         assert content is not None
         damaged = damage(bytes(content))
@@ -129,7 +129,7 @@ def _assert_unread(store: Store, damage: Callable[[bytes], bytes], *, fits: bool
 def test_grid_without_digest_counts_as_missing(store: Store) -> None:
     key = _key(_add(store))
     _put(store, key)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.execute(update(LATENT_GRIDS).values(sha256=None))
     assert store.grids.get(key) is None
     assert store.grids.poses("m1", 0.5) == {}
@@ -146,7 +146,7 @@ def test_lease_of_a_fast_clock_is_expired(store: Store) -> None:
     key = _key(_add(store))
     store.leases.claim(key, "ahead", 60.0)
     two_days_s = 2 * 24 * 3600.0
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.execute(update(GRID_LEASES).values(lease_until_s=GRID_LEASES.c.lease_until_s + two_days_s))
     assert store.leases.progress("m1", 0.5, [key.revision_id]) == {}
     assert [summary.revision_id for summary in store.grids.missing("m1", 0.5, 10)] == [key.revision_id]
@@ -157,7 +157,7 @@ def test_lease_of_a_fast_clock_is_expired(store: Store) -> None:
 def test_lease_without_length_holds_until_its_end(store: Store) -> None:
     key = _key(_add(store))
     store.leases.claim(key, "earlier", 60.0)
-    with store._database.writing() as connection:
+    with store.database.writing() as connection:
         connection.execute(update(GRID_LEASES).values(length_s=None))
     assert store.leases.claim(key, "me", 60.0) is None
 

@@ -222,7 +222,7 @@ def test_idempotent_answer_beyond_the_quota_is_not_kept(store: Store) -> None:
         unfinished = store.idempotency_keys.begin("a", "POST /x", f"k{number}", "body")
         assert isinstance(unfinished, Claimed)
         store.idempotency_keys.abandon("a", "POST /x", f"k{number}", unfinished.token)
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         assert (connection.scalar(select(func.count()).select_from(IDEMPOTENCY)) or 0) < 30
     _recounted(store, "a")
 
@@ -239,7 +239,7 @@ def test_purge_deletes_all_of_one_tenant(store: Store, capsys: pytest.CaptureFix
     assert store.quota.account("a").used.total == 0
     assert store.quota.account("b") == kept
     assert main(["tenants", "purge", "b", "--yes"]) == 0
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         left = {
             table.name: connection.scalar(select(func.count()).select_from(table)) for table in METADATA.sorted_tables
         }

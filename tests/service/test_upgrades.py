@@ -118,7 +118,7 @@ def _assert_counted(store: Store, counts: dict[str, int]) -> None:
     texts = (REVISIONS.c.document, REVISIONS.c.warnings, REVISIONS.c.report)
     size = sum((sa.func.coalesce(sa.func.length(text), 0) for text in texts), start=sa.literal(ROW_BYTES))
     size += content.where(ORIGINAL_CHUNKS.c.revision_id == REVISIONS.c.id).scalar_subquery()
-    with store._database.reading() as connection:
+    with store.database.reading() as connection:
         assert connection.scalars(sa.select(REVISIONS.c.id).where(REVISIONS.c.stored_bytes != size)).all() == []
         places = {row.id: row._mapping for row in connection.execute(sa.select(FLOORPLANS))}
     accounts = store.quota.accounts()
@@ -141,7 +141,7 @@ def test_plan_that_cannot_be_read_gets_no_place(tmp_path: Path) -> None:
         database.executescript((RELEASED / "0.2.0.sql").read_text(encoding="utf-8"))
         database.execute("UPDATE revisions SET document = 'damaged'")
         database.commit()
-    with closing(Store(f"sqlite:///{file}")) as store, store._database.reading() as connection:
+    with closing(Store(f"sqlite:///{file}")) as store, store.database.reading() as connection:
         assert connection.scalars(sa.select(FLOORPLANS.c.reach_m)).all() == [None]
 
 

@@ -107,11 +107,11 @@ class Changes:
     def prepare_by_an_earlier_version(self) -> None:
         """Store a grid, and count its bytes alone."""
         store = self.store
-        with store._database.reading() as connection:
+        with store.database.reading() as connection:
             before = connection.execute(TENANTS.select()).one()
         self.prepare()
         columns = TENANTS.c
-        with store._database.writing() as connection:
+        with store.database.writing() as connection:
             values = {name: getattr(before, name) for name in ("changes", "counted_bytes")}
             connection.execute(update(TENANTS).values(values))
             own = FLOORPLANS.c.changed

@@ -153,8 +153,8 @@ def test_missing_prototypes_are_made(
     with start_app(tmp_path) as client:
         venue_id = venue_of(client, upload(client), upload(client, STUDIO))
         store = Store(database_of(tmp_path))
-        with store._database.writing() as connection:
-            value = "'\\x4c4c5032'" if stored != "NULL" and store._database.is_postgresql else stored
+        with store.database.writing() as connection:
+            value = "'\\x4c4c5032'" if stored != "NULL" and store.database.is_postgresql else stored
             connection.exec_driver_sql(f"UPDATE latent_grids SET prototypes = {value}")
             grid_ids = connection.exec_driver_sql("SELECT id FROM latent_grids").scalars().all()
         assert store.grids.prototypes(grid_ids) == {}
