@@ -9,13 +9,14 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
-from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any, Literal, TypeVar
+
+from cachetools import LRUCache
 
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import MAX_RATIO, FairSemaphore, Shares
@@ -81,34 +82,10 @@ def declared_class(endpoint: Callable[..., Any]) -> RouteClass | None:
     return getattr(endpoint, "route_class", None)
 
 
-class _Pace:
-    """Running means of the share of its time limit that a query of each client would take without the others.
-
-    A client whose queries wait behind one another is refused at once, not when the deadline has passed.
-    """
-
-    def __init__(self) -> None:
-        self._shares: OrderedDict[str, float] = OrderedDict()
-
-    def exceeds_deadline(self, client: str, others: int) -> bool:
-        """Return whether one more query beside others of the client is expected to miss its deadline."""
-        return others > 0 and (others + 1) * self._shares.get(client, 0.0) > 1.0
-
-    def note(self, client: str, share: float, others: int) -> None:
-        """Note the share of its time limit that a query took beside others of its client."""
-        mean = self._shares.pop(client, 0.0)
-        self._shares[client] = mean + _NEWEST_OF_CLIENT * (share / (others + 1) - mean)
-        if len(self._shares) > _MAX_PACES:
-            self._shares.popitem(last=False)
-
-
 class Slots:
     """Slots for requests of one kind, shared between clients (`Shares`); for one event loop.
 
-    Args:
-        limit: number of slots.
-        max_waiting: number of requests that can wait for a slot in `wait_and_hold`, shared between clients as well.
-        accounts: CPU time of the clients, by which the waiting ones are served.
+    As many as `max_waiting` requests, shared between clients as well, can wait for a slot in `wait_and_hold`.
     """
 
     def __init__(self, limit: int, max_waiting: int = 0, accounts: CpuAccounts | None = None) -> None:
@@ -116,7 +93,8 @@ class Slots:
         self._slots = FairSemaphore(limit, accounts or CpuAccounts())
         self._places = Shares(max_waiting)
         self._held_s = 0.0
-        self._pace = _Pace()
+        # Mean of the share of its time limit that a query of each client would take without the client's others.
+        self._paces: LRUCache[str, float] = LRUCache(_MAX_PACES)
 
     @property
     def in_use(self) -> int:
@@ -130,11 +108,7 @@ class Slots:
 
     @contextmanager
     def hold(self, client: str) -> Iterator[None]:
-        """Hold a slot.
-
-        Raises:
-            OverloadedError: all slots, or the client's share of them, are in use.
-        """
+        """Hold a slot, or refuse the request if all slots, or the client's share of them, are in use."""
         if not self._slots.acquire_at_once(client):
             raise self._refusal(client)
         with self._held(client):
@@ -144,10 +118,11 @@ class Slots:
     async def wait_and_hold(self, client: str, deadline: float) -> AsyncIterator[None]:
         """Wait for a slot until `deadline` (`monotonic`) and hold it; raises as `hold` does.
 
-        The client that used the least CPU time lately is first.
+        The client that used the least CPU time lately is first. A client whose queries wait behind one another is
+        refused at once, not when the deadline has passed.
         """
         begin, others = monotonic(), self._others(client)
-        if self._pace.exceeds_deadline(client, others):
+        if others and (others + 1) * self._paces.get(client, 0.0) > 1.0:
             raise ExpectedTooLateError(others, retry_after_s=self._retry_after_s())
         _AWAY_S.set(0.0)
         try:
@@ -155,8 +130,10 @@ class Slots:
             with self._held(client):
                 yield
         finally:
-            spent_s = monotonic() - begin - _AWAY_S.get()
-            self._pace.note(client, spent_s / max(deadline - begin, 1e-3), max(others, self._others(client)))
+            share = (monotonic() - begin - _AWAY_S.get()) / max(deadline - begin, 1e-3)
+            mean = self._paces.get(client, 0.0)
+            alone = share / (max(others, self._others(client)) + 1)
+            self._paces[client] = mean + _NEWEST_OF_CLIENT * (alone - mean)
 
     @contextmanager
     def released(self, client: str) -> Iterator[None]:
@@ -213,12 +190,7 @@ class Slots:
 
 
 class BytesInFlight(Shares):
-    """Bytes of request bodies in progress, from their heads to the end of their answers; for one event loop.
-
-    Args:
-        total_bytes: limit of all clients together.
-        limit_of: returns the limit (bytes) of a client.
-    """
+    """Bytes of request bodies in progress, from their heads to the end of their answers; for one event loop."""
 
     def __init__(self, total_bytes: int, limit_of: Callable[[str], int]) -> None:
         super().__init__(total_bytes)
@@ -229,12 +201,7 @@ class BytesInFlight(Shares):
         return min(self._limit_of(client), self.limit)
 
     def take(self, client: str, count: int = 1) -> None:
-        """Take some bytes for a client.
-
-        Raises:
-            UploadTooLargeError: one request needs more than the client's limit.
-            BytesInFlightError: the requests in progress leave too few.
-        """
+        """Take some bytes for a client, or refuse the request."""
         held, limit = self.held_by(client), self.limit_of(client)
         if count > limit:
             raise UploadTooLargeError("upload_tenant_bytes", limit, count)
@@ -298,11 +265,8 @@ class Admission:
             lambda: by_tenant(self.bytes_in_flight.held()),
         )
         telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in progress.", lambda: self.requests.in_use)
-        telemetry.gauge(
-            "lalaloc_queries_in_work",
-            "Queries being computed, without those that wait for a pose grid.",
-            lambda: self.queries.in_use,
-        )
+        in_work = "Queries being computed, without those that wait for a pose grid."
+        telemetry.gauge("lalaloc_queries_in_work", in_work, lambda: self.queries.in_use)
         telemetry.gauge("lalaloc_queries_waiting", "Queries waiting for a slot.", lambda: self.queries.waiting)
         telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in progress.", lambda: self.reads.in_use)
         telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
@@ -328,12 +292,7 @@ class Admission:
 
     @contextmanager
     def slot_for(self, client: str, route_class: RouteClass) -> Iterator[None]:
-        """Hold a slot for a request whose head has arrived.
-
-        Raises:
-            StoppingError: the service is stopping.
-            OverloadedError: all slots of its kind, or the client's share of them, are in use.
-        """
+        """Hold a slot for a request whose head has arrived, or refuse it."""
         if self.stopping:
             raise StoppingError()
         if route_class.is_query:

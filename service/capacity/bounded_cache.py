@@ -25,17 +25,11 @@ class SingleFlight(Generic[K, V]):
         self._begun: dict[K, Future[V]] = {}
 
     def run(self, key: K, make: Callable[[], V]) -> V:
-        """Return what `make` returns, or the result of the call with this key that another thread makes already.
-
-        Raises:
-            Exception: what the call raises, in all threads that wait for it.
-        """
+        """Return what `make` returns or raises, or what another thread's call with this key does that has begun."""
+        mine = Future[V]()
         with self._lock:
-            begun = self._begun.get(key)
-            mine = Future[V]()
-            if begun is None:
-                self._begun[key] = mine
-        if begun is not None:
+            begun = self._begun.setdefault(key, mine)
+        if begun is not mine:
             return begun.result()
         try:
             made = make()
@@ -50,16 +44,6 @@ class SingleFlight(Generic[K, V]):
                 del self._begun[key]
 
 
-class _CountingLruCache(LRUCache[K, V]):
-    """LRU cache that counts evictions."""
-
-    evictions = 0
-
-    def popitem(self) -> tuple[K, V]:
-        self.evictions += 1
-        return super().popitem()
-
-
 class BoundedCache(Generic[K, V]):
     """Thread-safe `cachetools.LRUCache` that ignores values larger than the whole cache.
 
@@ -67,8 +51,8 @@ class BoundedCache(Generic[K, V]):
     """
 
     def __init__(self, limit_bytes: int, size: Callable[[V], int]) -> None:
-        self._values: _CountingLruCache[K, V] = _CountingLruCache(limit_bytes, size)
-        self._lock = threading.Lock()
+        self._values: LRUCache[K, V] = LRUCache(limit_bytes, size)
+        self._lock = threading.RLock()
         self._making = SingleFlight[K, Any]()
 
     @property
@@ -85,10 +69,11 @@ class BoundedCache(Generic[K, V]):
         """Store a value, unless it is larger than the whole cache; return the number of evictions."""
         with self._lock:
             self._values.pop(key, None)
-            before = self._values.evictions
-            if self._values.getsizeof(value) <= self._values.maxsize:
-                self._values[key] = value
-            return self._values.evictions - before
+            if self._values.getsizeof(value) > self._values.maxsize:
+                return 0
+            count = len(self._values) + 1
+            self._values[key] = value
+            return count - len(self._values)
 
     def put_unread(self, key: K, value: V) -> None:
         """Store a value that nobody asked for, in a share of the cache: thousands do not displace those in use."""
@@ -114,15 +99,11 @@ class BoundedCache(Generic[K, V]):
     def drop(self, unwanted: Callable[[K, V], bool]) -> None:
         """Remove the values that `unwanted` selects."""
         with self._lock:
-            for key, value in self._items():
+            for key, value in self.items():
                 if unwanted(key, value):
                     del self._values[key]
 
     def items(self) -> list[tuple[K, V]]:
         """Return keys and values without marking them as used."""
         with self._lock:
-            return self._items()
-
-    def _items(self) -> list[tuple[K, V]]:
-        # Bypasses the subclass, which would mark each value as used.
-        return [(key, Cache.__getitem__(self._values, key)) for key in self._values]
+            return [(key, Cache.__getitem__(self._values, key)) for key in self._values]

@@ -28,22 +28,12 @@ class CoreShares:
     compute_threads: int
     onnx_threads: int
 
-    @property
-    def total(self) -> int:
-        """Number of threads that compute under full load."""
-        return self.workers + self.compute_threads * self.onnx_threads
-
 
 def share_cores(cores: int, *, workers: int | None, compute_threads: int, onnx_threads: int) -> CoreShares:
     """Return the numbers of threads, and choose those left open, with at least one thread each.
 
-    On fewer than four cores there is one thread more than cores, because a single LPO worker is mostly idle.
-
-    Args:
-        cores: usable cores.
-        workers: LPO workers; 0 for none, None to choose by LPO's share of the cores.
-        compute_threads: queries at a time; 0 to use the remaining cores.
-        onnx_threads: threads per network; 0 for the default of one, which is most efficient.
+    Open are `workers` if None, `compute_threads`, for the remaining cores, and `onnx_threads` per network if 0. On less
+    than four cores there is one thread more than cores, because a single LPO worker is mostly idle.
     """
     onnx_threads = onnx_threads or 1
     if workers is None:
@@ -73,16 +63,10 @@ def limit_arenas(cores: int) -> bool:
 
 def _quota_cores(cgroups: Path, own_cgroup: Path) -> float:
     """Return the smallest CPU quota, in cores, of the cgroup and its parents; infinite without one."""
-    quotas = [float("inf")]
-    try:
-        lines = own_cgroup.read_text(encoding="ascii", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    unified = [line.removeprefix("0::/") for line in lines if line.startswith("0::/")]
+    unified = [word.removeprefix("0::/") for word in _words(own_cgroup) if word.startswith("0::/")]
     group = cgroups / unified[0] if unified else cgroups
-    while group.is_relative_to(cgroups):
-        quotas.append(_cores(_words(group / "cpu.max")))
-        group = group.parent
+    groups = [group, *group.parents]
+    quotas = [_cores(_words(each / "cpu.max")) for each in groups if each.is_relative_to(cgroups)]
     # cgroup v1, as seen in a container.
     v1 = cgroups / "cpu"
     quotas.append(_cores(_words(v1 / "cpu.cfs_quota_us") + _words(v1 / "cpu.cfs_period_us")))
@@ -99,6 +83,6 @@ def _cores(quota_and_period: list[str]) -> float:
 
 def _words(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="ascii").split()
+        return path.read_text(encoding="ascii", errors="replace").split()
     except OSError:
         return []

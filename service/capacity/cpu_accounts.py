@@ -48,9 +48,6 @@ class CpuAccounts:
 
     Attributes:
         share: returns the weight of a client; the recent CPU time of a client with weight 2 counts half.
-
-    Args:
-        clock: monotonic clock (s).
     """
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:

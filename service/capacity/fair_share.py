@@ -127,11 +127,8 @@ class FairQueue(Generic[T]):
 class FairSemaphore:
     """Semaphore that is shared fairly between clients. Thread-safe.
 
-    Args:
-        limit: number of permits.
-        accounts: CPU time of the clients.
-        cores: while other clients use CPU time, a client holds fewer permits than this, one less for each of them, so
-            that its computations leave a core to theirs; it can always hold one. None: it holds no fewer.
+    With `cores`, while other clients use CPU time, a client holds fewer permits than that, one less for each of them:
+    its computations leave a core to theirs. It can always hold one.
     """
 
     def __init__(self, limit: int, accounts: CpuAccounts, *, cores: int | None = None) -> None:

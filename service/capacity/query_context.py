@@ -23,8 +23,7 @@ class QueryContext:
 
     Attributes:
         client: fairness group that shares decoders, threads and workers; see `service.capacity.fair_share`.
-        begin: end of the upload (`monotonic`).
-        deadline: time limit of the answer (`monotonic`).
+        begin, deadline: end of the upload, and time limit of the answer (`monotonic`).
         clock: durations of the stages, failed ones and the wait for the plan's grid included.
     """
 
@@ -35,10 +34,7 @@ class QueryContext:
 
     @classmethod
     def starting(cls, client: str, limit_s: float, clock: StageClock | None = None, *, spent_s: float = 0.0) -> Self:
-        """Return the context of a query that was complete `spent_s` (s) ago, with a time limit (s) from then.
-
-        `clock` timed its upload; None: a new one.
-        """
+        """Return the context of a query that was complete `spent_s` (s) ago; `clock` may have timed its upload."""
         begin = monotonic() - spent_s
         return cls(client=client, begin=begin, deadline=begin + limit_s, clock=clock or StageClock())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from contextvars import ContextVar, copy_context
 from typing import Any, ParamSpec, TypeVar
 
@@ -25,7 +26,7 @@ class Threads:
     Args:
         name: prefix of thread names.
         count: number of threads.
-        accounts: CPU time of the clients; calls are charged to theirs.
+        accounts: CPU time of the clients, to which calls are charged.
         cores: cores to compute on, of which each call holds one; None: calls hold none.
         beside_others: limits the threads of a client beside other clients, as `cores` of `FairSemaphore`.
         rests: the calls count for `CpuAccounts.rest_s`.
@@ -49,19 +50,14 @@ class Threads:
 
     async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a call for a client and return its result; a call that has begun is never cancelled."""
-        taken = list[FairSemaphore]()
-        try:
+        with ExitStack() as taken:
             for semaphore in self._needed:
                 await semaphore.acquire(client)
-                taken.append(semaphore)
+                taken.callback(semaphore.release, client)
             future = self.submit(self._charged, client, work, *args, **kwargs)
-        except BaseException:
-            for semaphore in taken:
-                semaphore.release(client)
-            raise
-        # Released when the thread is done, even if the caller was cancelled.
-        for semaphore in taken:
-            future.add_done_callback(lambda _future, semaphore=semaphore: semaphore.release(client))
+            # Released when the thread is done, even if the caller was cancelled.
+            kept = taken.pop_all()
+            future.add_done_callback(lambda _future: kept.close())
         return await asyncio.wrap_future(future)
 
     def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
@@ -108,10 +104,7 @@ class IdleCores(Executor):
 class BoundedReads:
     """Reads of the store with a timeout, which also applies while the store hangs; shared fairly between tenants.
 
-    Args:
-        threads: number of threads.
-        max_pending: limit of running and waiting reads; bounds the threads and requests that a hanging store blocks.
-        wait_s: timeout of a read.
+    `max_pending` limits running and waiting reads, and so the threads and requests that a hanging store blocks.
     """
 
     def __init__(self, *, threads: int, max_pending: int, wait_s: float) -> None:
@@ -121,11 +114,7 @@ class BoundedReads:
         self._begun: set[asyncio.Future[Any]] = set()
 
     async def run(self, tenant: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a read for a tenant and return its result; one that has begun is never cancelled.
-
-        Raises:
-            StoreUnavailableError: timeout, or too many reads are pending.
-        """
+        """Run a read for a tenant and return its result; one that has begun is never cancelled."""
         if len(self._begun) >= self._max_pending:
             raise StoreUnavailableError()
         begun = asyncio.ensure_future(self._threads.run(tenant, work, *args, **kwargs))
