@@ -32,8 +32,8 @@ class CoreShares:
 def share_cores(cores: int, *, workers: int | None, compute_threads: int, onnx_threads: int) -> CoreShares:
     """Return the numbers of threads, and choose those left open, with at least one thread each.
 
-    Open are `workers` if None, `compute_threads`, for the remaining cores, and `onnx_threads` per network if 0. On less
-    than four cores there is one thread more than cores, because a single LPO worker is mostly idle.
+    Open are `workers` if None, `compute_threads`, for the remaining cores, and `onnx_threads` per network if 0.
+    There is one thread more than cores if these are fewer than four, because a single LPO worker is mostly idle.
     """
     onnx_threads = onnx_threads or 1
     if workers is None:

@@ -47,13 +47,8 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
         return grid
 
     def find(self, key: GridKey) -> PoseGrid | None:
-        """Return a grid from memory or from the store.
-
-        Raises:
-            StoreUnavailableError: the grid is not in memory, and the database is unavailable.
-        """
-        grid = self.cached(key)
-        if grid is not None:
+        """Return a grid from memory or from the store."""
+        if (grid := self.cached(key)) is not None:
             return grid
         self._telemetry.grid_cache_misses.inc()
         return self.load(key)
@@ -131,7 +126,6 @@ class GridBuilder:
         settings: Settings,
         telemetry: Telemetry,
     ) -> None:
-        """Start the thread."""
         self._store = store
         self._encoders = encoders
         self._cache = cache

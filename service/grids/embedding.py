@@ -48,9 +48,6 @@ def embed(
         computing: entered for the sampling and for each chunk, so that queries take turns with them.
         after_room: called after each room of the sampling; an error that it or `after_chunk` raises ends the work.
         after_chunk: called with the share done (0 to 1), without a core.
-
-    Raises:
-        InvalidPoseError: the networks return non-finite latents at this camera height.
     """
     with computing():
         poses = pose_grid(plan, step_m, after_room)
@@ -87,16 +84,9 @@ def embed_small(
     step_m: float,
     computing: Callable[[], AbstractContextManager[None]],
 ) -> Iterator[list[tuple[PoseGrid, SortedPrototypes]]]:
-    """Make the own grids of small plans and their prototypes as `embed` does, several plans at a time.
+    """Make the own grids of small plans and their prototypes as `embed` does, and yield those of some plans at a time.
 
-    Args:
-        plans: plans of few poses, by their estimates.
-        encoders: networks that predict wall profiles.
-        step_m: grid step (m).
-        computing: entered for at most about `_TOGETHER` poses at a time, so that queries take turns with them.
-
-    Yields:
-        Grids and prototypes of the next plans.
+    The networks predict wall profiles. `computing` is entered for at most about `_TOGETHER` poses at a time.
     """
     begin, poses = 0, np.cumsum([grid_size(plan, step_m) for plan in plans])
     while begin < len(plans):

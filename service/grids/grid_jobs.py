@@ -28,11 +28,8 @@ class GridJob:
     """Grid to be computed.
 
     Attributes:
-        key: key of the grid.
-        plan_id: id of the plan.
         poses: estimated number of poses.
         on_demand: a query needs the grid, for a camera height other than the plan's own.
-        future: result of the job.
         cancelled: event that ends the work.
         progress: share that is done, 0 to 1, here or in another replica.
         remote: another replica computes the grid.
@@ -52,11 +49,7 @@ class GridJobs:
     """Jobs of this replica, and the thread that works on them."""
 
     def __init__(self, work: Callable[[GridJob], None]) -> None:
-        """Start the thread.
-
-        Args:
-            work: computes a job and ends it with `end`, or leaves it `remote`; must not raise.
-        """
+        # Computes a job and ends it with `end`, or leaves it `remote`; must not raise.
         self._work = work
         self._changed = threading.Condition()
         self._jobs: dict[GridKey, GridJob] = {}
@@ -73,12 +66,7 @@ class GridJobs:
         return self._jobs.get(key)
 
     def add(self, key: GridKey, *, plan_id: str, poses: int, on_demand: bool) -> GridJob:
-        """Return the job for a grid, a new one if there is none.
-
-        Raises:
-            OverloadedError: too many jobs wait already.
-            StoppingError: the service stops.
-        """
+        """Return the job for a grid, a new one if there is none."""
         with self._changed:
             job = self._jobs.get(key)
             if job is not None:

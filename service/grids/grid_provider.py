@@ -33,11 +33,7 @@ HEIGHT_STEP_M = 0.02
 
 
 def check_height_m(record: PlanRecord, height_m: float) -> None:
-    """Check that a camera can have a height (m) in a plan.
-
-    Raises:
-        InvalidPoseError: the height is not below the lowest ceiling, or too low for any camera.
-    """
+    """Check that a camera can have a height (m) in a plan: below the lowest ceiling, and not too low."""
     lowest = float(record.plan.ceiling_heights_m.min())
     if height_m != record.plan.camera_height_m and not MIN_CAMERA_HEIGHT_M <= height_m < lowest:
         raise InvalidPoseError(
@@ -251,11 +247,7 @@ class GridProvider:
             self.compute(record, record.plan.camera_height_m)
 
     def find(self, key: GridKey) -> PoseGrid | None:
-        """Return a computed grid from memory or from the store.
-
-        Raises:
-            StoreUnavailableError: the grid is not in memory, and the database is unavailable.
-        """
+        """Return a computed grid from memory or from the store."""
         return self._cache.find(key)
 
     def find_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:

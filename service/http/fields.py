@@ -65,11 +65,7 @@ def describe_fault(fault: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
-    """Return the fields of a form as a model; empty fields count as left out.
-
-    Raises:
-        InvalidRequestError: names every faulty field, its value and the limit.
-    """
+    """Return the fields of a form as a model; empty fields count as left out."""
     try:
         return model.model_validate({name: value for name, value in fields.items() if value.strip()}, context=context)
     except ValidationError as error:

@@ -63,15 +63,7 @@ class IdempotentRequest:
     def run(self, parts: Parts, work: Callable[[str], Response]) -> Response:
         """Execute the request unless it was executed before; runs to the end even if the client leaves.
 
-        Args:
-            parts: content of the request.
-            work: makes the answer from a token of 32 hexadecimal digits, the same for every attempt.
-
-        Raises:
-            IdempotencyKeyReusedError: the key was used with other content.
-            IdempotencyInProgressError: another attempt is running.
-            StoreUnavailableError: the database is away.
-            LaLaLocError: raised by `work`.
+        `work` makes the answer from a token of 32 hexadecimal digits, the same for every attempt.
         """
         token = self._begin(parts)
         if isinstance(token, Response):

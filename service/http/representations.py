@@ -151,10 +151,7 @@ _RANGE = re.compile(r"bytes=[ \t]*([0-9]{0,18})-([0-9]{0,18})[ \t]*")
 class Tags:
     """List of entity tags, without quotes.
 
-    Attributes:
-        any: the list is `*`.
-        strong: strong tags.
-        all: strong and weak tags.
+    The list is `*` if `any`; `all` are strong and weak tags.
     """
 
     any: bool
@@ -168,12 +165,7 @@ def digest_etag(digest: str) -> str:
 
 
 def revision_etag(revision_id: str, *parts: object) -> str:
-    """Return the entity tag of a representation of a revision, which needs no content.
-
-    Args:
-        revision_id: id of the revision.
-        parts: everything else that the bytes depend on, besides the version of the service.
-    """
+    """Return the entity tag of a representation of a revision: `parts` are all else that its bytes depend on."""
     digest = hashlib.sha256(repr((__version__, *parts)).encode()).hexdigest()
     return f'"{revision_id}.{digest[:_DIGITS]}"'
 

@@ -169,9 +169,6 @@ async def read_parts(
         repeated: files that can be repeated.
         aliases: other names of files, and the names under which they are returned.
         substitutes: other kinds of files, and the names of the files that they can be sent instead of.
-
-    Raises:
-        UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
     """
     stated = request.headers.get("content-type", "")
     options = parse_options_header(stated)[1]
@@ -219,11 +216,7 @@ class _Body:
 
     @asynccontextmanager
     async def bounded(self) -> AsyncGenerator[None]:
-        """Bound the time of the block, which reads the body, and name the reason if its files do not fit on the disk.
-
-        Raises:
-            UploadTimeoutError, SpoolFullError: the time is over, or the disk full.
-        """
+        """Bound the time of the block, which reads the body, and name the reason if the disk is full."""
         try:
             async with asyncio.timeout(self._limits.deadline_s):
                 yield
@@ -275,9 +268,7 @@ class _Expected:
     Attributes:
         needed: names of required files.
         files: names of all files, those that can be sent instead of others included.
-        fields: names of optional fields.
-        repeated: files that can be repeated.
-        substitutes: other kinds of files, and the names of the files that they can be sent instead of.
+        repeated, substitutes: see `read_parts`.
     """
 
     needed: set[str]

@@ -112,11 +112,7 @@ class JobQueue:
         return self._closed
 
     def put(self, pending: PendingJob) -> None:
-        """Add a job.
-
-        Raises:
-            JobLostError: the job cannot be run in time.
-        """
+        """Add a job."""
         with self._changed:
             reason = self._refusal(pending)
             if reason is not None:

@@ -119,11 +119,8 @@ class WorkerPool(Generic[Job, Result]):
 
         `on_news` is called with what the worker tells meanwhile, see `PendingJob`.
 
-        Returns:
-            A future with the result or a `JobLostError`; it can be done later than the deadline.
-
-        Raises:
-            JobLostError: the job cannot be run in time.
+        The future has the result or a `JobLostError`, and can be done later than the deadline. A job that cannot be run
+        in time raises that error.
         """
         content = _Parts()
         pickle.Pickler(content, protocol=pickle.HIGHEST_PROTOCOL).dump(job)
@@ -132,11 +129,7 @@ class WorkerPool(Generic[Job, Result]):
         return pending.future
 
     async def run_job(self, job: Job, timeout_s: float, client: str = "") -> Result:
-        """Run a client's job and return its result; a job that is no longer awaited is not started.
-
-        Raises:
-            JobLostError: there is no result within `timeout_s`.
-        """
+        """Run a client's job and return its result or raise `JobLostError`; one that nobody awaits is not started."""
         deadline = monotonic() + timeout_s
         try:
             async with asyncio.timeout(timeout_s), self._cores.held(client) if self._cores else nullcontext():

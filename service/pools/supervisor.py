@@ -64,10 +64,7 @@ class Supervisor:
     """Keeper of one worker process; everything but `stop` runs on its own thread."""
 
     def __init__(self, spec: WorkerSpec, index: int, queue: JobQueue, on_restart: Callable[[str], None]) -> None:
-        """Create a supervisor, which `start` starts.
-
-        Closing the queue ends the thread after its current job.
-        """
+        """Create a supervisor, which `start` starts; closing the queue ends its thread after the current job."""
         self.ready = False
         self.warmed_up = False
         self.fault: str | None = None

@@ -77,11 +77,7 @@ class AccessControl:
         self._keys.close()
 
     async def authorise(self, request: Request) -> Caller:
-        """Return the caller of a request.
-
-        Raises:
-            HTTPException: unknown route or method.
-        """
+        """Return the caller of a request."""
         if not self._needs_keys:
             self._check_local(request, request.method)
             if Permission.ADMIN in permissions_needed(routed_path(request.scope)).values():

@@ -108,10 +108,6 @@ class KeyCache:
         """Return the key; None if it is unknown or revoked.
 
         The look-up uses the hash of the secret only, so its duration does not reveal whether an id exists.
-
-        Raises:
-            StoreUnavailableError: the database is away, and the key is not cached.
-            StoreBusyError: all database connections are in use.
         """
         cached = self._known.get(presented.hash)
         if cached is not None and self._clock() < cached.refresh_s:

@@ -83,12 +83,7 @@ class TokenVerifier:
         self._fetching: asyncio.Task[None] | None = None
 
     async def verify(self, token: str) -> Identity:
-        """Return the holder of a token.
-
-        Raises:
-            UnauthenticatedError: the token is not valid, or has no tenant.
-            IssuerUnavailableError: the issuer's keys are not known.
-        """
+        """Return the holder of a token."""
         try:
             decoded = await self._decoded(token)
             self._check(decoded)
@@ -199,12 +194,7 @@ class TokenVerifier:
 
 
 async def fetch_keys(issuer: str) -> KeySet:
-    """Return the keys that an issuer publishes for signatures (OpenID Connect Discovery 1.0, RFC 8414).
-
-    Raises:
-        httpx.HTTPError, OSError: the issuer cannot be reached.
-        ValueError: its answer is not valid, or too large or too slow.
-    """
+    """Return the keys that an issuer publishes for signatures (OpenID Connect Discovery 1.0, RFC 8414)."""
     # Reads the certificates of authorities.
     tls = await asyncio.to_thread(httpx.create_ssl_context)
     # Without compression, so that the bytes on the wire bound those in memory.

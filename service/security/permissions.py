@@ -37,61 +37,55 @@ OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 PAGES = frozenset({"/", "/pin", "/docs", "/web/{name}", "/favicon.ico"})
 
 # Scopes of all other routes. With keys on, a route without a row does not exist.
-NEEDED: Mapping[tuple[str, str], Permission] = {
-    ("GET", "/openapi.json"): Permission.READ,
-    ("GET", "/metrics"): Permission.METRICS,
-    ("GET", "/limits"): Permission.READ,
-    ("GET", "/usage"): Permission.READ,
-    ("GET", "/floorplans"): Permission.READ,
-    ("POST", "/floorplans"): Permission.WRITE,
-    ("GET", "/floorplans/{floorplan_id}"): Permission.READ,
-    ("PUT", "/floorplans/{floorplan_id}"): Permission.WRITE,
-    ("DELETE", "/floorplans/{floorplan_id}"): Permission.WRITE,
-    ("GET", "/floorplans/{floorplan_id}/events"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/layout"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/original"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/export"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/preview.svg"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/mesh.glb"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/localisability"): Permission.READ,
-    ("GET", "/floorplans/{floorplan_id}/localisability.svg"): Permission.READ,
-    ("GET", "/venues"): Permission.READ,
-    ("POST", "/venues"): Permission.WRITE,
-    ("GET", "/venues/{venue_id}"): Permission.READ,
-    ("PUT", "/venues/{venue_id}"): Permission.WRITE,
-    ("PATCH", "/venues/{venue_id}"): Permission.WRITE,
-    ("DELETE", "/venues/{venue_id}"): Permission.WRITE,
-    ("GET", "/venues/{venue_id}/plans"): Permission.READ,
-    ("GET", "/answers/{answer_id}"): Permission.READ,
-    ("DELETE", "/answers/{answer_id}"): Permission.LOCALISE,
-    ("GET", "/model/{file}"): Permission.LOCALISE,
-    ("POST", "/localise"): Permission.LOCALISE,
-    ("POST", "/localise/batch"): Permission.LOCALISE,
-    ("POST", "/localise/sequence"): Permission.LOCALISE,
-    ("POST", "/sessions"): Permission.LOCALISE,
-    ("GET", "/sessions/{session_id}"): Permission.LOCALISE,
-    ("DELETE", "/sessions/{session_id}"): Permission.LOCALISE,
-    ("POST", "/sessions/{session_id}/photographs"): Permission.LOCALISE,
-    ("GET", "/albums"): Permission.LOCALISE,
-    ("POST", "/albums"): Permission.LOCALISE,
-    ("GET", "/albums/{album_id}"): Permission.LOCALISE,
-    ("DELETE", "/albums/{album_id}"): Permission.LOCALISE,
-    ("GET", "/albums/{album_id}/events"): Permission.LOCALISE,
-    ("GET", "/albums/{album_id}/photographs"): Permission.LOCALISE,
-    ("POST", "/albums/{album_id}/photographs"): Permission.LOCALISE,
-    ("GET", "/albums/{album_id}/photographs/{photograph_id}"): Permission.LOCALISE,
-    ("PATCH", "/albums/{album_id}/photographs/{photograph_id}"): Permission.LOCALISE,
-    ("DELETE", "/albums/{album_id}/photographs/{photograph_id}"): Permission.LOCALISE,
-    ("GET", "/admin/keys"): Permission.ADMIN,
-    ("POST", "/admin/keys"): Permission.ADMIN,
-    ("GET", "/admin/keys/{key_id}"): Permission.ADMIN,
-    ("DELETE", "/admin/keys/{key_id}"): Permission.ADMIN,
-    ("POST", "/admin/keys/{key_id}/rotation"): Permission.ADMIN,
-    ("GET", "/admin/tenants"): Permission.ADMIN,
-    ("PATCH", "/admin/tenants/{tenant}"): Permission.ADMIN,
-    ("GET", "/admin/audit"): Permission.ADMIN,
+_SCOPES: Mapping[str, Mapping[str, Permission]] = {
+    "/openapi.json": {"GET": Permission.READ},
+    "/metrics": {"GET": Permission.METRICS},
+    "/limits": {"GET": Permission.READ},
+    "/usage": {"GET": Permission.READ},
+    "/floorplans": {"GET": Permission.READ, "POST": Permission.WRITE},
+    "/floorplans/{floorplan_id}": {"GET": Permission.READ, "PUT": Permission.WRITE, "DELETE": Permission.WRITE},
+    "/floorplans/{floorplan_id}/events": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/layout": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/original": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/export": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/preview.svg": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/mesh.glb": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/localisability": {"GET": Permission.READ},
+    "/floorplans/{floorplan_id}/localisability.svg": {"GET": Permission.READ},
+    "/venues": {"GET": Permission.READ, "POST": Permission.WRITE},
+    "/venues/{venue_id}": {
+        "GET": Permission.READ,
+        "PUT": Permission.WRITE,
+        "PATCH": Permission.WRITE,
+        "DELETE": Permission.WRITE,
+    },
+    "/venues/{venue_id}/plans": {"GET": Permission.READ},
+    "/answers/{answer_id}": {"GET": Permission.READ, "DELETE": Permission.LOCALISE},
+    "/model/{file}": {"GET": Permission.LOCALISE},
+    "/localise": {"POST": Permission.LOCALISE},
+    "/localise/batch": {"POST": Permission.LOCALISE},
+    "/localise/sequence": {"POST": Permission.LOCALISE},
+    "/sessions": {"POST": Permission.LOCALISE},
+    "/sessions/{session_id}": {"GET": Permission.LOCALISE, "DELETE": Permission.LOCALISE},
+    "/sessions/{session_id}/photographs": {"POST": Permission.LOCALISE},
+    "/albums": {"GET": Permission.LOCALISE, "POST": Permission.LOCALISE},
+    "/albums/{album_id}": {"GET": Permission.LOCALISE, "DELETE": Permission.LOCALISE},
+    "/albums/{album_id}/events": {"GET": Permission.LOCALISE},
+    "/albums/{album_id}/photographs": {"GET": Permission.LOCALISE, "POST": Permission.LOCALISE},
+    "/albums/{album_id}/photographs/{photograph_id}": {
+        "GET": Permission.LOCALISE,
+        "PATCH": Permission.LOCALISE,
+        "DELETE": Permission.LOCALISE,
+    },
+    "/admin/keys": {"GET": Permission.ADMIN, "POST": Permission.ADMIN},
+    "/admin/keys/{key_id}": {"GET": Permission.ADMIN, "DELETE": Permission.ADMIN},
+    "/admin/keys/{key_id}/rotation": {"POST": Permission.ADMIN},
+    "/admin/tenants": {"GET": Permission.ADMIN},
+    "/admin/tenants/{tenant}": {"PATCH": Permission.ADMIN},
+    "/admin/audit": {"GET": Permission.ADMIN},
 }
-_PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}
+NEEDED = {(method, path): needed for path, methods in _SCOPES.items() for method, needed in methods.items()}
+_PATTERNS = {path: compile_path(path)[0] for path in _SCOPES}
 _PAGE_PATTERNS = [compile_path(path)[0] for path in PAGES]
 
 
@@ -101,8 +95,6 @@ class Identity:
 
     Attributes:
         id: id of the key, or `oidc:` and the subject of the token.
-        tenant: tenant of the holder.
-        permissions: scopes.
         rate_per_minute: limit of requests per minute; 0 for none, None for the limit in the settings.
     """
 
@@ -125,7 +117,6 @@ class Caller:
     Attributes:
         tenant: tenant whose plans are visible.
         identity: holder of the key or token; None while keys are off.
-        permissions: scopes of the key or token.
         client: unit of fair sharing: the tenant, or without keys the client address.
     """
 
@@ -150,12 +141,11 @@ def template_of(path: str) -> str | None:
     return next((template for template, pattern in _PATTERNS.items() if pattern.match(plain)), None)
 
 
-def permissions_needed(path: str) -> dict[str, Permission]:
+def permissions_needed(path: str) -> Mapping[str, Permission]:
     """Return the methods of a path with their scopes; empty for an unknown path."""
     if is_page(path):
         return {"GET": Permission.READ}
-    template = template_of(path)
-    return {method: needed for (method, row), needed in NEEDED.items() if row == template}
+    return _SCOPES.get(template_of(path) or "", {})
 
 
 def is_page(path: str) -> bool:

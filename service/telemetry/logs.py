@@ -74,14 +74,11 @@ class RequestLogFields:
     Attributes:
         request_id: id in answers and log lines.
         trace: this service's span of the caller's trace.
-        plan: id of the floor plan.
-        venue: id of the venue.
         revision: id of the revision of the plan, or of the venue where there is no plan.
         stage: last stage of the query.
         clock: durations of the stages, also of a request that failed.
         rejection: slug of the problem that the request was refused with.
         key: id of the API key, or subject of the token; never the key itself.
-        tenant: tenant of the key or token.
         bytes_in: received bytes of the body.
         gave_up: the client disconnected before the end of the answer.
     """

@@ -47,7 +47,6 @@ class Telemetry:
     creates, and never from client input.
 
     Attributes:
-        registry: the registry.
         tracing: exporter of spans; None without an endpoint.
         cpu_accounts: CPU time of each client.
     """

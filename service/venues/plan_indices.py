@@ -84,10 +84,7 @@ class PlanIndices:
         file_bytes: int,
         limit_bytes: int,
     ) -> None:
-        """Create the cache; the file is opened on first use.
-
-        Without a path, the file is a temporary one.
-        """
+        """Create the cache; the file, without a path a temporary one, is opened on first use."""
         self._store = store
         self._grids = grids
         self._reads = reads
@@ -108,13 +105,8 @@ class PlanIndices:
     ) -> tuple[PlanList, DividedIndex]:
         """Return the index of plans that are ready, and their rows in its order, without plans whose grid was deleted.
 
-        Prototypes that are missing, or of an earlier format, are made and stored.
-
-        Args:
-            tenant: their owner.
-            ready: rows of the plans.
-            compute: runs CPU work.
-            venue_id: id of the venue, if these are all of its plans that are ready.
+        Prototypes that are missing, or of an earlier format, are made and stored. `venue_id` is given if these are all
+        plans of the venue that are ready.
         """
         digest = ready.digest
         indexed = self._indices.get(digest)

@@ -54,9 +54,6 @@ class PrototypeFile:
             path: path of the file; a temporary file is used for None, or if another process has it open.
             cells_version: version of the cells; blocks of other versions are ignored.
             limit_bytes: maximum size of the file.
-
-        Raises:
-            OSError: the file cannot be read or written.
         """
         self._cells_version = cells_version
         self._limit = limit_bytes // ROW.itemsize

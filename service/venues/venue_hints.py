@@ -32,8 +32,7 @@ class VenueHints:
 
     Attributes:
         anchor: anchor of the venue.
-        place: place that the camera is near; None without that hint.
-        radius_m: radius (m) around `place`.
+        place: place that the camera is near, within `radius_m`; None without that hint.
         rooms: ids or names of rooms.
         level: level of the camera; None without that hint.
         strict: plans and places that contradict the hints are excluded.
@@ -59,11 +58,7 @@ class VenueHints:
         )
 
     def check(self, members: _Rows) -> None:
-        """Check the hints against all plans of the venue, ready or not.
-
-        Raises:
-            InvalidHintError: no plan is on the level, or none is known to be near the place.
-        """
+        """Check the hints against all plans of the venue, ready or not."""
         if self.level is not None and self.level not in (levels := sorted({row.level for row in members})):
             listed = ", ".join(f"{level:g}" for level in levels[:_MAX_LEVELS_LISTED])
             more = f" and {len(levels) - _MAX_LEVELS_LISTED} more" if len(levels) > _MAX_LEVELS_LISTED else ""
@@ -120,12 +115,7 @@ class VenueHints:
     ) -> Hints:
         """Return the hints about plans that are merged side by side.
 
-        Args:
-            rows: rows of the plans.
-            plans: the plans.
-            merged: the plans side by side.
-            shares: see `shares`.
-            partly: other plans, which may have the rooms, are not searched.
+        With `partly`, other plans, which may have the rooms, are not searched.
         """
         counts, first = [len(plan.rooms) for plan in plans], merged.first_room
         level = None

@@ -70,10 +70,7 @@ class VenuePlans:
         max_poses: int,
         idle_cores: IdleCores | None = None,
     ) -> None:
-        """Create the reader.
-
-        `limit_bytes` limits the memory of the rows, `max_poses` the poses of the chosen plans.
-        """
+        """Limit the memory of the rows to `limit_bytes`, and the poses of the chosen plans to `max_poses`."""
         self._store = store
         self._grids = grids
         self._reads = reads

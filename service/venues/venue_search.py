@@ -42,8 +42,6 @@ class LoadedPlans:
 
     Attributes:
         rows: rows of the searched plans, see `Venues.searchable_plans`.
-        records: the searched plans.
-        grids: their pose grids.
         log_mass: (p,) log masses of all plans that are ready; None if all of them are searched.
         area_share: share of their floor area that the searched plans have.
         numbers: numbers of the searched plans among the plans that are ready.
@@ -115,12 +113,6 @@ class VenueSearch:
 
         Each of the queries chooses plans; `favour` returns log factors by which plans are preferred in the choice
         alone.
-
-        Raises:
-            InvalidHintError: strict hints exclude every plan.
-            InvalidPoseError: the camera height is above all ceilings.
-            VenueNotReadyError: all plans were deleted meanwhile.
-            DeadlineExceededError: the deadline passed.
         """
         query = max(queries, key=lambda encoded: len(encoded.roll))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]

@@ -122,7 +122,7 @@ def test_both_keys_are_valid_during_the_overlap(admin: httpx.Client, database_of
     assert lifetime_s(after) == 1000
     assert lifetime_s(old) < 1000
     opened = Store(database_of(tmp_path))
-    with opened._database.writing() as connection:
+    with opened.database.writing() as connection:
         past = datetime.now(UTC) - timedelta(seconds=1)
         connection.execute(update(API_KEYS).where(API_KEYS.c.id == old["id"]).values(expires_at=past))
     opened.close()
@@ -426,7 +426,7 @@ def test_entries_wait_for_the_database(store: Store, monkeypatch: pytest.MonkeyP
     waiting = Store(store.database._engine.url.render_as_string(hide_password=False), connections=1, wait_s=0.05)
     trail = AuditTrail(waiting.audit_log)
     # The only connection is in use.
-    with waiting._database.reading():
+    with waiting.database.reading():
         for number in range(5):
             asyncio.run(trail.record(_entry(resource=str(number))))
         trail.count(replace(_entry("counted"), status=403))

@@ -201,7 +201,7 @@ def test_read_during_deletion_is_complete(open_store: OpenStore, half_way: str) 
         if arguments[2].startswith(half_way):
             first.plans.delete("default", "p")
 
-    event.listen(second._database._engine, "before_cursor_execute", delete_elsewhere)
+    event.listen(second.database._engine, "before_cursor_execute", delete_elsewhere)
     if "chunks" in half_way:
         assert second.originals.checked(added.revision_id) == OriginalFile("application/json", len(original))
         assert second.originals.checked(added.revision_id) is None
@@ -421,7 +421,7 @@ def test_abandoned_request_can_be_claimed_again(store: Store) -> None:
 
 def test_expired_claim_is_taken_over_with_its_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
-    dead = IdempotencyKeys(stores[0]._database, stores[0].quota, lease_s=0.2).begin("t", "r", "k", "body")
+    dead = IdempotencyKeys(stores[0].database, stores[0].quota, lease_s=0.2).begin("t", "r", "k", "body")
     assert isinstance(dead, Claimed)
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
