@@ -24,8 +24,7 @@ class AlbumPart:
     Attributes:
         facts: size, time and camera, as JSON.
         entry: its features.
-        correction: its correction as JSON; None without one.
-        pin: its pin before, as JSON; None before the first solution.
+        correction, pin: as JSON; None without.
     """
 
     id: str
@@ -42,8 +41,6 @@ class AlbumJob:
     """Album under the lease of an owner.
 
     Attributes:
-        album: the album.
-        photographs: its photographs, by number.
         place_change: number of the tenant's last change of a plan.
         attempts: number of claims since it was last solved or changed, this one included.
     """

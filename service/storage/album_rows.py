@@ -44,7 +44,6 @@ class AlbumRecord(NewAlbum):
     Attributes:
         revision_id: id of its revision, which changes with the photographs and their corrections.
         number: number of the revision, from 1.
-        photographs: number of photographs.
         solved_number: number of the revision that was solved last; 0 before.
         place_revision_id: revision of the plan or venue that it was solved in; None before.
         place_change: number of the tenant's last change of a plan when it was solved.
@@ -91,7 +90,6 @@ class NewPhotograph:
     """Photograph that is added to an album.
 
     Attributes:
-        sha256: digest of the uploaded file.
         name: name of the file; None if the client sent none.
         facts: size, time and camera, as JSON.
         entry: features, as `lalaloc_core.localise.album` writes them.

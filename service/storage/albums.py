@@ -28,7 +28,7 @@ from service.storage.album_rows import (
 )
 from service.storage.database import Database
 from service.storage.records import Cursor
-from service.storage.statements import lock_place, newest_first
+from service.storage.statements import count_rows, lock_place, newest_first
 from service.storage.stored_bytes import StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS
 
@@ -72,7 +72,7 @@ class Albums:
             connection.execute(ALBUMS.insert().values(values))
             # Counted after it: `settle` locks the tenant, so that the number is exact.
             self._quota.settle(connection, tenant, StoredBytes(albums=size - freed))
-            if (connection.scalar(select(func.count()).select_from(ALBUMS).where(own)) or 0) > limit:
+            if count_rows(connection, ALBUMS, own) > limit:
                 raise TooManyAlbumsError(limit)
             return find_album(connection, tenant, album_id, now)
 

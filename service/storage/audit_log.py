@@ -8,7 +8,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, and_, delete, or_, select
+from sqlalchemy import ColumnElement, Row, Select, and_, delete, or_, select
 
 from service.storage.database import Database
 from service.storage.records import ANONYMOUS, AuditEntry, Cursor, StoredAuditEntry
@@ -85,18 +85,14 @@ class AuditLog:
         return None if last is None else and_(kind, _COLUMNS.created_at <= last)
 
     def _delete(self, condition: ColumnElement[bool] | None) -> int:
-        count = 0
-        while condition is not None:
-            batch = select(_COLUMNS.id).where(condition).limit(_BATCH_SIZE)
-            statement = delete(AUDIT_LOG).where(_COLUMNS.id.in_(batch))
-
-            def work(connection: Connection, statement: Any = statement) -> int:
-                return connection.execute(statement).rowcount
-
-            deleted = self._database.freeing(work)
+        if condition is None:
+            return 0
+        batch = select(_COLUMNS.id).where(condition).limit(_BATCH_SIZE)
+        statement = delete(AUDIT_LOG).where(_COLUMNS.id.in_(batch))
+        count, deleted = 0, _BATCH_SIZE
+        while deleted == _BATCH_SIZE:
+            deleted = self._database.freeing(lambda connection: connection.execute(statement).rowcount)
             count += deleted
-            if deleted < _BATCH_SIZE:
-                break
         return count
 
 

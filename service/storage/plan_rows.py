@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, select
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.query import DEFAULT_STD_M
@@ -85,11 +85,6 @@ def new_record(new: NewPlan, plan_id: str, tenant: str, now: datetime) -> PlanRe
         failure=None,
         report=new.original.report,
     )
-
-
-def count_plans(connection: Connection, tenant: str) -> int:
-    """Return the number of a tenant's plans."""
-    return connection.scalar(select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)) or 0
 
 
 def insert_plan(connection: Connection, database: Database, record: PlanRecord, content: PlanContent) -> bool:

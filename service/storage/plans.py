@@ -15,17 +15,16 @@ from service.errors import RevisionMismatchError, TooManyFloorPlansError, Unknow
 from service.plan_documents import PlanDocument, StoredPlan
 from service.storage.album_rows import delete_albums
 from service.storage.database import Database
-from service.storage.plan_rows import (
-    PlanCache,
-    PlanContent,
-    count_plans,
-    insert_plan,
-    insert_revisions,
-    new_record,
-    revision_values,
-)
+from service.storage.plan_rows import PlanCache, PlanContent, insert_plan, insert_revisions, new_record, revision_values
 from service.storage.records import Cursor, NewPlan, PlanRecord, PlanSummary
-from service.storage.statements import damaged, lock_plan_of, newest_first, select_revisions, select_summaries
+from service.storage.statements import (
+    count_rows,
+    damaged,
+    lock_plan_of,
+    newest_first,
+    select_revisions,
+    select_summaries,
+)
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import ALBUMS, FLOORPLANS, KEPT_ANSWERS, LATENT_GRIDS, REVISIONS, SESSIONS
 from service.storage.venue_rows import remove_from_venues
@@ -74,13 +73,13 @@ class Plans:
         with self._database.writing(grows_by=content.stored.total) as connection:
             stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
-                if count_plans(connection, tenant) >= limit:
+                if count_rows(connection, FLOORPLANS, FLOORPLANS.c.tenant == tenant) >= limit:
                     raise TooManyFloorPlansError(limit)
                 self._quota.check(connection, tenant, content.stored.total + new.later_bytes)
                 if insert_plan(connection, self._database, record, content):
                     self._quota.settle(connection, tenant, content.stored)
                     # Exact now, because settling locks the tenant.
-                    if count_plans(connection, tenant) > limit:
+                    if count_rows(connection, FLOORPLANS, FLOORPLANS.c.tenant == tenant) > limit:
                         raise TooManyFloorPlansError(limit)
                 else:
                     # Another attempt of the same upload was faster.

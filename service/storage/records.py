@@ -291,9 +291,7 @@ class StoredAnswer:
 class Claimed:
     """The caller carries out the request.
 
-    Attributes:
-        token: 32 hexadecimal digits, the same for every attempt of the request, so that an object that is stored under
-            this id is stored once.
+    The token has 32 hexadecimal digits, the same for every attempt: an object with this id is stored once.
     """
 
     token: str

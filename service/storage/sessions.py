@@ -10,7 +10,7 @@ import uuid
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from sqlalchemy import Connection, Row, and_, delete, func, select, update
+from sqlalchemy import Connection, Row, and_, delete, select, update
 
 from service.errors import (
     PhotographOutOfOrderError,
@@ -21,7 +21,7 @@ from service.errors import (
 )
 from service.storage.database import Database
 from service.storage.records import PlanRecord, VenueRecord
-from service.storage.statements import lock_place
+from service.storage.statements import count_rows, lock_place
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import SESSIONS
 
@@ -37,8 +37,7 @@ class SessionRecord:
         revision_id: revision of the plan or venue when it began.
         options: the request that began it, as JSON.
         photographs: number of photographs so far.
-        state: state of the filter; None before the first photograph.
-        pose: pose of the last photograph as JSON; None before the first.
+        state, pose: state of the filter, and last pose as JSON; None before the first photograph.
         claim: token of the claim, for `finish` and `release`; without one, token of the request that was answered last.
     """
 
@@ -90,7 +89,7 @@ class Sessions:
             if row is not None:
                 return _record(row)
             freed = deleted_bytes(connection, delete(SESSIONS).where(own, _COLUMNS.expires_at < now))
-            if (connection.scalar(select(func.count()).select_from(SESSIONS).where(own)) or 0) >= limit:
+            if count_rows(connection, SESSIONS, own) >= limit:
                 raise TooManySessionsError(limit)
             row = connection.execute(SESSIONS.insert().values(values).returning(SESSIONS)).one()
             self._quota.settle(connection, tenant, StoredBytes(sessions=size - freed))

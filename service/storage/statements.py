@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, and_, or_, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_, select
 
 from service.errors import DamagedDataError, UnknownFloorPlanError, UnknownVenueError
 from service.storage.records import Cursor
@@ -35,16 +35,20 @@ def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None
     return query.order_by(age.desc(), own_id.desc()).limit(limit)
 
 
+def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[bool]) -> int:
+    """Return the number of rows; exact for those of a tenant after `StorageQuota.settle`, which locks the tenant."""
+    return connection.scalar(select(func.count()).select_from(table).where(*conditions)) or 0
+
+
 def write_chunks(connection: Connection, table: Table, values: Iterable[tuple[dict[str, Any], memoryview]]) -> None:
     """Write values, each with name and value of the column that identifies it."""
-    rows = (row for owner, content in values for row in _chunk_rows(owner, content))
+    rows = (
+        {**owner, "number": number, "content": bytes(content[first : first + CHUNK_BYTES])}
+        for owner, content in values
+        for number, first in enumerate(range(0, len(content), CHUNK_BYTES))
+    )
     while part := list(islice(rows, _CHUNKS_TOGETHER)):
         connection.execute(table.insert(), part)
-
-
-def _chunk_rows(owner: dict[str, Any], content: memoryview) -> Iterator[dict[str, Any]]:
-    for number, first in enumerate(range(0, len(content), CHUNK_BYTES)):
-        yield {**owner, "number": number, "content": bytes(content[first : first + CHUNK_BYTES])}
 
 
 def read_chunks(connection: Connection, table: Table, owner: dict[str, Any]) -> Iterator[bytes]:

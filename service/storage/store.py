@@ -190,13 +190,7 @@ class PlanLookup:
         self._breaker = CircuitBreaker()
 
     async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
-        """Return a plan at its current revision, or at the last known one while the database is unavailable.
-
-        Raises:
-            StoreUnavailableError: the database is unavailable, and the plan was not read recently; or too many reads
-                wait already.
-            StoreBusyError: all connections are in use.
-        """
+        """Return a plan at its current revision, or at one read recently while the database is unavailable."""
         if self._breaker.is_open and (known := self._recent(tenant, plan_id)) is not None:
             return known
         begin_s = monotonic()

@@ -162,7 +162,6 @@ VENUES = Table(
     Column("id", String(32), primary_key=True),
     Column("tenant", String(64), nullable=False),
     Column("name", Text, nullable=False),
-    # As in `floorplans`.
     Column("folded_name", Text, nullable=False),
     Column("revision_id", String(32), nullable=False),
     Column("number", Integer, nullable=False),
@@ -182,7 +181,6 @@ VENUE_PLANS = Table(
     Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE"), primary_key=True),
     Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), primary_key=True),
     Column("level", Double, nullable=False),
-    # NULL for the plan's own name.
     Column("name", Text),
     Index("venue_plans_by_plan", "plan_id"),
     Index("venue_plans_by_level", "venue_id", "level", "plan_id"),
@@ -220,11 +218,9 @@ API_KEYS = Table(
     Column("created_at", UtcDateTime, nullable=False),
     Column("revoked_at", UtcDateTime),
     Column("last_used_at", UtcDateTime),
-    # NULL for a key without an end.
     Column("expires_at", UtcDateTime),
     # Lifetime that a successor inherits; rotation shortens `expires_at`.
     Column("lifetime_s", Double),
-    # Id of the key that this one replaces.
     Column("replaces", String(32)),
     Index("api_keys_by_age", "created_at", "id"),
 )
@@ -299,14 +295,12 @@ ALBUMS = Table(
     Column("id", String(32), primary_key=True),
     Column("tenant", String(64), nullable=False),
     Column("name", Text, nullable=False),
-    # As in `floorplans`.
     Column("folded_name", Text, nullable=False),
     # Either a plan or a venue.
     Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
     Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
     # The request that created the album, as JSON.
     Column("options", Text, nullable=False),
-    # The model that encoded its photographs.
     Column("model_sha256", String(64), nullable=False),
     # Revision, which changes with the photographs and their corrections.
     Column("revision_id", String(32), nullable=False),
@@ -344,7 +338,6 @@ ALBUM_PHOTOGRAPHS = Table(
     Column("album_id", String(32), ForeignKey("albums.id", ondelete="CASCADE"), nullable=False),
     # Position in the album, in the order of uploads.
     Column("number", Integer, nullable=False),
-    # Digest of the picture's file, or of its features.
     Column("sha256", String(64), nullable=False),
     # Revision, which changes with the correction.
     Column("revision_id", String(32), nullable=False),
@@ -354,7 +347,6 @@ ALBUM_PHOTOGRAPHS = Table(
     Column("facts", Text, nullable=False),
     # Features; pictures are not stored.
     Column("entry", LargeBinary, nullable=False),
-    # JSON.
     Column("correction", Text),
     Column("pin", Text),
     _stored_bytes(),

@@ -11,8 +11,9 @@ from sqlalchemy import Connection, select
 
 from service.errors import TooManyFloorPlansError, UnknownVenueError
 from service.storage.database import Database
-from service.storage.plan_rows import PlanCache, PlanContent, count_plans, insert_plans, new_record
+from service.storage.plan_rows import PlanCache, PlanContent, insert_plans, new_record
 from service.storage.records import NewPlan, PlanRecord, VenueMember, VenueRecord
+from service.storage.statements import count_rows
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes
 from service.storage.tables import FLOORPLANS
 from service.storage.venue_rows import (
@@ -103,14 +104,14 @@ class VenueImports:
         return stored, self._cached(batch.records if is_new else [])
 
     def _check(self, connection: Connection, batch: _Batch, size: StoredBytes, max_plans: int) -> None:
-        if count_plans(connection, batch.tenant) + len(batch.records) > max_plans:
+        if count_rows(connection, FLOORPLANS, FLOORPLANS.c.tenant == batch.tenant) + len(batch.records) > max_plans:
             raise TooManyFloorPlansError(max_plans)
         self._quota.check(connection, batch.tenant, size.total + batch.later_bytes)
 
     def _settle(self, connection: Connection, tenant: str, size: StoredBytes, max_plans: int) -> None:
         self._quota.settle(connection, tenant, size)
         # Exact now, because settling locks the tenant.
-        if count_plans(connection, tenant) > max_plans:
+        if count_rows(connection, FLOORPLANS, FLOORPLANS.c.tenant == tenant) > max_plans:
             raise TooManyFloorPlansError(max_plans)
 
     def _cached(self, records: list[PlanRecord]) -> list[PlanRecord]:

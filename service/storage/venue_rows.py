@@ -14,6 +14,7 @@ from lalaloc_core.floorplan.earth import Anchor
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.records import VenueMember, VenueRecord
+from service.storage.statements import count_rows
 from service.storage.tables import VENUE_PLANS, VENUES
 
 
@@ -44,9 +45,8 @@ def insert_members(connection: Connection, venue_id: str, members: Sequence[Venu
 
 
 def check_count(connection: Connection, tenant: str, limit: int) -> None:
-    """Check the number of a tenant's venues; exact after `StorageQuota.settle`, which locks the tenant."""
-    own = select(func.count()).select_from(VENUES).where(VENUES.c.tenant == tenant)
-    if (connection.scalar(own) or 0) > limit:
+    """Check the number of a tenant's venues, after `StorageQuota.settle`."""
+    if count_rows(connection, VENUES, VENUES.c.tenant == tenant) > limit:
         raise TooManyVenuesError(limit)
 
 
@@ -114,15 +114,9 @@ def lock_venue(connection: Connection, tenant: str, venue_id: str, expected: str
     return row
 
 
-def count_members(connection: Connection, venue_id: str) -> int:
-    """Return the number of a venue's plans."""
-    own = VENUE_PLANS.c.venue_id == venue_id
-    return connection.scalar(select(func.count()).select_from(VENUE_PLANS).where(own)) or 0
-
-
 def check_members(connection: Connection, venue_id: str, limit: int) -> int:
     """Check the number of a venue's plans after a change, and return it."""
-    count = count_members(connection, venue_id)
+    count = count_rows(connection, VENUE_PLANS, VENUE_PLANS.c.venue_id == venue_id)
     if count > limit:
         fault = f"the venue would have {count} plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)"
         raise InvalidRequestError([("plans", fault)])

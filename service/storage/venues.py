@@ -19,13 +19,12 @@ from service.errors import InvalidRequestError, UnknownVenueError
 from service.storage.album_rows import delete_albums
 from service.storage.database import Database
 from service.storage.records import Cursor, VenueCounts, VenueMember, VenuePlace, VenueRecord, VenueState
-from service.storage.statements import is_own_grid, newest_first
+from service.storage.statements import count_rows, is_own_grid, newest_first
 from service.storage.stored_bytes import ROW_BYTES, StorageQuota, StoredBytes, deleted_bytes
 from service.storage.tables import ALBUMS, FLOORPLANS, LATENT_GRIDS, REVISIONS, SESSIONS, TENANTS, VENUE_PLANS, VENUES
 from service.storage.venue_rows import (
     check_count,
     check_members,
-    count_members,
     find_venue,
     insert_members,
     insert_venue,
@@ -106,26 +105,17 @@ class Venues:
         max_plans: int,
         expected: str | None = None,
     ) -> VenueRecord:
-        """Store a new revision of a venue.
+        """Store a new revision of a venue, which must have the revision `expected` before, if there is one.
 
-        Args:
-            tenant: owner of the venue.
-            venue_id: id of the venue.
-            name: new name; None keeps the old one.
-            anchor: new anchor; None keeps the old one.
-            drop_anchor: remove the anchor.
-            members: plans that are added, or change level or name.
-            removed: ids of plans that are removed.
-            replace_members: `members` replace all plans.
-            max_plans: maximum number of plans.
-            expected: id of the revision that the venue must have; None for any.
+        A name or anchor of None keeps the old one, unless the anchor is dropped. `members` are added, change level or
+        name, or replace all plans.
         """
         now = datetime.now(UTC)
         with self._database.writing(grows_by=ROW_BYTES * len(members)) as connection:
             # Plans are locked before venues, as in the deletion of a plan, to avoid a deadlock.
             _check_plans(connection, tenant, [member.plan_id for member in members])
             row = lock_venue(connection, tenant, venue_id, expected)
-            before = count_members(connection, venue_id)
+            before = count_rows(connection, VENUE_PLANS, VENUE_PLANS.c.venue_id == venue_id)
             if replace_members:
                 connection.execute(delete(VENUE_PLANS).where(VENUE_PLANS.c.venue_id == venue_id))
             _remove(connection, venue_id, removed)
@@ -239,7 +229,7 @@ class Venues:
                 lock_venue(connection, tenant, venue_id, expected)
             except UnknownVenueError:
                 return False
-            rows = 1 + count_members(connection, venue_id)
+            rows = 1 + count_rows(connection, VENUE_PLANS, VENUE_PLANS.c.venue_id == venue_id)
             sessions = deleted_bytes(connection, delete(SESSIONS).where(SESSIONS.c.venue_id == venue_id))
             albums = delete_albums(connection, ALBUMS.c.venue_id == venue_id)
             connection.execute(delete(VENUES).where(VENUES.c.id == venue_id))
