@@ -66,7 +66,7 @@ class Decoder:
                 keep_spare=True,
                 accounts=telemetry.cpu_accounts,
                 cores=cores,
-                on_restart=lambda _reason: telemetry.note_restart(name),
+                on_restart=lambda _reason: telemetry.pool_restarts.labels(name).inc(),
             )
 
         self._pool = pool("decode", settings.decode.stall_s, settings.decode.workers, _QUEUE)

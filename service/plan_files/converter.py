@@ -177,7 +177,7 @@ class Converter:
             queue_limit=_QUEUE,
             keep_spare=name == "import",
             accounts=self._telemetry.cpu_accounts,
-            on_restart=lambda _reason: self._telemetry.note_restart(name),
+            on_restart=lambda _reason: self._telemetry.pool_restarts.labels(name).inc(),
         )
         pool.start()
         return pool

@@ -41,7 +41,7 @@ class LpoPool:
             queue_limit=settings.lpo.queue,
             accounts=telemetry.cpu_accounts,
             cores=cores,
-            on_restart=lambda _reason: telemetry.note_restart("lpo"),
+            on_restart=lambda _reason: telemetry.pool_restarts.labels("lpo").inc(),
         )
         # Counters exist with value 0 from the start, so that the first miss shows as a rise.
         for reason in get_args(LostReason):

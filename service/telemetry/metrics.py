@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from time import perf_counter
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
@@ -17,25 +18,19 @@ _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5
 _GRID_SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
 
 
+@dataclass(frozen=True, eq=False)
 class _PerTenant(Collector):
     """Metric with a value per tenant."""
 
-    def __init__(
-        self,
-        family: type[CounterMetricFamily | GaugeMetricFamily],
-        name: str,
-        meaning: str,
-        read: Callable[[], Mapping[str, float]],
-    ) -> None:
-        self._family = family
-        self._name = name
-        self._meaning = meaning
-        self._read = read
+    family: type[CounterMetricFamily | GaugeMetricFamily]
+    name: str
+    meaning: str
+    read: Callable[[], Mapping[str, float]]
 
     def collect(self) -> Iterator[Metric]:
         """Return the current values."""
-        family = self._family(self._name, self._meaning, labels=["tenant"])
-        for tenant, value in self._read().items():
+        family = self.family(self.name, self.meaning, labels=["tenant"])
+        for tenant, value in self.read().items():
             family.add_metric([tenant], value)
         yield family
 
@@ -110,11 +105,11 @@ class Telemetry:
 
     def tenant_counter(self, name: str, meaning: str, read: Callable[[], Mapping[str, float]]) -> None:
         """Add a counter per tenant that is read on each scrape; a restarted app replaces it."""
-        self._add_per_tenant(_PerTenant(CounterMetricFamily, name, meaning, read), name)
+        self._add_per_tenant(_PerTenant(CounterMetricFamily, name, meaning, read))
 
     def tenant_gauge(self, name: str, meaning: str, read: Callable[[], Mapping[str, float]]) -> None:
         """Add a gauge per tenant that is read on each scrape; a restarted app replaces it."""
-        self._add_per_tenant(_PerTenant(GaugeMetricFamily, name, meaning, read), name)
+        self._add_per_tenant(_PerTenant(GaugeMetricFamily, name, meaning, read))
 
     def describe_build(self, version: str, model: str, model_version: str, model_sha256: str) -> None:
         """Set the info gauge with the versions of software and model."""
@@ -122,10 +117,6 @@ class Telemetry:
         gauge = self._gauge("lalaloc_build_info", "Versions of software and model.", labels)
         gauge.clear()
         gauge.labels(version, model, model_version, model_sha256).set(1.0)
-
-    def note_restart(self, pool: str) -> None:
-        """Count a replaced worker process of a pool."""
-        self.pool_restarts.labels(pool).inc()
 
     @contextmanager
     def timed(self, histogram: Histogram) -> Iterator[None]:
@@ -140,10 +131,10 @@ class Telemetry:
         """Return all metrics in Prometheus' text format."""
         return generate_latest(self.registry)
 
-    def _add_per_tenant(self, collector: Collector, name: str) -> None:
-        if name in self._collectors:
-            self.registry.unregister(self._collectors[name])
-        self._collectors[name] = collector
+    def _add_per_tenant(self, collector: _PerTenant) -> None:
+        if (before := self._collectors.get(collector.name)) is not None:
+            self.registry.unregister(before)
+        self._collectors[collector.name] = collector
         self.registry.register(collector)
 
     def _histogram(
