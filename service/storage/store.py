@@ -75,16 +75,8 @@ class Store:
     ) -> None:
         """Connect, and migrate the schema.
 
-        Args:
-            url: URL of the database.
-            connections: maximum number of open connections.
-            wait_s: timeout (s) for a free connection.
-            claim_s: lease (s) of an idempotency key while its request runs.
-            plan_cache_bytes: approximate memory limit of parsed plans; 0 caches none.
-            stored_bytes: limit of the stored bytes of a tenant without a limit of its own.
-            idempotency_bytes: limit of the bytes of a tenant's idempotency keys and their answers.
-            audit_keep_s: time (s) after which entries of the audit log are deleted.
-            max_audit_entries: limit of the entries of the audit log.
+        The arguments are settings, see `open_store`. `claim_s` (s) is the lease of an idempotency key or session while
+        its request runs, `stored_bytes` the limit of a tenant without a limit of its own.
         """
         try:
             database = Database(url, connections=connections, wait_s=wait_s)
