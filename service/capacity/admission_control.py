@@ -252,6 +252,7 @@ class Admission:
         # Time for the upload, the query or conversion, and sending the answer to a slow client.
         work_s = max(settings.sequence_deadline_s, settings.plans.import_deadline_s)
         self.deadline_s = uploads.deadline_s + work_s + requests.request_deadline_s
+        # Draining is announced before the service stops.
         self.draining = self.stopping = False
         self._at_stop: list[Callable[[], None]] = []
         telemetry.tenant_counter(
@@ -270,10 +271,6 @@ class Admission:
         telemetry.gauge("lalaloc_queries_waiting", "Queries waiting for a slot.", lambda: self.queries.waiting)
         telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in progress.", lambda: self.reads.in_use)
         telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
-
-    def drain(self) -> None:
-        """Announce that the service will stop soon. Safe to call in a signal handler."""
-        self.draining = True
 
     def at_stop(self, action: Callable[[], None]) -> None:
         """Run an action on a thread of its own when the service stops, for work that requests must not wait for."""

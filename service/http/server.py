@@ -115,7 +115,7 @@ class Server(uvicorn.Server):
             self.should_exit = True
         elif self._settings.requests.stop_notice_s > 0.0:
             # Load balancers need time to react.
-            admission.drain()
+            admission.draining = True
         else:
             admission.stop()
 

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 
 from sqlalchemy import bindparam, func, select, update
 
-from service.storage.album_rows import AlbumRecord, album_record, is_due, select_albums
+from service.storage.album_rows import AlbumRecord, is_due, select_albums
 from service.storage.database import Database
 from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, TENANTS
 
@@ -87,7 +87,7 @@ class AlbumJobs:
             attempts = connection.scalar(statement.returning(columns.attempts))
             if attempts is None:
                 return None
-            album = album_record(connection.execute(select_albums().where(columns.id == album_id)).one())
+            album = AlbumRecord(**connection.execute(select_albums().where(columns.id == album_id)).one()._mapping)
             changes = connection.scalar(select(TENANTS.c.changes).where(TENANTS.c.tenant == album.tenant))
             parts = ALBUM_PHOTOGRAPHS.c
             names = [parts[name] for name in AlbumPart.__dataclass_fields__]

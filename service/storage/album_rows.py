@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, Row, and_, delete, exists, func, or_, select, update
+from sqlalchemy import ColumnElement, Connection, and_, delete, exists, func, or_, select, update
 
 from service.errors import AlbumOutdatedError, RevisionMismatchError, UnknownAlbumError, UnknownAlbumPhotographError
 from service.storage.stored_bytes import ROW_BYTES, deleted_bytes
@@ -163,7 +163,7 @@ def find_album(connection: Connection, tenant: str, album_id: str, now: datetime
     row = connection.execute(select_albums().where(*own)).one_or_none()
     if row is None:
         raise UnknownAlbumError(album_id)
-    return album_record(row)
+    return AlbumRecord(**row._mapping)
 
 
 def lock_album(
@@ -203,11 +203,6 @@ def find_photograph(connection: Connection, album_id: str, photograph_id: str) -
 def select_photographs(*conditions: ColumnElement[bool]) -> Any:
     """Return a query for the columns of `PhotographRecord`, in the order of their numbers."""
     return select(*_LISTED).where(*conditions).order_by(ALBUM_PHOTOGRAPHS.c.number)
-
-
-def album_record(row: Row[Any]) -> AlbumRecord:
-    """Return the row of `select_albums` as a value."""
-    return AlbumRecord(**row._mapping)
 
 
 def delete_albums(connection: Connection, *conditions: ColumnElement[bool]) -> int:

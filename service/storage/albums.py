@@ -17,7 +17,6 @@ from service.storage.album_rows import (
     NewPhotograph,
     PhotographRecord,
     album_bytes,
-    album_record,
     change_album,
     delete_albums,
     find_album,
@@ -87,12 +86,12 @@ class Albums:
         """Return albums, newest first; arguments as for `Venues.list_venues`."""
         query = select_albums().where(ALBUMS.c.tenant == tenant, ALBUMS.c.expires_at >= datetime.now(UTC))
         rows = self._database.rows(newest_first(query, ALBUMS, limit=limit, after=after, name=name))
-        return [album_record(row) for row in rows]
+        return [AlbumRecord(**row._mapping) for row in rows]
 
     def by_ids(self, album_ids: set[str]) -> list[AlbumRecord]:
         """Return the albums that exist among some ids, regardless of tenant. Callers check access first."""
         query = select_albums().where(ALBUMS.c.id.in_(album_ids), ALBUMS.c.expires_at >= datetime.now(UTC))
-        return [album_record(row) for row in self._database.rows(query)]
+        return [AlbumRecord(**row._mapping) for row in self._database.rows(query)]
 
     def delete(self, tenant: str, album_id: str, *, expected: str | None = None) -> None:
         """Delete an album with its photographs."""
