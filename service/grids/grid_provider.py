@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
@@ -89,7 +89,11 @@ class GridState:
 
 
 class GridProvider:
-    """Pose grids of one model at one grid step."""
+    """Pose grids of one model at one grid step.
+
+    Attributes:
+        cache: the grids that are computed, in memory or in the store.
+    """
 
     def __init__(
         self,
@@ -106,8 +110,8 @@ class GridProvider:
         self._settings = settings
         self._telemetry = telemetry
         self._cores = cores
-        self._cache = GridCache(store, settings.storage.grid_cache_bytes, telemetry)
-        self._jobs = GridBuilder(store, encoders, self._cache, cores, settings, telemetry).jobs
+        self.cache = GridCache(store, settings.storage.grid_cache_bytes, telemetry)
+        self._jobs = GridBuilder(store, encoders, self.cache, cores, settings, telemetry).jobs
         self._unprepared = 0
         telemetry.gauge(
             "lalaloc_grids_pending", "Pose grids being computed or queued in this replica.", lambda: self.pending
@@ -115,7 +119,7 @@ class GridProvider:
         telemetry.gauge(
             "lalaloc_grids_preparing", "Plans without a pose grid, in all replicas.", lambda: self.preparing
         )
-        telemetry.gauge("lalaloc_grid_cache_bytes", "Size of the pose grids in memory.", lambda: self._cache.bytes)
+        telemetry.gauge("lalaloc_grid_cache_bytes", "Size of the pose grids in memory.", lambda: self.cache.bytes)
 
     @property
     def pending(self) -> int:
@@ -239,33 +243,21 @@ class GridProvider:
         of thousands of homes does not displace the grids that queries use.
         """
         if prepared is not None:
-            put = self._cache.put_unread if len(prepared.grid.poses) <= RENDERED else self._cache.put
+            put = self.cache.put_unread if len(prepared.grid.poses) <= RENDERED else self.cache.put
             put(prepared.key(record.revision_id), prepared.grid)
             return
         # A grid that cannot be queued now is queued later, here or by another replica.
         with suppress(StoppingError, OverloadedError):
             self.compute(record, record.plan.camera_height_m)
 
-    def find(self, key: GridKey) -> PoseGrid | None:
-        """Return a computed grid from memory or from the store."""
-        return self._cache.find(key)
-
-    def find_all(self, keys: Collection[GridKey]) -> dict[GridKey, PoseGrid]:
-        """Return the computed grids among `keys`; raises as `find` does."""
-        return self._cache.find_all(keys)
-
     def make_prototypes(self, key: GridKey, grid_id: int) -> SortedPrototypes | None:
         """Make and store the prototypes of a grid that was stored without; None if the grid was deleted."""
-        grid, record = self.find(key), self._store.plans.get_by_revision(key.revision_id)
+        grid, record = self.cache.find(key), self._store.plans.get_by_revision(key.revision_id)
         if grid is None or record is None:
             return None
         prototypes = SortedPrototypes.of_grid(grid, record.plan)
         self._store.grids.put_prototypes(grid_id, prototypes)
         return prototypes
-
-    def cached(self, key: GridKey) -> PoseGrid | None:
-        """Return a grid from memory."""
-        return self._cache.cached(key)
 
     def compute(self, record: PlanRecord, camera_height_m: float) -> Future[PoseGrid]:
         """Compute a grid in the background; a second call during the computation returns the same future.
@@ -286,7 +278,7 @@ class GridProvider:
 
     def forget(self, revision_ids: set[str]) -> None:
         """Drop grids of deleted revisions from memory, and cancel their computation."""
-        self._cache.drop(lambda key, _: key.revision_id in revision_ids)
+        self.cache.drop(lambda key, _: key.revision_id in revision_ids)
         for revision_id in revision_ids:
             self._jobs.cancel(revision_id)
 
@@ -296,7 +288,7 @@ class GridProvider:
 
     def revisions(self) -> set[str]:
         """Return the revisions with grids in memory or in the queue."""
-        return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
+        return {key.revision_id for key, _ in self.cache.items()} | self._jobs.revisions()
 
     def queue_missing(self) -> bool:
         """Queue the oldest grids that no replica computes, unless the queue is long; tell whether more are left."""

@@ -93,10 +93,10 @@ class Grounds:
         with context.clock.stage("grid"):
             height_m = grid_height_m(record, height.height_m, latents_alone=self._latents_alone)
             key = self._grids.key(record.revision_id, height_m)
-            grid = self._grids.cached(key)
+            grid = self._grids.cache.cached(key)
             if grid is None:
                 # Not on the compute threads: a database that does not answer would block them.
-                grid = await self._reads.run(record.tenant, self._grids.find, key)
+                grid = await self._reads.run(record.tenant, self._grids.cache.find, key)
             if grid is not None:
                 return grid
             own_height = height_m == record.plan.camera_height_m

@@ -137,10 +137,10 @@ class VenuePlans:
             found = await self._reads.run(tenant, plans.find_revisions, tenant, missing)
             parsed = await self._reads.process(tenant, lambda: [plans.record(plan) for plan in found.values()])
             records |= {record.revision_id: record for record in parsed}
-        grids = {key: grid for key in keys.values() if (grid := self._grids.cached(key)) is not None}
+        grids = {key: grid for key in keys.values() if (grid := self._grids.cache.cached(key)) is not None}
         if len(grids) < len(keys):
             missing = [key for key in keys.values() if key not in grids]
-            grids |= await self._reads.run(tenant, self._grids.find_all, missing)
+            grids |= await self._reads.run(tenant, self._grids.cache.find_all, missing)
         return [
             (row, records[row.revision_id], grids[keys[row.revision_id]])
             for row in members

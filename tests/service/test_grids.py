@@ -148,7 +148,7 @@ def test_second_request_shares_the_computation(store: Store, make_grids: MakeGri
     futures = [grids.compute(record, 1.5) for _ in range(5)]
     results = [future.result(30.0) for future in futures]
     assert all(result is results[0] for result in results)
-    assert grids.find(grids.key(record.revision_id, 1.5)) is results[0]
+    assert grids.cache.find(grids.key(record.revision_id, 1.5)) is results[0]
     assert encoders.embedded == len(results[0].poses)
 
 
@@ -168,11 +168,11 @@ def test_cache_stays_within_its_limit(store: Store, make_grids: MakeGrids, cache
     grids, record = make_grids(store, grid_cache_bytes=cache_bytes), _add(store)
     for height_m in (1.5, 1.6, 1.7):
         grids.compute(record, height_m).result(30.0)
-        assert grids._cache.bytes <= cache_bytes
-        assert grids._cache.bytes == sum(grid_bytes(grid) for _, grid in grids._cache.items())
-    assert (len(grids._cache.items()) > 0) == (cache_bytes > 0)
+        assert grids.cache.bytes <= cache_bytes
+        assert grids.cache.bytes == sum(grid_bytes(grid) for _, grid in grids.cache.items())
+    assert (len(grids.cache.items()) > 0) == (cache_bytes > 0)
     # Evicted grids are still in the store.
-    assert all(grids.find(grids.key(record.revision_id, height_m)) is not None for height_m in (1.5, 1.6, 1.7))
+    assert all(grids.cache.find(grids.key(record.revision_id, height_m)) is not None for height_m in (1.5, 1.6, 1.7))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 60)), max_size=30), st.integers(0, 100))
@@ -232,9 +232,9 @@ def test_cache_is_in_the_metrics(store: Store, encoders: PhotographEncoder) -> N
     grids = GridProvider(store, encoders, "m1", Settings(), telemetry, _permits())
     record = _add(store)
     key = grids.key(record.revision_id, 1.5)
-    assert grids.find(key) is None
+    assert grids.cache.find(key) is None
     grids.compute(record, 1.5).result(30.0)
-    assert grids.find(key) is not None
+    assert grids.cache.find(key) is not None
     grids.close()
     text = telemetry.render().decode()
     assert "lalaloc_grid_cache_hits_total 1.0" in text
@@ -396,7 +396,7 @@ def test_work_of_stopped_replica_is_taken_over(
     assert not grids.queue_missing()
     assert grids.pending == 1
     wait_for(lambda: grids.pending == 0)
-    assert grids.find(grids.key(record.revision_id, 1.5)) is not None
+    assert grids.cache.find(grids.key(record.revision_id, 1.5)) is not None
 
 
 def test_unqueued_plans_count_as_preparing(
@@ -552,7 +552,7 @@ def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make
     postgres.stop()
     try:
         assert _looked_up(known, "default", "p") == record
-        assert grids.find(grids.key(record.revision_id, 1.5)) is not None
+        assert grids.cache.find(grids.key(record.revision_id, 1.5)) is not None
         unknown = (
             (known, "default", "q"),
             (known, "other", "p"),
