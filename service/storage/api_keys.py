@@ -107,8 +107,8 @@ class ApiKeys:
 
 
 def _key(row: Row[Any]) -> ApiKey:
-    values = {name: getattr(row, name) for name in ApiKey.__dataclass_fields__}
-    return ApiKey(**values | {"scopes": frozenset(row.scopes.split())})
+    values = {name: getattr(row, name) for name in ApiKey.__dataclass_fields__ if name != "scopes"}
+    return ApiKey(**values, scopes=frozenset(row.scopes.split()))
 
 
 # Column of each attribute of `OperatorLimits`.
