@@ -100,10 +100,7 @@ _METHOD_QUERIES = 5
 
 
 def bench_methods(setting: Setting) -> dict[str, Any]:
-    """Measure seconds per query of ICP and of LaLaLoc in a furnished home of 100 m², heading known.
-
-    The plan's wall cloud (ICP) and pose grid (LaLaLoc) are prepared before and not counted.
-    """
+    """Measure seconds per query of ICP and of LaLaLoc in a furnished home of 100 m², heading known, plan prepared."""
     home = home_of_area(100.0)
     shots = sample_shots(home, _METHOD_QUERIES + 1, np.random.default_rng(2), "full")
     # One height, so that all share one pose grid.
@@ -205,10 +202,7 @@ _STAGES = ("encode", "retrieve", "vdr", "lpo")
 
 
 def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
-    """Return tables of the stages and of the slowest functions of queries in a home of 100 m², in one thread.
-
-    Stages are timed without the profiler, as medians over the queries; functions with it, by their own time.
-    """
+    """Return tables of the stages, and by the profiler of the slowest functions, of queries in one thread."""
     home = home_of_area(100.0)
     shots = sample_shots(home, queries, np.random.default_rng(1), "full")
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))

@@ -53,10 +53,7 @@ class _Row(NamedTuple):
 
 
 def bench_steps(setting: Setting) -> dict[str, Any]:
-    """Measure steps after photographs of 80° in furnished test homes, 2 in each, heading unknown.
-
-    The best step of each kind is carried out where the answer is not sure.
-    """
+    """Measure the best step of each kind after photographs of 80° that are not sure, 2 in each furnished test home."""
     model, renderers = setting.model, split_renderer_cache(_SPLIT, 0, setting.textures)
     rows: list[_Row] = []
     spent_s: list[float] = []

@@ -57,10 +57,7 @@ _SPHERE_SIZE, _GALLERIES = (1024, 2048), 1
 
 
 def bench_turns(setting: Setting) -> dict[str, Any]:
-    """Measure accuracy of three views of 80°, a third of a turn apart, in furnished test homes, 4 spots each.
-
-    The heading is unknown, and so are the angles between the views, unless the row says that they are known.
-    """
+    """Measure three views of 80°, a third of a turn apart, heading unknown, 4 spots in each furnished test home."""
     answers: dict[str, list[Found]] = {"known_angles": [], "unknown_angles": []}
     for spot in spots(setting.homes, "test", setting.textures):
         for row, answer in zip(answers, _at_spot(spot, setting.model), strict=True):

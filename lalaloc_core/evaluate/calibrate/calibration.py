@@ -224,11 +224,7 @@ def fit_appearance(encoders: PhotographEncoder, scenes: Iterable[Scene]) -> tupl
 
 
 def mixtures(likelihood: Float[np.ndarray, "n c"], drawn: Integer[np.ndarray, "n"]) -> Float[np.ndarray, "c c"]:
-    """Return for every class of the plan the most likely shares of the classes seen.
-
-    `likelihood` is that of each prediction for every class seen, and `drawn` the class in the plan. Classes that do not
-    occur look like themselves.
-    """
+    """Return for every class drawn the most likely shares of the classes seen; absent classes look like themselves."""
     classes = len(OPENING_CLASSES)
     shares = np.eye(classes)
     for code in np.unique(drawn):

@@ -83,11 +83,7 @@ def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
 
 
 def fit_matching_weights(answers: Sequence[Prediction], default: MatchingWeights | None = None) -> MatchingWeights:
-    """Return the weights of the matching cost that make the right candidates the most probable.
-
-    They maximise the likelihood of a choice model over the candidates of each query. Queries without a right or without
-    a wrong candidate do not count. `default` are the weights to begin with, and the rest of the result.
-    """
+    """Return the weights, from `default`, with which a choice model makes right candidates the most probable."""
     queries = [choice for choice in map(_choice, answers) if choice is not None]
     default = default or MatchingWeights()
     start = default.temperature * np.array([1.0, default.openings, default.ceiling, default.room_type])
@@ -134,10 +130,7 @@ def _is_right(pose: Pose, prediction: Prediction) -> bool:
 
 
 def with_heading_doubt(weights: MatchingWeights, known: Answers, searched: Answers) -> MatchingWeights:
-    """Return the weights with `usual_cost` and `usual_gain` of these answers, with right headings and without headings.
-
-    Both are quantiles over the home's own and disturbed photographs that were answered in both ways.
-    """
+    """Return the weights with `usual_cost` and `usual_gain`: quantiles over photographs answered in both ways."""
     without = {(answer.scene, answer.camera, part): _grid_cost(answer) for answer, part in _own(searched)}
     pairs = [
         (given, best)

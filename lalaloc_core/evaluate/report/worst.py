@@ -66,10 +66,7 @@ class WorstQuery:
 
 
 def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
-    """List the worst queries of a run in `SUMMARY_FILE` and return its content without them: their common features.
-
-    Queries without an answer come first, then by error.
-    """
+    """List the worst queries of a run in `SUMMARY_FILE`, unanswered ones first, and return their common features."""
     folder = RunFolder(run)
     info, predictions = folder.read_info(), folder.read_predictions()
     if not predictions:

@@ -111,14 +111,7 @@ ABLATIONS: dict[str, Ablation] = {
 def train_ablation(
     name: str, budget: Budget, dataset: Dataset, out: Path, *, device: torch.device, workers: int = 1
 ) -> Bundle:
-    """Train a variant on a data set and export it to `out/<name>/bundle`.
-
-    Finished stages are skipped and interrupted ones resume. Variants of the image branch use the layout encoder of
-    another variant, whose stage 1 is trained first if needed.
-
-    `out` is the folder of all variants of one data set and budget. The validation scenes of `dataset` monitor the
-    training. `workers` processes make batches; 0 for this process.
-    """
+    """Train a variant, and the layout encoder of another that it uses, and export it; finished stages are kept."""
     ablation = ABLATIONS.get(name)
     if ablation is None:
         raise ConfigError(f"unknown variant '{name}'; choose one of: {', '.join(ABLATIONS)}")

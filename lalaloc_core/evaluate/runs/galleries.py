@@ -156,10 +156,7 @@ def foreign_plans() -> list[FloorPlan]:
 def foreign_confidences(
     bundle: Bundle, photographs: Sequence[AnnotatedPhotograph], plans: Sequence[FloorPlan], *, heading_known: bool
 ) -> list[float]:
-    """Return the confidence of every photograph in every plan; empty for a model without confidence.
-
-    A known heading is one at which the walls of the photographed room are parallel to the plan's axes.
-    """
+    """Return the confidence of photographs in plans; a known heading is one parallel to the plan's axes."""
     if bundle.manifest.confidence is None:
         return []
     model = LocalModel(bundle)

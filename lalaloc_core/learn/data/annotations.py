@@ -245,10 +245,7 @@ class _Reader:
 
 
 def _pieces(room: DrawnRoom, annotated: DrawnRoom, span: ClassSpan) -> list[DrawnOpening]:
-    """Return the visible pieces of a room's walls that an opening covers.
-
-    An opening may be partly occluded, so its line need not be a piece of a wall.
-    """
+    """Return the visible pieces of a room's walls that an opening, perhaps partly occluded, covers."""
     kind, left, right = span
     share = left + (right - left) % 1.0 * (np.arange(_RAYS) + 0.5) / _RAYS
     azimuth = TWO_PI * (share - 0.5)

@@ -182,10 +182,7 @@ class _FloorReader:
         return np.array([self._pair(vertex, f"{where}vertex {k}", sphere) for k, vertex in enumerate(vertices)])
 
     def _openings(self, sphere: _Sphere, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
-        """Yield the doors, passages and windows of a layout.
-
-        Each is a triple: start, end, and the heights of sill and head above the camera.
-        """
+        """Yield the doors, passages and windows of a layout: triples of start, end, and heights of sill and head."""
         transform = self._transform(sphere)
         camera = self._number(sphere.data, "camera_height", sphere)
         for key, kind in _OPENING_LISTS.items():

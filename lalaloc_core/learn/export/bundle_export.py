@@ -72,11 +72,7 @@ def export_bundle(
     version: str,
     training: dict[str, Any] | None = None,
 ) -> Bundle:
-    """Write a bundle; networks are put into evaluation mode and their weights are rounded in place.
-
-    The folder is created, or its bundle files are replaced. A bundle without an image encoder answers layout queries
-    only. `training` has entries of the manifest's `training`.
-    """
+    """Write a bundle and round its networks in place; without an image encoder it answers layout queries only."""
     for module in filter(None, (layout_encoder, image_encoder, decoder)):
         _freeze(module)
     with _new_files(folder) as work:

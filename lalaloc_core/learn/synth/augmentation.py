@@ -123,10 +123,7 @@ _JPEG_SHARE = 0.25
 
 
 def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
-    """Change exposure, colour and noise of spheres at random.
-
-    `strength` 0 changes nothing, 1 changes the exposure by about a third. The generator is on the pictures' device.
-    """
+    """Change exposure, colour and noise of spheres at random; `strength` 0 changes nothing, 1 by about a third."""
 
     def drawn(spread: float, channels: int = 1) -> Tensor:
         size = (len(image), channels, 1)

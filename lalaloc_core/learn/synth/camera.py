@@ -223,10 +223,7 @@ _BLEND = 0.05
 def develop(
     radiance: Float[Tensor, "b h w 3"], exposure: Exposure, noise: Float[Tensor, "bh bw 3"]
 ) -> UInt8[Tensor, "b h w 3"]:
-    """Expose linear radiance and encode it as sRGB-like bytes.
-
-    `noise` is unit noise, at least as large as a picture; every picture uses its own rolled part.
-    """
+    """Expose linear radiance and encode it as sRGB-like bytes; every picture uses its own rolled part of `noise`."""
     luma = radiance @ radiance.new_tensor(_LUMA_SHARES)
     # Like a light meter, the mean of logarithms weighs a dark room more than its bright window.
     luma = luma.clamp_(1e-3, 20.0).log_()

@@ -221,10 +221,7 @@ class SphereBatches(Stream):
 def opening_kinds(
     plan: FloorPlan, camera: Camera | Shot | SphereSample, heading: float, columns: int
 ) -> Int[np.ndarray, "{columns}"]:
-    """Return the code of the wall or opening that a camera sees at each azimuth at eye height.
-
-    Walls are `UNKNOWN` in a plan that does not claim to show all openings.
-    """
+    """Return the code seen at each azimuth at eye height; walls are `UNKNOWN` in a plan that may lack openings."""
     view = render_layout(
         camera.position_m[None].astype(np.float32),
         np.array([heading], np.float32),

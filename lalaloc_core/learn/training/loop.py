@@ -214,11 +214,7 @@ def learning_rate(config: OptimiserConfig, progress: float) -> float:
 
 
 def moving_average(module: nn.Module, decay: float) -> AveragedModel:
-    """Create an exponential moving average of a module's weights and statistics, in evaluation mode.
-
-    The average starts with the module's current weights; call `update_parameters` after every step. `decay` is per
-    step; early steps use a smaller decay.
-    """
+    """Create an exponential moving average of a module from its current weights; early steps use a smaller decay."""
 
     def update(averaged: Iterable[Tensor], current: Iterable[Tensor], count: Tensor | int) -> None:
         # At full decay, the initial weights would dominate for too long.

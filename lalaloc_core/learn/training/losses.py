@@ -127,10 +127,7 @@ def ceiling(log_ceiling: Float[Tensor, "b"], log_scale: Float[Tensor, "b"], abov
 
 
 def teacher_openings(logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 3"]) -> Tensor:
-    """Return the cross entropy to a teacher's shares of (door, window, passage) in each column.
-
-    Where the share of passages is NaN, the remaining share can be wall or passage.
-    """
+    """Return the cross entropy to a teacher's shares by column; without that of passages, the rest is either."""
     log_probability = torch.log_softmax(logits, dim=2)
     wall, passage = log_probability[..., WALL_CODE], log_probability[..., PASSAGE_CODE]
     log_other = torch.where(shares[..., 2].isnan(), torch.logaddexp(wall, passage), wall)

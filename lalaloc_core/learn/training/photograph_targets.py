@@ -93,10 +93,7 @@ def _taught(paths: Sequence[Path], teachers: Sequence[Path], height: int, width:
 def read_by_encoder(
     encoder: TrunkImageEncoder, spheres: UInt8[Tensor, "n h w 3"], width: int
 ) -> tuple[Float[Tensor, "n w 3"], Float[Tensor, "n w"]]:
-    """Return openings and log distances of spheres in `width` columns, as `Photographs` has them.
-
-    They are the medians and means over turned and mirrored pictures.
-    """
+    """Return openings and log distances of spheres in `width` columns, over turned and mirrored pictures."""
     openings, distances = [], []
     for mirrored in (False, True):
         for turn in range(_TURNS):

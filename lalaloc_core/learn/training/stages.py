@@ -123,10 +123,7 @@ def photograph_loss(
 def sample_styles(
     mixed_share: float, rendered: int, photographs: int, generator: torch.Generator, device: torch.device
 ) -> StyleMixing | None:
-    """Draw style partners for a share of a batch, half of them photographs, because queries look like photographs.
-
-    `generator` is on the CPU. Returns None if the share is 0.
-    """
+    """Draw style partners for a share of a batch, half of them photographs, because queries look like photographs."""
     if not mixed_share:
         return None
     count = rendered + photographs

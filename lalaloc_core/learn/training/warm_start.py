@@ -159,10 +159,7 @@ def _state(bundle: Bundle, file: str) -> dict[str, Tensor]:
 
 
 def check_same_networks(stage: str, config: TrainConfig, trained: TrainConfig, where: str) -> None:
-    """Check that two configurations have the same networks of a stage; the image stage uses both branches.
-
-    The layout branches of `ring` and `trunk` are the same.
-    """
+    """Check that the networks of a stage are the same; the layout branches of `ring` and `trunk` are."""
     parts: dict[str, tuple[object, object]] = {"architecture": (config.architecture, trained.architecture)}
     if stage == "layout" and config.has_ring == trained.has_ring:
         parts = {}

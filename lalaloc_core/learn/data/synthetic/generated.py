@@ -33,11 +33,7 @@ SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "te
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratedScenes:
-    """Homes of the generator with cameras at any heading, 1.0 to 1.9 m high.
-
-    `homes` are per split. With `furniture` None each camera has its own level, which its photograph does not state;
-    with `textures` None all materials are procedural.
-    """
+    """Homes of the generator, with cameras 1.0 to 1.9 m high; `furniture` None draws a level for each, unstated."""
 
     homes: int
     shots_per_home: int = 4

@@ -112,11 +112,7 @@ def share_out(scenes: int, split: Split | Literal["all"]) -> dict[Split, tuple[i
 
 
 def synthesise(settings: Synthesis, numbers: dict[Split, tuple[int, ...]], *, workers: int = 1) -> int:
-    """Write the missing scenes, with a progress bar on standard error.
-
-    `numbers` are those of the scenes by split. One worker renders in this process. The result is the number of scenes
-    written.
-    """
+    """Write the missing scenes of these numbers and return how many; one worker renders in this process."""
     if workers < 1:
         raise InvalidInputError(f"workers is {workers}; the minimum is 1")
     wanted = [_Job(settings, split, number) for split, chosen in numbers.items() for number in chosen]

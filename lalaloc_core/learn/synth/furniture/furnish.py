@@ -91,14 +91,7 @@ Pose = tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n 2"]]
 
 
 class Prism(NamedTuple):
-    """A vertical box or elliptic cylinder in the plan frame.
-
-    Attributes:
-        x, y: centre, metres.
-        axis_x, axis_y: unit vector of its first axis; the second is the first turned by +90°.
-        half_a, half_b: half extents along the two axes, metres.
-        z0, z1: lower and upper end above the floor, metres.
-    """
+    """A vertical box or elliptic cylinder in the plan frame (m); the second axis is the first turned by +90°."""
 
     x: float
     y: float

@@ -61,10 +61,7 @@ class Home:
 
 
 def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -> Home:
-    """Draw a home.
-
-    Rooms never overlap and lie one wall thickness apart. Openings are consistent between the two rooms they join.
-    """
+    """Draw a home: rooms lie one wall thickness apart, and openings are consistent between the two rooms they join."""
     is_open_plan = rng.random() < config.open_plan_share
     between = config.open_plan_rooms if is_open_plan else config.rooms
     rooms = int(rng.integers(between[0], between[1] + 1))

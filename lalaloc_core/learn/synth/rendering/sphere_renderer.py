@@ -102,11 +102,7 @@ class SphereRenderer:
     def render_moods(
         self, shot: Shot, moods: Sequence[Mood]
     ) -> tuple[UInt8[Tensor, "m h w 3"], Float[Tensor, "h2 w2"]]:
-        """Photograph one staged shot in several lights, casting its rays once.
-
-        Returns:
-            the pictures, and the ranges (m) of `depth_m`.
-        """
+        """Photograph a staged shot in several lights, casting its rays once; return pictures and ranges (m)."""
         scene = build_scene(dataclasses.replace(shot, lighting="raw"), self._materials)
         batch = stack_scenes([scene], self._device)
         direction = self._directions(batch)

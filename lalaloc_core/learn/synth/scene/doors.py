@@ -57,11 +57,7 @@ def hang_leaves(
     camera_m: Float[np.ndarray, "2"],
     rng: np.random.Generator,
 ) -> list[Leaf]:
-    """Open a door; leaves without space clear of walls and camera, and a random share, are missing.
-
-    `neighbour` is the room behind the opening and `depth_m` the thickness of the wall; leaves keep `CAMERA_CLEARANCE_M`
-    away from `camera_m`.
-    """
+    """Open a door; leaves without space clear of walls and camera, and a random share, are missing."""
     if rng.random() < 0.15:
         return []
     start, along, inwards = wall_frame(room, opening.wall)

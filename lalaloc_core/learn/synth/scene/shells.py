@@ -315,11 +315,7 @@ def _hang(
     z_m: tuple[float, float],
     surface: int,
 ) -> None:
-    """Add a flat box before a wall, narrower at the wall's end, if it stays in the room and off the camera.
-
-    `at_m` is the position of the box's middle along the wall, `from_wall_m` its distance from the wall, `half_m` half
-    its width, and `z_m` its lower and upper end above the floor.
-    """
+    """Add a flat box before a wall, narrower at the wall's end, if it stays in the room and off the camera."""
     start, along, inwards = wall_frame(room, wall)
     length = float(np.hypot(*(room.walls_m[wall, 2:] - room.walls_m[wall, :2])))
     half_m = min(half_m, at_m, length - at_m)

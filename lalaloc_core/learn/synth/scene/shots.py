@@ -100,10 +100,7 @@ def sample_shots(
 
 
 def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
-    """Return one staged shot of every room, all from the same height above the floor and looking along +y.
-
-    Cameras keep `POSE_MARGIN_M` from the walls; in a room too narrow for that they stand in its middle.
-    """
+    """Return one staged shot of every room along +y, all from one height, clear of the walls where there is space."""
     low, high = _STAGED_HEIGHTS_M
     lowest_ceiling = min(room.ceiling_height_m for room in home.plan.rooms)
     height = rng.uniform(low, min(high, lowest_ceiling - CEILING_CLEARANCE_M))

@@ -196,14 +196,7 @@ def _finish(finish: Finish, rng: np.random.Generator) -> tuple[Colour | None, fl
 
 @dataclass(frozen=True, kw_only=True)
 class HouseStyle:
-    """One style for all rooms of a scene; surfaces are rows of its table.
-
-    Attributes:
-        outdoors: view through windows.
-        gloom: surface behind the doors of rooms that are seen through doors, and behind panes.
-        baseboard_m: height of the baseboards, 0 for none.
-        crown_m: height of the mouldings below the ceiling, 0 for none.
-    """
+    """One style for all rooms of a scene: rows of its surfaces, and heights of baseboards and mouldings, 0 for none."""
 
     trim: int
     door: int
