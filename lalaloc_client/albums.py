@@ -55,7 +55,6 @@ class Pin:
     Attributes:
         state: `sure`, `uncertain`, `set_aside` or `corrected`.
         within_1m: probability that the position is right within 1 m.
-        reason: reason why it is uncertain or set aside.
         suggestions: up to five places, the most probable first.
         moved: change by the latest revision of the plan; None without one.
     """

@@ -331,7 +331,6 @@ class SequenceLocalisation:
     """Poses of the photographs of one visit.
 
     Attributes:
-        confidence: probability that all position errors are below 1 m.
         warnings: motions that were not followed, and photographs of a turn that do not overlap.
     """
 

@@ -55,8 +55,6 @@ class ProblemError(ClientError):
 
     Attributes:
         type: stable identifier of the kind of problem; `about:blank` if the answer has none.
-        detail: explanation with value and limit.
-        request_id: id of the request in the service's log.
         faults: (field, message) of every invalid field.
     """
 

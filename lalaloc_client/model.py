@@ -59,9 +59,7 @@ class FloorPlan:
         warnings: oddities that do not prevent its use.
         revision: id of the uploaded revision, as in `Localisation.floorplan_revision`.
         revision_number: number of uploads up to this revision.
-        updated_at: time of this revision's upload.
         etag: entity tag of this revision, for `replace_floorplan(..., if_match=...)`.
-        plan: the plan in the native format.
         import_report: interpretation of its file, with guesses and likely errors.
     """
 
@@ -206,7 +204,6 @@ class PlanEvent:
     Attributes:
         status: `preparing`, then `ready`, `failed` or `deleted`, which is the last event.
         progress: computed share of its pose grid, 0 to 1; None after deletion.
-        revision: the current revision, which may change in between.
     """
 
     status: str

@@ -43,8 +43,6 @@ class Request:
 
     Attributes:
         params: query parameters; a list is sent as one parameter per item.
-        safety: effect of sending the request twice.
-        answers: status codes of success.
         streamed: read the answer as it arrives, for as long as it takes.
         on_step: called with every step of the import that the request asks for; needs `Accept: application/x-ndjson`.
     """

@@ -29,7 +29,6 @@ class RetryPolicy:
     """Number of attempts and waits between them.
 
     Attributes:
-        attempts: maximum number of attempts, including the first.
         total_s: time after the start of the first attempt by which every wait must end.
         first_s: maximum wait before the second attempt; doubles with each attempt.
         longest_s: maximum wait, unless the service asks for more with Retry-After.

@@ -53,7 +53,6 @@ class DrawnAnswer:
 
     Attributes:
         camera: the predicted pose, with its covariance if known.
-        confidence: probability that the position is correct; None if unknown.
         heat: map of the posterior; None leaves the floors white.
     """
 

@@ -73,7 +73,6 @@ class ExifLens:
         focal: focal length, pixels of the full picture; None if unknown.
         strip: the picture is a strip of a phone's panorama mode.
         fisheye: angle (radians) across the longer side, if the camera's wide lens is a fisheye; else None.
-        camera: maker and model, if `fisheye` is known.
     """
 
     focal: float | None = None

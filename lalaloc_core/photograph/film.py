@@ -59,11 +59,7 @@ _LEAST_TURN = math.radians(30.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Film:
-    """Frames of a turn that were kept of a film.
-
-    Attributes:
-        turned: angle (radians) that the camera turned through.
-    """
+    """Frames of a turn that were kept of a film."""
 
     photographs: tuple[Photograph, ...]
     times_s: tuple[float, ...]

@@ -98,7 +98,6 @@ class Attitude:
         pitch: elevation of the optical axis, radians.
         roll: clockwise rotation about it, radians.
         yaw: azimuth of one of the two horizontal directions relative to the optical axis, radians; repeats by 90°.
-        yaw_sd: its standard deviation; infinite without lines.
     """
 
     pitch: float

@@ -101,7 +101,6 @@ class Photograph:
     """A photograph as the encoders expect it, and what was assumed about it.
 
     Attributes:
-        pitch: elevation of the centre of the picture.
         roll: clockwise rotation of the camera about its optical axis.
         wall_direction: azimuth of walls relative to the photograph's centre, up to quarter turns, by straight lines;
             None without lines, and for a full sphere.

@@ -58,7 +58,6 @@ class PhotographLimits:
     """Limits of photographs, checked on the file's header before its pixels are allocated.
 
     Attributes:
-        max_pixels: width times height.
         max_scans: scans of a progressive JPEG; encoders write 3 to 12.
         min_height: pixels of the full sphere's height.
         aspect_tolerance: relative deviation of a full sphere from twice as wide as high; stitchers round.
@@ -76,10 +75,6 @@ class PictureFile:
 
     Attributes:
         open: returns the picture, whose pixels are not decoded yet.
-        kind: Pillow's name of its format.
-        size: width and height of the stored picture.
-        exif: its Exif metadata, empty if they are damaged.
-        packets: its XMP packets.
         box: part of the upright picture that counts, as shares (left, top, right, bottom).
         is_cut: it is a JPEG whose end is missing.
         warnings: parts of the file that are damaged, or that were ignored.

@@ -49,7 +49,6 @@ class Intrinsics:
     Attributes:
         cx, cy: optical centre, pixels from the centre of the top left pixel; None for the picture's centre.
         k1, k2, k3: radial distortion, of the fisheye model for projection "fisheye".
-        k4: radial distortion of the fisheye model.
         p1, p2: tangential distortion, not of the fisheye model.
     """
 
@@ -70,8 +69,6 @@ class StatedCamera:
     """Caller's statements about one photograph; None for unknown values. Degrees, as in requests.
 
     Attributes:
-        hfov_deg: horizontal field of view of the upright picture.
-        intrinsics: camera matrix and distortion, instead of `hfov_deg`.
         pitch_deg: elevation of the picture's centre above the horizon; of its whole middle row, if it is cylindrical.
         roll_deg: clockwise rotation of the camera about its optical axis.
     """

@@ -96,7 +96,6 @@ class TurnAngles:
     Attributes:
         group: number of the group of photographs that overlap, directly or by others.
         heading: heading minus that of the first photograph of the group.
-        focal_factor: factor of the camera's focal length.
         focal_sd: relative standard deviation of the resulting focal length.
         is_assumed: the heading does not follow from overlap with the most photographs of the group, but from the order.
     """
@@ -124,7 +123,11 @@ def angles_of_turn(views: Sequence[TurnView], steps: Sequence[Step] | None = Non
     found: list[TurnAngles] = []
     for _ in range(_ROUNDS):
         found = _fitted(views, attitudes, links)
-        kept = [link for link in links if abs(wrap_angle(_turn(found, link) - link.turn)) < _MISSED]
+        kept = [
+            link
+            for link in links
+            if abs(wrap_angle(found[link.second].heading - found[link.first].heading - link.turn)) < _MISSED
+        ]
         if len(kept) == len(links):
             break
         links = kept
@@ -143,10 +146,6 @@ def _joined(found: list[TurnAngles], steps: Sequence[Step]) -> list[TurnAngles]:
         )
         for angle, turn, sd in zip(found, turned, placed_sd, strict=True)
     ]
-
-
-def _turn(found: Sequence[TurnAngles], link: Link) -> float:
-    return found[link.second].heading - found[link.first].heading
 
 
 def _fitted(views: Sequence[TurnView], attitudes: Sequence[Attitude], links: Sequence[Link]) -> list[TurnAngles]:

@@ -40,7 +40,6 @@ class ImportJob:
     """Uploaded plan file, and the options of its import.
 
     Attributes:
-        step_m: grid step of descriptions.
         every_level: import all levels of the file, not the only one.
         building: name for plans that have none, and for those of several levels, see `import_plans`.
         tells_steps: tell the steps of the import as they begin: a few, and one for each level.

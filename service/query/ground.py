@@ -41,7 +41,6 @@ class Ground(answers.Ground):
     """Places that a photograph is compared with.
 
     Attributes:
-        hints: hints in the frame of `plan`.
         merged: the plans side by side; None for one plan outside of venues.
         venue_plans: the plans of the venue; None for one plan outside of venues.
         venue_hints: hints of the request about the venue; None outside of venues.

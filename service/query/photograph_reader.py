@@ -68,10 +68,9 @@ class PhotographReader:
     async def decode_turn(
         self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext
     ) -> tuple[list[Photograph], list[TurnAngles] | None]:
-        """Decode photographs of one spot, each with the tilt and field of view that their overlap tells.
+        """Decode photographs of one spot, with the tilt, field of view and angles that their overlap tells.
 
-        Returns:
-            the photographs, and their angles; None if they are features or a sphere is among them.
+        There are no angles if they are features, or a sphere is among them.
         """
         with context.clock.stage("decode"):
             photographs = await self._decode_all(contents, stated, context, purpose="turn")

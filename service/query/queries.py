@@ -91,7 +91,6 @@ class TrackQuery(AnyQuery[TrackOutcome]):
     """Photograph of a session.
 
     Attributes:
-        document: the request that began the session.
         state: state after the photographs before; None for the first.
     """
 
@@ -113,12 +112,7 @@ class AlbumEntry:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlbumPhotographQuery(AnyQuery[AlbumEntry]):
-    """Photograph that is added to an album.
-
-    Attributes:
-        document: the request that created the album.
-        sha256: digest of the uploaded file.
-    """
+    """Photograph that is added to an album."""
 
     document: AlbumDocument
     content: Content

@@ -94,7 +94,6 @@ class ApiCall:
     """Request with the running service and its caller.
 
     Attributes:
-        tenant: tenant whose data the caller can see.
         client: tenant or client address that the request's share of slots counts for; see
             `service.capacity.fair_share`.
     """

@@ -25,7 +25,7 @@ from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_typ
 from service.plan_documents import PlanDocument
 from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
 from service.routes.dependencies import ApiCall
-from service.routes.descriptions import json_body
+from service.routes.descriptions import BINARY, json_body
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.plan_import import ImportForm, LevelsForm
 from service.storage.records import ComputedGrid, NewPlan, Original
@@ -52,17 +52,15 @@ _FILES = (
     "application/x-step",
     "application/octet-stream",
 )
-_BYTES = {"schema": {"type": "string", "format": "binary"}}
+_BYTES = {"schema": BINARY}
 
 
 def _form_schema(form: type[BaseModel]) -> dict[str, Any]:
     schema = form.model_json_schema()
-    schema["properties"][_FILE] = {
-        "type": "string",
-        "format": "binary",
+    schema["properties"][_FILE] = BINARY | {
         "description": "GeoJSON, an IMDF archive, OpenStreetMap (XML or Overpass JSON), a RoomPlan scan, SVG, DXF, IFC "
         "(also zipped), PDF, PNG, JPEG, or JSON in the native format (FloorPlanDocument). The format is detected from "
-        "the content.",
+        "the content."
     }
     schema["required"] = [_FILE]
     return schema
@@ -78,12 +76,7 @@ LEVELS_FORM: dict[str, Any] = {"schema": _form_schema(LevelsForm)}
 
 @dataclass(frozen=True)
 class PlanUpload:
-    """Uploaded file with its options.
-
-    Attributes:
-        parts: the parts that identify the request for idempotency.
-        is_native: see `PlanReader`.
-    """
+    """Uploaded file with its options."""
 
     file: UploadedFile
     options: ImportOptions

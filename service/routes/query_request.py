@@ -91,11 +91,7 @@ async def read_files(
     repeated: Mapping[str, Repeats] | None = None,
     film: bool = False,
 ) -> tuple[AnyForm, Parts, QueryContext]:
-    """Read a form with photographs and start the clock of its deadline.
-
-    Returns:
-        the form, all parts, and the context of the query.
-    """
+    """Read a form with photographs and start the clock of its deadline."""
     media_type(call.request, (MULTIPART,))
     settings = call.settings
     clock = StageClock()

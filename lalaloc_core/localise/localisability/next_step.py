@@ -54,7 +54,6 @@ class NextStep:
         kind: `turn` (another photograph from the same spot), `door` (another photograph from behind a door), `heading`
             (state it) or `rooms` (choose one).
         turn: of `turn` and `door`: direction (radians) relative to the photograph's centre, clockwise.
-        distance_m: of `door`: distance to it.
         rooms: of `rooms`: numbers of the probable rooms, the most probable first.
     """
 
@@ -71,7 +70,6 @@ class Known:
     """Facts about an answer that steps are computed from.
 
     Attributes:
-        support: its posterior.
         fit: probability that the photograph is of the plan.
         answer: share of the posterior within 1 m of the answer.
         arcs: azimuths (radians, first and last) that were seen, relative to the photograph's centre.

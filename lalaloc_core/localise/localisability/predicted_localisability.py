@@ -88,7 +88,6 @@ class Draw(NamedTuple):
     """Outcome of a drawn photograph.
 
     Attributes:
-        found_in_room: the same with a hint of the room.
         mistaken: probability of an answer in each of the other rooms.
     """
 
