@@ -266,8 +266,11 @@ class Admission:
             lambda: by_tenant(self.bytes_in_flight.held()),
         )
         telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in progress.", lambda: self.requests.in_use)
-        in_work = "Queries being computed, without those that wait for a pose grid."
-        telemetry.gauge("lalaloc_queries_in_work", in_work, lambda: self.queries.in_use)
+        telemetry.gauge(
+            "lalaloc_queries_in_work",
+            "Queries being computed, without those that wait for a pose grid.",
+            lambda: self.queries.in_use,
+        )
         telemetry.gauge("lalaloc_queries_waiting", "Queries waiting for a slot.", lambda: self.queries.waiting)
         telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in progress.", lambda: self.reads.in_use)
         telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)

@@ -62,10 +62,10 @@ def busy_for(calls: int) -> Callable[..., Any]:
     """Return an `AlbumSearch.entry` that misses its deadline in so many calls after the first."""
     left, entry = [0, *([1] * calls)], AlbumSearch.entry
 
-    async def encode(self: AlbumSearch, query: Any) -> Any:
+    async def encode(self: AlbumSearch, where: Any, query: Any) -> Any:
         if left and left.pop(0):
             raise DeadlineExceededError(1.0)
-        return await entry(self, query)
+        return await entry(self, where, query)
 
     return encode
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,3 +127,21 @@ class PaintedSession(onnxruntime.InferenceSession):
         camera = torch.from_numpy(input_feed["camera_height_m"])
         ring = self.encoder.ring(profile, camera, torch.full_like(camera, 2.5)).numpy()
         return [ring, np.log(profile.numpy()), np.full_like(profile.numpy(), -5.0)]
+
+
+HEADINGS = 32
+# Place, number of the room, and heading of each photograph.
+Walk = list[tuple[tuple[float, float], int, float]]
+
+
+def queries_along(encoders: PhotographEncoder, plan: FloorPlan, walk: Walk, height: CameraHeight) -> list[Query]:
+    """Return the queries of a perfect image encoder along a walk, headings unknown."""
+    layouts, queries = encoders.layouts, []
+    for place, room, heading in walk:
+        pose = PoseSet(np.array([place]), np.array([room]))
+        roll = np.arange(HEADINGS) * (math.tau / HEADINGS)
+        profile_m = np.concatenate([layouts.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
+        profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -3.0))
+        latents = layouts.latents(profile_m, np.full(HEADINGS, height.height_m), np.full(HEADINGS, 2.5))
+        queries.append(Query(latents, roll, 0.0, heading_known=False, camera_height=height, profile=profile))
+    return queries

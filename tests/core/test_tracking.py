@@ -28,12 +28,12 @@ from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPla
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.walk_motion import States, WalkGraph, moved
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from tests.core.test_sequence import CAMERA_M, STEP_M, queries_along
+from tests.core.questions import Walk, queries_along
 from tests.strategies import l_shape, plan_of, present, rectangle
 
 SECTORS = 16
+CAMERA_M, STEP_M = 1.5, 0.5
 EXACT = (0.05, 0.05, math.radians(2.0))
-Walk = list[tuple[tuple[float, float], int, float]]
 # From the left room through its door into the right one, and back.
 WALK: Walk = [
     ((1.0, 1.0), 0, 1.6),

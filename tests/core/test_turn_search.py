@@ -14,14 +14,14 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
-from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
+from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.search import turn_search
 from lalaloc_core.localise.search.pipeline import localise, run_steps
 from lalaloc_core.localise.search.turn_search import RelativeHeading, SearchedTurn, TurnLocalisation, searched_turn
-from lalaloc_core.render.sampling import PoseSet
+from tests.core.questions import HEADINGS, queries_along
 from tests.strategies import plan_of, rectangle
 
-CAMERA_M, STEP_M, HEADINGS = 1.5, 0.5, 32
+CAMERA_M, STEP_M = 1.5, 0.5
 SPOT_M, ROOM = (1.6, 7.0), 2
 
 
@@ -37,14 +37,8 @@ def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
 
 
 def query_at(encoders: PhotographEncoder, plan: FloorPlan, heading: float) -> Query:
-    """Return the query of a perfect image encoder at `SPOT_M`, heading unknown."""
-    pose = PoseSet(np.array([SPOT_M]), np.array([ROOM]))
-    roll = np.arange(HEADINGS) * (math.tau / HEADINGS)
-    profile_m = np.concatenate([encoders.layouts.profiles(plan, pose, np.array([heading - turn])) for turn in roll])
-    profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -3.0))
-    latents = encoders.layouts.latents(profile_m, np.full(HEADINGS, CAMERA_M), np.full(HEADINGS, 2.5))
-    height = CameraHeight(CAMERA_M, 0.0)
-    return Query(latents, roll, 0.0, heading_known=False, camera_height=height, profile=profile)
+    (query,) = queries_along(encoders, plan, [(SPOT_M, ROOM, heading)], CameraHeight(CAMERA_M, 0.0))
+    return query
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ import lalaloc_core.localise.refine.latent_refiner  # noqa: F401
 import service.decoding.decode_worker
 import service.plan_files.convert_worker
 import service.workers.lpo  # noqa: F401
+from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import warm_up
 
 cv2.setNumThreads(1)
-warm_up(sphere_size=(32, 64), patch_size=None)
+warm_up(sphere_size=(32, 64), patch_size=PatchSize())

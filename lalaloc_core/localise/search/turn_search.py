@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -98,7 +98,7 @@ def searched_turn(
     queries: Sequence[Query],
     relative: Sequence[RelativeHeading],
     matching: MatchingConfig,
-) -> Generator[None, None, SearchedTurn]:
+) -> Generator[None, Any, SearchedTurn]:
     """Search the relative headings of photographs of one spot; yields None where the search can pause."""
     costs = [_GridCost(plan, grid, encoder, query, matching) for query in queries]
     pairs = _MAX_PAIRS // sum(len(query.roll) for query in queries)
