@@ -85,6 +85,7 @@ class Report:
 
     runs: Runs
     out: Annotated[Path, "page to write"] = Path("report.html")
+    pictures: Annotated[Path | None, "folder to write the page's charts to as well"] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,7 +234,7 @@ def _print_scores(report: dict[str, Any]) -> None:
 def _report(arguments: Report) -> None:
     from lalaloc_core.evaluate.report import write_report
 
-    write_report(arguments.runs, arguments.out)
+    write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
 
 
 def _worst(arguments: Worst) -> None:

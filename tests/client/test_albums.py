@@ -11,7 +11,8 @@ import pytest
 from lalaloc_client import ConflictError, InvalidError, NotFoundError, RetryPolicy
 from lalaloc_core.bundle import default_bundle
 from service.errors import DeadlineExceededError
-from service.query.album_search import AlbumSearch
+from service.query.localiser import LocalLocaliser
+from service.query.queries import AlbumPhotographQuery
 from tests.client.conftest import MakeClient
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import HOME
@@ -59,21 +60,21 @@ def test_folder_is_pinned_corrected_and_taken_away(service: Any) -> None:
 
 
 def busy_for(calls: int) -> Callable[..., Any]:
-    """Return an `AlbumSearch.entry` that misses its deadline in so many calls after the first."""
-    left, entry = [0, *([1] * calls)], AlbumSearch.entry
+    """Return a `LocalLocaliser.answer` that misses its deadline in so many photographs of albums after the first."""
+    left, answer = [0, *([1] * calls)], LocalLocaliser.answer
 
-    async def encode(self: AlbumSearch, where: Any, query: Any) -> Any:
-        if left and left.pop(0):
+    async def busy(self: LocalLocaliser, where: Any, query: Any) -> Any:
+        if isinstance(query, AlbumPhotographQuery) and left and left.pop(0):
             raise DeadlineExceededError(1.0)
-        return await entry(self, where, query)
+        return await answer(self, where, query)
 
-    return encode
+    return busy
 
 
 def test_photographs_that_a_busy_service_refuses_are_sent_again(service: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(HOME).id).id
     album = service.create_album(plan_id)
-    monkeypatch.setattr(AlbumSearch, "entry", busy_for(3))
+    monkeypatch.setattr(LocalLocaliser, "answer", busy_for(3))
     added = list(service.add_to_album(album.id, [*FILES, b"no picture", EXAMPLES / "study.jpg"]))
     assert sorted((line.index, line.status) for line in added) == [(0, 201), (1, 201), (2, 422), (3, 201)]
     names = {line.index: line.name for line in added}
@@ -88,7 +89,7 @@ def test_photographs_are_sent_again_as_often_as_the_policy_allows(
     with make_client(str(app.base_url), retry=RetryPolicy(attempts=2)) as service:
         plan_id = service.wait_until_ready(service.upload_floorplan(HOME).id).id
         album = service.create_album(plan_id)
-        monkeypatch.setattr(AlbumSearch, "entry", calls)
+        monkeypatch.setattr(LocalLocaliser, "answer", calls)
         added = list(service.add_to_album(album.id, FILES))
         assert sorted(line.status for line in added) == [201, 504]
         assert added[-1].retry_after_s == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -265,6 +266,11 @@ class TestPage:
         for colours in (day, night):
             assert used <= set(re.findall(r"(--[\w-]+):", colours))
 
+    def test_charts_have_descriptions(self, page: Page) -> None:
+        drawings = [attributes for tag, attributes in page.tags if tag == "img"]
+        assert len(drawings) == 4
+        assert all(drawing["src"].startswith("data:image/svg+xml;base64,") and drawing["alt"] for drawing in drawings)
+
     def test_text_from_files_is_escaped(self, tmp_path: Path) -> None:
         query = prediction(scene=NASTY, room=NASTY, camera=NASTY, timings_ms={NASTY: 1.0})
         query = replace(query, stages={NASTY: query.stages["lpo"], "lpo": query.stages["lpo"]}, confidence=0.5)
@@ -282,7 +288,7 @@ class TestPage:
         )
         for runs in ([run], [run, run]):
             page, _ = page_of(*runs, out=tmp_path / "report.html")
-            assert not any(tag in ("img", "script") for tag, _ in page.tags)
+            assert all(attributes["src"].startswith("data:") for tag, attributes in page.tags if tag == "img")
             for words in (f"lalaloc {NASTY}", f"scene {NASTY}", f"{NASTY}, test split"):
                 assert words in page.text
 
@@ -330,7 +336,7 @@ class TestRuns:
         some = [replace(query, confidence=None) for query in mixed()]
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         assert "nothing to calibrate" in page.text
-        assert not any(caption.startswith("Confidence and share") for caption in page.tables)
+        assert sum(tag == "img" for tag, _ in page.tags) == 3
 
 
 class TestWorst:
@@ -339,3 +345,10 @@ class TestWorst:
         assert head == ["query", "room", "outcome", "position error", "heading error", "confidence"]
         assert [row[2] for row in rows[:4]] == ["no answer", "wrong room", "wrong room", "wrong alignment"]
         assert [row[3] for row in rows[:4]] == ["–", "6.00 m", "3.00 m", "1.50 m"]
+
+    def test_charts_are_written_as_files(self, tmp_path: Path) -> None:
+        write_report([run_folder(tmp_path / "run", mixed())], tmp_path / "report.html", pictures=tmp_path / "charts")
+        drawn = {path.stem: ElementTree.parse(path).getroot().tag for path in (tmp_path / "charts").iterdir()}
+        assert drawn == dict.fromkeys(
+            ("calibration", "error-curves", "outcomes", "times"), "{http://www.w3.org/2000/svg}svg"
+        )

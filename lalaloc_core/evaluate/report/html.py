@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lalaloc_core.evaluate.report import report_tables
+from lalaloc_core.evaluate.report.charts import Chart, draw_charts
 from lalaloc_core.evaluate.report.scored_runs import Run, open_runs
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.evaluate.runs.score import ALIGNMENT_LIMIT_M, Outcome
@@ -17,22 +18,33 @@ from lalaloc_core.files import atomic_write
 _WORST = 20
 
 
-def write_report(folders: Sequence[Path], out: Path) -> None:
-    """Write the report on some runs."""
+def write_report(folders: Sequence[Path], out: Path, *, pictures: Path | None = None) -> None:
+    """Write the report on some runs; `pictures` is a folder for the page's charts as files, None for none."""
     runs = open_runs(folders)
+    charts = draw_charts(runs)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(out, render_page(runs, charts))
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        for chart in charts.values():
+            atomic_write(pictures / f"{chart.name}.svg", chart.svg)
+
+
+def render_page(runs: Sequence[Run], charts: Mapping[str, Chart]) -> str:
+    """Return the page."""
     loader = PackageLoader("lalaloc_core.evaluate.report", "template")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     source, _, _ = loader.get_source(environment, "style.css")
-    page = environment.get_template("page.html").render(
+    return environment.get_template("page.html").render(
         title="Localisation: " + (runs[0].info.label if len(runs) == 1 else f"{len(runs)} runs"),
         style=source,
         parts=[(run, _facts(run)) for run in runs],
+        charts=charts,
         tables=report_tables,
         runs=runs,
         several=len(runs) > 1,
-        answered=any(run.predictions for run in runs),
         outcomes=[outcome.value for outcome in Outcome],
         alignment_limit_m=ALIGNMENT_LIMIT_M,
         worst_count=_WORST,
@@ -41,8 +53,6 @@ def write_report(folders: Sequence[Path], out: Path) -> None:
             f"{100.0 * limit_m:g} cm" if limit_m < 1.0 else f"{limit_m:g} m" for limit_m in report_tables.CURVE_POINTS_M
         ],
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(out, page)
 
 
 def _facts(run: Run) -> dict[str, str]:

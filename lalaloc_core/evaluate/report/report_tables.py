@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lalaloc_core.evaluate.report.charts import curves
 from lalaloc_core.evaluate.report.scored_runs import Run, stage_times
 from lalaloc_core.evaluate.runs.score import (
     Estimate,
@@ -64,14 +65,9 @@ def metric_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def curve_rows(runs: Sequence[Run]) -> list[Row]:
-    """Return the share of queries within each of `CURVE_POINTS_M`: by stage of a single run, or of all final poses."""
-    runs = [run for run in runs if run.predictions]
-    if len(runs) == 1 and len(runs[0].stages) > 1:
-        curves = {stage: position_errors_m(runs[0].predictions, stage) for stage in runs[0].stages}
-    else:
-        curves = {run.name: position_errors_m(run.predictions) for run in runs}
+    """Return the share of queries within each of `CURVE_POINTS_M`, per curve of the chart."""
     rows = []
-    for name, errors_m in curves.items():
+    for name, errors_m in curves([run for run in runs if run.predictions]).items():
         shares = [float(np.mean(errors_m <= limit_m)) for limit_m in CURVE_POINTS_M]
         rows.append(Row(run=name, part="", cells=tuple(Cell(percent(share)) for share in shares)))
     return rows

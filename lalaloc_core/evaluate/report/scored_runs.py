@@ -23,6 +23,7 @@ class Run:
     """
 
     name: str
+    folder: Path
     info: RunInfo
     predictions: list[Prediction]
     scores: Scores | None
@@ -41,11 +42,12 @@ def open_runs(folders: Sequence[Path]) -> list[Run]:
     return [
         Run(
             name=f"{number}. {_shortened(info.label)}" if several else _shortened(info.label),
+            folder=folder,
             info=info,
             predictions=predictions,
             scores=score(predictions) if predictions else None,
         )
-        for number, (info, predictions) in enumerate(read_runs(folders), start=1)
+        for number, (folder, (info, predictions)) in enumerate(zip(folders, read_runs(folders), strict=True), start=1)
     ]
 
 
