@@ -23,8 +23,8 @@ THUMBNAIL_SIDE = 504
 # Relative deviation of a ratio of sides; editors round.
 _TOLERANCE = 0.01
 # Eyes of a stereo picture: height and width (pixels) of compared pictures, the smallest correlation of two eyes (other
-# pictures reach 0.45), and the largest shift between them (pixels).
-_EYE, _MIN_CORRELATION, _MAX_SHIFT = (32, 64), 0.65, 3
+# pictures reach 0.57, a plain corridor seen both ways), and the largest shift between them (pixels).
+_EYE, _MIN_CORRELATION, _MAX_SHIFT = (64, 128), 0.75, 6
 # Bars: largest spread of grey levels along a row, and least share of the height.
 _MAX_BAR_SPREAD, _MIN_BARS = 4.0, 0.02
 # Circles: side (pixels) of judged squares, radii of the ring inside and of the corners, and grey levels of the corners.

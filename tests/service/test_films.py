@@ -66,7 +66,7 @@ def test_frames_of_a_film_become_poses(client: httpx.Client, flat: str, film: by
 @pytest.mark.parametrize(
     ("fields", "field", "message"),
     [
-        ({"motion": "walk"}, "motion", "is 'walk'; a film needs motion=turn"),
+        ({"motion": "walk"}, "motion", "photographs of a walk are no query of their own"),
         ({"relative_heading_deg": "[0, 20]"}, "relative_heading_deg", "does not go with a film"),
         ({"headings_deg": "[0, 20]"}, "headings_deg", "does not go with a film"),
     ],
