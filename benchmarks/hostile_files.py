@@ -7,7 +7,7 @@ import json
 import math
 import random
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,11 +31,9 @@ class HostilePlan:
     options: ImportOptions
 
 
-def plans(
-    format: str, makers: Mapping[str, Callable[[int], bytes]], options: ImportOptions = NONE
-) -> Iterator[HostilePlan]:
-    """Yield the kinds of hostile files of a format, by their titles."""
-    return (HostilePlan(format, title, make, options) for title, make in makers.items())
+def plan(format: str, title: str, make: Callable[[int], bytes], options: ImportOptions = NONE) -> HostilePlan:
+    """Return a kind of hostile files."""
+    return HostilePlan(format, title, make, options)
 
 
 def star(points: int, size: float = 20.0) -> list[Point]:
@@ -246,65 +244,59 @@ def _stacked(size: int) -> bytes:
 
 
 MODELS = (
-    *plans("roomplan", {
-        "numbers of 1e308": _huge_roomplan,
-        "a floor that crosses itself": lambda s: _roomplan((), [_scanned_floor(star(s // 18))]),
-        "stars of 15 corners": lambda s: _roomplan((), map(_scanned_floor, stars(s, 15, 24))),
-        "walls that cross": lambda s: _roomplan([_scanned_wall(*c) for c in chords(s // 120)]),
-        "a lattice of walls": lambda s: _roomplan([_scanned_wall(*c) for c in lattice(s // 120)]),
-        "floors that coincide": lambda s: _roomplan((), map(_scanned_floor, boxes(s // 140))),
-        "sections of no room": _sections,
-    }),
-    *plans("ros", {
-        "nested aliases": _aliases,
-        "nested merge keys": _merges,
-        "nested lists": lambda s: _ros(_MAP + b"a: " + b"[" * min(s, 60_000)),
-        "nested blocks": lambda s: _ros(_MAP + b"a:\n " + b"- " * min(s // 2, 30_000)),
-        "a number in base 60": lambda s: _ros(_MAP[:17] + b"resolution: 1" + b":1" * min(s // 2, 30_000)),
-        "keys": lambda s: _ros(_MAP + b"".join(b"a%d: {b: [1, 2]}\n" % k for k in range(2800))),
-        "noise": lambda s: _ros(_MAP, b"P5\n%d %d\n255\n" % ((side := math.isqrt(s * 8),) * 2) + _noise(side)),
-        "checkerboard of 36 megapixels": lambda _: _zip({"map.yaml": _MAP.replace(b"pgm", b"png"), "map.png": _png(_checkerboard(20))}),
-        "empty map of 36 megapixels": lambda s: _ros(_MAP, b"P5\n6000 6000\n255\n" + bytes([254]) * 36_000_000),
-    }),
-    *plans("osm", {
-        "latitude nan": lambda s: _osm([boxes(1)[0]]).replace(b'lat="0.00000000"', b'lat="nan"'),
-        "longitude 1e308": lambda s: _osm([boxes(1)[0]]).replace(b'lon="0.00000000"', b'lon="1e308"'),
-        "a room that crosses itself": lambda s: _osm([star(s // 75)]),
-        "stars of 15 corners": lambda s: _osm(stars(s, 15, 75)),
-        "one way in many multipolygons": _multipolygons,
-        "rooms that coincide": lambda s: _osm(boxes(s // 400, 0.1)),
-    }),
-    *plans("geojson", {
-        "numbers of 1e308": lambda s: _geojson([[(0.0, 0.0), (LARGEST_NUMBER, 0.0), (0.0, 5.0)]]),
-        "a room that crosses itself": lambda s: _geojson([star(s // 16)]),
-        "stars of 15 corners": lambda s: _geojson(stars(s, 15, 20)),
-        "rooms that coincide": lambda s: _geojson(boxes(s // 150)),
-        "columns that coincide": lambda s: _geojson([star(5, 9.0), *boxes(s // 170)], kind="column"),
-        "holes that coincide": _geojson_holes,
-        "doors that cross": _geojson_lines,
-        "200 levels": lambda s: _geojson(boxes(s // 200, 6.0), level=";".join(map(str, range(200)))),
-    }),
-    *plans("native", {
-        "a room that crosses itself": lambda s: _native([star(s // 16)]),
-        "stars of 15 corners": lambda s: _native(stars(s, 15, 20)),
-        "rooms that coincide": lambda s: _native(boxes(s // 60)),
-        "doors that cross": lambda s: _native(boxes(1, size=20.0), chords(s // 60)),
-    }),
-    *plans("indoorgml", {
-        "a cell that crosses itself": lambda s: _indoorgml([[(x, y, 0.0) for x, y in star(s // 20)]]),
-        "faces that coincide": _stacked,
-        "numbers of 1e308": lambda s: _indoorgml([[(0.0, 0.0, 0.0), (1e308, 0.0, 0.0), (0.0, 5.0, 0.0)]]),
-    }),
+    plan("roomplan", "numbers of 1e308", _huge_roomplan),
+    plan("roomplan", "a floor that crosses itself", lambda s: _roomplan((), [_scanned_floor(star(s // 18))])),
+    plan("roomplan", "stars of 15 corners", lambda s: _roomplan((), map(_scanned_floor, stars(s, 15, 24)))),
+    plan("roomplan", "walls that cross", lambda s: _roomplan([_scanned_wall(*c) for c in chords(s // 120)])),
+    plan("roomplan", "a lattice of walls", lambda s: _roomplan([_scanned_wall(*c) for c in lattice(s // 120)])),
+    plan("roomplan", "floors that coincide", lambda s: _roomplan((), map(_scanned_floor, boxes(s // 140)))),
+    plan("roomplan", "sections of no room", _sections),
+    plan("ros", "nested aliases", _aliases),
+    plan("ros", "nested merge keys", _merges),
+    plan("ros", "nested lists", lambda s: _ros(_MAP + b"a: " + b"[" * min(s, 60_000))),
+    plan("ros", "nested blocks", lambda s: _ros(_MAP + b"a:\n " + b"- " * min(s // 2, 30_000))),
+    plan("ros", "a number in base 60", lambda s: _ros(_MAP[:17] + b"resolution: 1" + b":1" * min(s // 2, 30_000))),
+    plan("ros", "keys", lambda s: _ros(_MAP + b"".join(b"a%d: {b: [1, 2]}\n" % k for k in range(2800)))),
+    plan("ros", "noise", lambda s: _ros(_MAP, b"P5\n%d %d\n255\n" % ((side := math.isqrt(s * 8),) * 2) + _noise(side))),
+    plan(
+        "ros",
+        "checkerboard of 36 megapixels",
+        lambda _: _zip({"map.yaml": _MAP.replace(b"pgm", b"png"), "map.png": _png(_checkerboard(20))}),
+    ),
+    plan(
+        "ros", "empty map of 36 megapixels", lambda s: _ros(_MAP, b"P5\n6000 6000\n255\n" + bytes([254]) * 36_000_000)
+    ),
+    plan("osm", "latitude nan", lambda s: _osm([boxes(1)[0]]).replace(b'lat="0.00000000"', b'lat="nan"')),
+    plan("osm", "longitude 1e308", lambda s: _osm([boxes(1)[0]]).replace(b'lon="0.00000000"', b'lon="1e308"')),
+    plan("osm", "a room that crosses itself", lambda s: _osm([star(s // 75)])),
+    plan("osm", "stars of 15 corners", lambda s: _osm(stars(s, 15, 75))),
+    plan("osm", "one way in many multipolygons", _multipolygons),
+    plan("osm", "rooms that coincide", lambda s: _osm(boxes(s // 400, 0.1))),
+    plan("geojson", "numbers of 1e308", lambda s: _geojson([[(0.0, 0.0), (LARGEST_NUMBER, 0.0), (0.0, 5.0)]])),
+    plan("geojson", "a room that crosses itself", lambda s: _geojson([star(s // 16)])),
+    plan("geojson", "stars of 15 corners", lambda s: _geojson(stars(s, 15, 20))),
+    plan("geojson", "rooms that coincide", lambda s: _geojson(boxes(s // 150))),
+    plan("geojson", "columns that coincide", lambda s: _geojson([star(5, 9.0), *boxes(s // 170)], kind="column")),
+    plan("geojson", "holes that coincide", _geojson_holes),
+    plan("geojson", "doors that cross", _geojson_lines),
+    plan("geojson", "200 levels", lambda s: _geojson(boxes(s // 200, 6.0), level=";".join(map(str, range(200))))),
+    plan("native", "a room that crosses itself", lambda s: _native([star(s // 16)])),
+    plan("native", "stars of 15 corners", lambda s: _native(stars(s, 15, 20))),
+    plan("native", "rooms that coincide", lambda s: _native(boxes(s // 60))),
+    plan("native", "doors that cross", lambda s: _native(boxes(1, size=20.0), chords(s // 60))),
+    plan("indoorgml", "a cell that crosses itself", lambda s: _indoorgml([[(x, y, 0.0) for x, y in star(s // 20)]])),
+    plan("indoorgml", "faces that coincide", _stacked),
+    plan(
+        "indoorgml", "numbers of 1e308", lambda s: _indoorgml([[(0.0, 0.0, 0.0), (1e308, 0.0, 0.0), (0.0, 5.0, 0.0)]])
+    ),
 )
 PICTURES = (
-    *plans("picture", {
-        "white, 36 megapixels": lambda s: _png(Image.new("L", (6000, 6000), 255)),
-        "checkerboard of 20 pixels": lambda s: _png(_checkerboard(20)),
-        "checkerboard of 8 pixels": lambda s: _png(_checkerboard(8)),
-        "lattice of 100 pixels": lambda s: _png(_grid(100, 20)),
-        "lattice of 300 pixels": lambda s: _png(_grid(300, 20)),
-        "lattice of two lines": lambda s: _png(_grid(60, 3)),
-        "noise": lambda s: _png(_noise_picture(math.isqrt(8 * s))),
-        "coarse noise": lambda s: _png(_noise_picture(300).resize((6000, 6000), 0)),
-    }, _DRAFT),
+    plan("picture", "white, 36 megapixels", lambda s: _png(Image.new("L", (6000, 6000), 255)), _DRAFT),
+    plan("picture", "checkerboard of 20 pixels", lambda s: _png(_checkerboard(20)), _DRAFT),
+    plan("picture", "checkerboard of 8 pixels", lambda s: _png(_checkerboard(8)), _DRAFT),
+    plan("picture", "lattice of 100 pixels", lambda s: _png(_grid(100, 20)), _DRAFT),
+    plan("picture", "lattice of 300 pixels", lambda s: _png(_grid(300, 20)), _DRAFT),
+    plan("picture", "lattice of two lines", lambda s: _png(_grid(60, 3)), _DRAFT),
+    plan("picture", "noise", lambda s: _png(_noise_picture(math.isqrt(8 * s))), _DRAFT),
+    plan("picture", "coarse noise", lambda s: _png(_noise_picture(300).resize((6000, 6000), 0)), _DRAFT),
 )
