@@ -1,4 +1,4 @@
-"""What calibration fits and measures: parameters of matching cost, confidence and covariance, errors of predictions.
+"""Results of calibration: parameters of matching cost, confidence and covariance, errors of predictions.
 
 Predictions are drawn from the measured errors. Those of log distances are normal scores with the measured correlation
 around the horizon, mapped to the measured quantiles. Their correlation at large angles is that of the error of scale,

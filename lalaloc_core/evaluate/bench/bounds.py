@@ -1,4 +1,4 @@
-"""What a better encoder could gain: accuracy with the true layout in place of predictions, and causes of what misses.
+"""Possible gains of a better encoder: accuracy with the true layout in place of predictions, and causes of what misses.
 
 Walls have independent errors of log distance, openings and ceiling none. Whatever is missed with exact predictions, no
 encoder can find: other evidence must.

@@ -1,4 +1,4 @@
-"""What a benchmark measures on, and the summary of its answers."""
+"""Setting of a benchmark, and the summary of its answers."""
 
 from __future__ import annotations
 

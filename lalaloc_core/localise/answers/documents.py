@@ -238,7 +238,7 @@ class PossiblePose:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What an answer was composed of, to draw it."""
+    """Parts that an answer was composed of, to draw it."""
 
     ground: Ground
     found: Localisation
