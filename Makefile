@@ -1,5 +1,8 @@
 # Tasks for users and developers; `make help` lists them.
 
+# Bytecode is kept, even where the environment says otherwise: every test that starts a process would compile it again.
+unexport PYTHONDONTWRITEBYTECODE
+
 PYTHON ?= python3
 PORT ?= 8000
 VENV := .venv

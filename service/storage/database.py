@@ -56,6 +56,7 @@ _DISK_FULL = "53100"
 # Beginnings of the names of SQLite's errors for a damaged file, and what to do about it.
 _DAMAGED = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
 _RESTORE = "stop the service, and restore a backup (lalaloc-service restore)"
+_IS_DAMAGED = f"the database file is damaged: {_RESTORE}"
 # Silence (ms) after which a connection counts as broken.
 _SILENCE_MS = 5000
 
@@ -136,7 +137,11 @@ class Database:
 
         Raises:
             StoreFullError: the disk has no room for the data.
+            StoreUnavailableError: the file is damaged; what another connection could still write, a restored backup
+                would not have.
         """
+        if self._is_damaged:
+            raise StoreUnavailableError(_IS_DAMAGED)
         with self._transaction(self.engine_for_writing) as connection:
             if grows_by and self._disk is not None:
                 self._disk.check(connection, grows_by)
@@ -254,12 +259,11 @@ class Database:
         reason = {"reason": str(cause).strip()[:300]}
         log = logging.getLogger(LOGGER_NAME)
         if _tells_damage(cause):
-            # Once: every request fails from now on.
             if not self._is_damaged:
                 fields = {**reason, "file": self._path, "remedy": _RESTORE}
                 log.error("the database file is damaged", extra={"fields": fields})
             self._is_damaged = True
-            return StoreUnavailableError(f"the database file is damaged: {_RESTORE}")
+            return StoreUnavailableError(_IS_DAMAGED)
         is_full = getattr(cause, "sqlite_errorname", None) == "SQLITE_FULL"
         if is_full or getattr(cause, "sqlstate", None) == _DISK_FULL:
             log.warning("database full", extra={"fields": reason})
