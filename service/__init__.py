@@ -11,7 +11,7 @@ venues/     the plans of a venue that a photograph is compared with
 grids/      pose grids of plans, computed once for all replicas
 plan_files/ plan files, read and written in worker processes
 storage/    database: plans, pose grids, keys, kept answers
-capacity/   who may compute, send bytes, or hold memory, now
+capacity/   who may compute or send bytes, now
 pools/      pools of worker processes
 workers/    common loop of the worker processes
 security/   API keys, scopes, rate limits
@@ -21,7 +21,8 @@ cli/        command line
 on_ray/     the service on several machines
 web/        web pages, built from web/ beside this package
 
-Also here: `errors.py` (errors and their HTTP problems), `plan_documents.py`, `uploaded_file.py`, `openapi.py`.
+Also here: `errors.py` (errors and their HTTP problems), `query_context.py` (client and deadline of a query),
+`bounded_cache.py`, `plan_documents.py`, `uploaded_file.py`, `openapi.py`.
 """
 
 import os

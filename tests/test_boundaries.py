@@ -95,9 +95,9 @@ FORBIDDEN = {
 }
 # Layers of the service, above the layers of the core, lowest first.
 SERVICE_LAYERS = (
-    "uploaded_file capacity.fair_share capacity.cpu_accounts capacity.cores capacity.bounded_cache",
+    "uploaded_file bounded_cache capacity.fair_share capacity.cpu_accounts capacity.cores",
     "settings errors schemas plan_documents",
-    "telemetry",
+    "telemetry query_context",
     "capacity",
     # Programs of worker processes, which do not import their supervisors.
     "workers plan_files.plan_mesh",

@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 
 from lalaloc_core.errors import InvalidInputError
 from service import errors
-from service.capacity.query_context import QueryContext
 from service.capacity.threads import BoundedReads
 from service.query import AlbumProgress, AlbumQuery, Localiser
+from service.query_context import QueryContext
 from service.schemas.albums import AlbumDocument
 from service.settings import Settings
 from service.storage import PlanLookup, Store

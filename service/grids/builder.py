@@ -12,7 +12,7 @@ from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.capacity.fair_share import FairSemaphore
 from service.errors import (
     PlanFailedError,

@@ -25,7 +25,7 @@ from lalaloc_core.localise.venue.index_search import (
     ShardSizes,
 )
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.errors import DeadlineExceededError
 from service.on_ray.remote import Failure, Success, result_of
 from service.settings import Settings

@@ -17,7 +17,7 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.localise.localisability.predicted_localisability import errors_of
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.capacity.fair_share import FairSemaphore, Shares
 from service.capacity.threads import Threads
 from service.errors import DamagedDataError, OverloadedError, UnknownFloorPlanError, UnmeasuredModelError

@@ -8,7 +8,6 @@ request states about the camera, waits for its plan or venue, and returns its `g
 `geopose.py` translates answers. `queries.py` has the queries.
 """
 
-from service.capacity.query_context import QueryContext
 from service.query.executor import Executor, Optimiser
 from service.query.grounds import Grounds
 from service.query.localiser import Localiser, LocalLocaliser
@@ -32,3 +31,4 @@ from service.query.queries import (
 )
 from service.query.session_query import MAX_POSES
 from service.query.single_query import QueryParts
+from service.query_context import QueryContext

@@ -19,8 +19,8 @@ from lalaloc_core.localise.encode.features import encodes_spheres
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from service.bounded_cache import BoundedCache
 from service.capacity.admission_control import Slots
-from service.capacity.bounded_cache import BoundedCache
 from service.capacity.fair_share import FairSemaphore
 from service.capacity.threads import Threads
 from service.query.album_answers import compose_outcome

@@ -15,9 +15,9 @@ from typing import Any, Protocol, TypeVar
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult, refine_walls, refined_by_walls
 from lalaloc_core.localise.search.pipeline import next_step
 from service.capacity.fair_share import FairSemaphore, with_headroom
-from service.capacity.query_context import QueryContext
 from service.capacity.threads import Threads
 from service.pools import LostReason, PoolState
+from service.query_context import QueryContext
 from service.settings import Settings
 from service.telemetry import LOGGER_NAME, Telemetry
 

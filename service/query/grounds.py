@@ -17,12 +17,12 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Hints, Near, Query, rooms_named
 from service.capacity.admission_control import Slots
-from service.capacity.query_context import QueryContext
 from service.capacity.threads import BoundedReads
 from service.errors import PlanFailedError, PlanNotReadyError, VenueUnsearchableError
 from service.grids import GridProvider, check_height_m, grid_height_m
 from service.query.executor import Executor
 from service.query.ground import Ground
+from service.query_context import QueryContext
 from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HeightFields, HintFields, PlanPoint
 from service.storage.records import PlanRecord, VenueRecord

@@ -16,10 +16,10 @@ from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
 from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.turn_angles import TurnAngles
-from service.capacity.query_context import QueryContext
 from service.decoding.decoder import Decoder
 from service.query.executor import Executor
 from service.query.queries import Content
+from service.query_context import QueryContext
 from service.schemas import LocaliseForm, PhotographForm, StatedHeading
 from service.uploaded_file import UploadedFile
 

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 from lalaloc_core.draw.answer import Picture
 from lalaloc_core.photograph import Photograph
-from service.capacity.query_context import QueryContext
+from service.query_context import QueryContext
 from service.schemas import (
     LocaliseAnswer,
     LocaliseForm,

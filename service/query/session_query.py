@@ -19,7 +19,7 @@ from lalaloc_core.localise.tracking import TrackState
 from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.tracking.walk_motion import WalkGraph
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.errors import SessionOutdatedError
 from service.query.geopose import geopose_at
 from service.query.ground import Ground

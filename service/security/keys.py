@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.errors import StoreBusyError, StoreUnavailableError
 from service.storage.api_keys import ApiKeys
 from service.storage.database import CircuitBreaker

@@ -16,7 +16,7 @@ from sqlalchemy import Connection, select
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.query import DEFAULT_STD_M
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.plan_documents import PlanDocument
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Row, delete, func, select, true, update
 
 from lalaloc_core.floorplan import FloorPlan
-from service.capacity.bounded_cache import SingleFlight
+from service.bounded_cache import SingleFlight
 from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.plan_documents import PlanDocument, StoredPlan
 from service.storage.album_rows import delete_albums

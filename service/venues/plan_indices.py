@@ -20,7 +20,7 @@ from sqlalchemy import Row
 from lalaloc_core.localise.venue.index_search import DividedIndex
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.capacity.threads import BoundedReads
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider

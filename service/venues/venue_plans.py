@@ -17,7 +17,7 @@ from lalaloc_core.localise.match import MatchingConfig, PoseGrid
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Query
 from lalaloc_core.localise.venue.index_search import DividedIndex
 from lalaloc_core.localise.venue.prototypes import most_probable
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.capacity.threads import BoundedReads, IdleCores
 from service.grids import GridProvider
 from service.schemas.query_fields import HeightFields

@@ -18,9 +18,9 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import HintName, Query
 from service.capacity.admission_control import Slots
-from service.capacity.query_context import QueryContext
 from service.errors import VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
+from service.query_context import QueryContext
 from service.schemas.query_fields import HeightFields
 from service.storage.records import PlanRecord
 from service.venues.plan_indices import IndexSource

@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.render.sampling import PoseSet
-from service.capacity.bounded_cache import BoundedCache
+from service.bounded_cache import BoundedCache
 from service.storage import Store
 from service.storage.records import GridKey, NewPlan, Original, VenueMember
 from service.storage.tables import FLOORPLANS, TENANTS
