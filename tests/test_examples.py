@@ -119,6 +119,7 @@ def test_incomplete_localisation_is_rejected(changes: dict[str, Any], message: s
         check_localisation(_localisation(**changes))
 
 
+@pytest.mark.slow
 def test_demo_runs_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
     out = tmp_path / "demo.png"
     environment = {**os.environ, "LALALOC_BUNDLE": str(tiny_bundle)}

@@ -113,6 +113,7 @@ def test_json_examples_are_valid(tmp_path: Path) -> None:
     assert "plan-format.md" in kinds
 
 
+@pytest.mark.slow
 def test_tutorial_leads_to_its_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

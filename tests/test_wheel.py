@@ -33,6 +33,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
+@pytest.mark.slow
 def test_wheel_has_model_example_and_page(wheel: Path) -> None:
     assert wheel.name == f"lalaloc-{__version__}-py3-none-any.whl"
     names = set(zipfile.ZipFile(wheel).namelist())

@@ -134,7 +134,8 @@ def _blocking(*arguments: Any, **options: Any) -> Iterator[_BlockingAdapter]:
         runner.run(client.close())
 
 
-@pytest.fixture(params=["sync", "async"])
+# The client that blocks is generated from the other one, so that a test with either runs the same lines.
+@pytest.fixture(params=["sync", pytest.param("async", marks=pytest.mark.slow)])
 def make_client(request: pytest.FixtureRequest) -> MakeClient:
     """Return a function that creates a client of either kind."""
     return Client if request.param == "sync" else _blocking

@@ -18,7 +18,7 @@ from tests.service.conftest import StartApp
 
 ROOT = Path(__file__).parents[2]
 ADDRESS = "http://127.0.0.1:8000"
-DESCRIPTION: dict[str, Any] = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
+DESCRIPTION: dict[str, Any] = yaml.load((ROOT / "openapi.yaml").read_bytes(), yaml.CSafeLoader)
 # Programs that were generated before call their methods by these names, so none may change or go.
 NAMES = """
     createFloorplan listFloorplans getFloorplan replaceFloorplan deleteFloorplan getOriginal getExport getPreview

@@ -104,6 +104,7 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
     _over_stdio(str(app.base_url), talk)
 
 
+@pytest.mark.slow
 def test_folder_is_pinned(start_app: StartApp, flat: Path, tmp_path: Path, sphere: bytes) -> None:
     folder = tmp_path / "visit"
     folder.mkdir()
@@ -128,38 +129,37 @@ def test_folder_is_pinned(start_app: StartApp, flat: Path, tmp_path: Path, spher
         _over_stdio(str(app.base_url), talk)
 
 
-@pytest.mark.parametrize(
-    ("tool", "arguments", "remedy"),
-    [
-        ("localise_photograph", {"photograph": "/missing.jpg", "floorplan_id": "x"}, "give the full path"),
-        ("localise_photograph", {"photograph": _JPEG + "###", "floorplan_id": "x"}, "not valid base64"),
-        ("localise_photograph", {"photograph": "data:text/plain,hello", "floorplan_id": "x"}, "base64"),
-        ("localise_photograph", {"photograph": _JPEG + "aGVsbG8="}, "list_plans names the stored plans"),
-        ("localise_photograph", {"photograph": _JPEG + "aGVsbG8=", "floorplan_id": "unknown"}, "unknown"),
-        ("import_plan", {"plan": "data:text/plain;base64,aGVsbG8="}, "plan"),
-        ("localise_turn", {"floorplan_id": "x"}, "either photographs or film"),
-        ("localise_turn", {"floorplan_id": "x", "photographs": [_JPEG + "aGVsbG8="]}, "2 to 64"),
-        ("pin_folder", {"floorplan_id": "x"}, "either folder or photographs"),
-        ("pin_folder", {"floorplan_id": "x", "folder": "/missing"}, "no folder '/missing'"),
-        ("pin_folder", {"floorplan_id": "x", "photographs": []}, "1 to 500"),
-        ("localise_turn", {"floorplan_id": "x", "film": _JPEG + "aGVsbG8="}, ""),
-    ],
-)
-def test_bad_input_is_an_error_of_the_tool_with_the_remedy(
-    app: httpx.Client, tool: str, arguments: dict[str, Any], remedy: str
-) -> None:
+_BAD_INPUT: list[tuple[str, dict[str, Any], str]] = [
+    ("localise_photograph", {"photograph": "/missing.jpg", "floorplan_id": "x"}, "give the full path"),
+    ("localise_photograph", {"photograph": _JPEG + "###", "floorplan_id": "x"}, "not valid base64"),
+    ("localise_photograph", {"photograph": "data:text/plain,hello", "floorplan_id": "x"}, "base64"),
+    ("localise_photograph", {"photograph": _JPEG + "aGVsbG8="}, "list_plans names the stored plans"),
+    ("localise_photograph", {"photograph": _JPEG + "aGVsbG8=", "floorplan_id": "unknown"}, "unknown"),
+    ("import_plan", {"plan": "data:text/plain;base64,aGVsbG8="}, "plan"),
+    ("localise_turn", {"floorplan_id": "x"}, "either photographs or film"),
+    ("localise_turn", {"floorplan_id": "x", "photographs": [_JPEG + "aGVsbG8="]}, "2 to 64"),
+    ("pin_folder", {"floorplan_id": "x"}, "either folder or photographs"),
+    ("pin_folder", {"floorplan_id": "x", "folder": "/missing"}, "no folder '/missing'"),
+    ("pin_folder", {"floorplan_id": "x", "photographs": []}, "1 to 500"),
+    ("localise_turn", {"floorplan_id": "x", "film": _JPEG + "aGVsbG8="}, ""),
+]
+
+
+def test_bad_input_is_an_error_of_the_tool_with_the_remedy(app: httpx.Client) -> None:
     async def talk(client: Any) -> None:
-        result = await client.call_tool(tool, arguments)
-        assert result.is_error
-        (text,) = _texts(result)
-        assert remedy in text
-        assert "Traceback" not in text
-        # The SDK names no cause of a crash.
-        assert text.startswith(f"Error executing tool {tool}: ")
+        for tool, arguments, remedy in _BAD_INPUT:
+            result = await client.call_tool(tool, arguments)
+            assert result.is_error
+            (text,) = _texts(result)
+            assert remedy in text
+            assert "Traceback" not in text
+            # The SDK names no cause of a crash.
+            assert text.startswith(f"Error executing tool {tool}: ")
 
     _over_stdio(str(app.base_url), talk)
 
 
+@pytest.mark.slow
 def test_service_that_does_not_run_is_named(photograph: Path) -> None:
     async def talk(client: Any) -> None:
         asked = {"photograph": str(photograph), "floorplan_id": "x"}

@@ -119,6 +119,7 @@ def test_all_photographs_are_pinned_to_their_rooms(
     assert album.cameras[0].photographs == 1
 
 
+@pytest.mark.slow
 def test_solve_does_not_depend_on_the_order_of_arrival(
     ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
 ) -> None:
@@ -140,6 +141,7 @@ def test_memory_gives_the_same_pins_after_storage(
         AlbumMemory.read(memory.to_bytes()[:200])
 
 
+@pytest.mark.slow
 def test_memory_of_another_plan_is_not_used(
     ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
 ) -> None:
@@ -198,6 +200,7 @@ def _facade(seed: int) -> bytes:
     return content.getvalue()
 
 
+@pytest.mark.slow
 def test_photographs_of_a_facade_are_set_aside(
     ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
 ) -> None:
@@ -351,6 +354,7 @@ def test_moved_pins_are_those_that_moved_far_or_changed_their_room() -> None:
     assert moved == {"far": (0.6, False), "room": (0.0, True), "gone": (None, True), "plan": (None, True)}
 
 
+@pytest.mark.slow
 def test_places_that_are_too_large_are_refused(encoder: PhotographEncoder, photographs: list[AlbumPhotograph]) -> None:
     squares = [
         {"polygon": [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]}

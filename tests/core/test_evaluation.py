@@ -103,6 +103,7 @@ class TestRunning:
         there = run_evaluation(RunFolder(tmp_path / "there"), layout_run, workers=2)
         assert without_times(here) == without_times(there)
 
+    @pytest.mark.slow
     def test_interrupted_run_resumes_to_the_same_file(self, layout_run: RunInfo, tmp_path: Path) -> None:
         whole = RunFolder(tmp_path / "whole")
         expected = run_evaluation(whole, layout_run, workers=0)
@@ -115,6 +116,7 @@ class TestRunning:
         assert without_times(broken.read_predictions()) == without_times(expected)
         assert broken.read_info().command == "again"
 
+    @pytest.mark.slow
     def test_larger_limit_continues_the_run(self, layout_run: RunInfo, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path)
         first = run_evaluation(folder, dataclasses.replace(layout_run, limit=3), workers=0)

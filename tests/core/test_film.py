@@ -47,7 +47,9 @@ def check_turn(film: Film) -> None:
     assert film.warnings == ()
 
 
-@pytest.mark.parametrize(("name", "options"), [("turn.mov", HEVC), ("turn.webm", VP9)])
+@pytest.mark.parametrize(
+    ("name", "options"), [("turn.mov", HEVC), pytest.param("turn.webm", VP9, marks=pytest.mark.slow)]
+)
 def test_film_of_any_codec_gives_angles(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
     check_turn(read_film(encode(turn(), tmp_path / name, *options), stated=FIELD))
 
@@ -71,6 +73,7 @@ def test_film_is_upright_by_its_metadata(tmp_path: Path) -> None:
     assert misses_deg(film).max() < 1.5
 
 
+@pytest.mark.slow
 def test_times_are_those_of_the_frames(h264: bytes, tmp_path: Path) -> None:
     source, target = tmp_path / "turn.mp4", tmp_path / "late.mp4"
     source.write_bytes(h264)
@@ -80,6 +83,7 @@ def test_times_are_those_of_the_frames(h264: bytes, tmp_path: Path) -> None:
     assert not [time_s for time_s in film.times_s if 3.1 < time_s < 4.9]
 
 
+@pytest.mark.slow
 def test_frames_at_the_rate_of_samples_are_all_used(tmp_path: Path) -> None:
     source, target = tmp_path / "turn.mp4", tmp_path / "turn.webm"
     encode(turn()[:30], source)
@@ -105,6 +109,7 @@ def test_plain_wall_is_passed_at_the_usual_speed(tmp_path: Path) -> None:
     assert any(f"nothing links {len(assumed)} of the" in warning for warning in film.warnings)
 
 
+@pytest.mark.slow
 def test_blank_frames_at_unknown_angles_are_left_out(tmp_path: Path) -> None:
     blank = np.full_like(turn()[0], 128)
     film = read_film(encode([*turn()[:36], *[blank] * 25], tmp_path / "wall.mp4"), stated=FIELD)

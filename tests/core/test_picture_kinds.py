@@ -46,7 +46,9 @@ def test_drawn_and_scanned_plans_are_not_taken_for_photographs(style: Style) -> 
     assert not tones.is_photograph
 
 
-@pytest.mark.parametrize("style", ["thin", "thick", "hatched", "coloured"])
+@pytest.mark.parametrize(
+    "style", ["coloured", *(pytest.param(style, marks=pytest.mark.slow) for style in ("thin", "thick", "hatched"))]
+)
 def test_plans_with_coloured_rooms_are_drawings(style: Style) -> None:
     picture = Image.open(io.BytesIO(draw_plan(style, 3).png())).convert("RGB")
     rng = np.random.default_rng(0)
@@ -102,6 +104,7 @@ def test_map_of_streets_is_refused() -> None:
         import_plan(json.dumps({"type": "FeatureCollection", "features": features}).encode())
 
 
+@pytest.mark.slow
 def test_scanned_plan_is_read_as_before() -> None:
     drawn = draw_plan("scanned", 3)
     plan = import_plan(drawn.jpeg(), ImportOptions(metres_per_pixel=drawn.metres_per_pixel))

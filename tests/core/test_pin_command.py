@@ -117,6 +117,7 @@ def test_originals_stay_and_copies_have_the_same_pixels(pinned: tuple[Path, Path
         assert ExifTags.GPS.GPSImgDirection in gps
 
 
+@pytest.mark.slow
 def test_a_new_revision_lists_what_moved(
     pinned: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,6 +215,7 @@ def test_other_formats_get_a_file_beside_them(kind: str) -> None:
     assert (stated["Location"], stated["GPSImgDirection"]) == ("Küche", "27124/100")
 
 
+@pytest.mark.slow
 def test_files_of_one_name_get_files_beside_them_of_two(
     tmp_path: Path, pinned: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -226,6 +226,7 @@ def test_rooms_have_structured3d_types() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_written_scene_is_read_back(root: Path) -> None:
     dataset = Structured3D(root)
     assert dataset.sphere_size == (HEIGHT, 2 * HEIGHT)

@@ -304,6 +304,7 @@ def sphere() -> np.ndarray:
     return pictures(1, TINY.trunk)[0].numpy()
 
 
+@pytest.mark.slow
 class TestBundle:
     def test_relu6_is_fused_into_convolutions(self, bundle: Bundle) -> None:
         # onnxruntime fuses clips with constant limits.

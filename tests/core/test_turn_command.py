@@ -50,6 +50,7 @@ def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert answer["poses"][0]["time_s"] < 0.2
 
 
+@pytest.mark.slow
 def test_features_of_a_turn_are_sent_with_its_angles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "turn").mkdir()
     for index, frame in enumerate(turn()[:12:4]):

@@ -66,6 +66,7 @@ def test_plan_is_written_although_the_reader_of_the_report_left(file: Path, tmp_
     assert len(FloorPlan.from_json(out.read_bytes()).rooms) == 3
 
 
+@pytest.mark.slow
 def test_export_to_dxf_logs_nothing(file: Path, tmp_path: Path):
     run = _run(
         "plan", "export", str(file), "--format", "dxf", "--out", str(tmp_path / "flat.dxf"), stderr=subprocess.PIPE

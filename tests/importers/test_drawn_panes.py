@@ -106,7 +106,13 @@ def _model() -> Model:
     return Model(rooms, ["kitchen", "bedroom"], openings, walls, (12.5, 7.2), (0.0, 0.0))
 
 
-@pytest.mark.parametrize(("format", "style"), list(itertools.product(("svg", "dxf", "pdf"), FILE_STYLES)))
+@pytest.mark.parametrize(
+    ("format", "style"),
+    [
+        pytest.param(*case, marks=[pytest.mark.slow] if case == ("pdf", "scanned") else [])
+        for case in itertools.product(("svg", "dxf", "pdf"), FILE_STYLES)
+    ],
+)
 def test_drawn_home_is_imported_untouched(format: FileFormat, style: FileStyle) -> None:
     language = LANGUAGES[(FILE_FORMATS.index(format) * 5 + FILE_STYLES.index(style)) % len(LANGUAGES)]
     drawing = draw_home(_model(), style, language, np.random.default_rng(0))

@@ -312,7 +312,7 @@ def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.Monke
 
 
 # Pictures, and pages that are drawn, take seconds whatever they show; so do some others.
-_DRAWN, _LONG = {"picture", "pdf"}, ("mega", "noise", "a lattice of thick", "one way in many")
+_DRAWN, _LONG = {"picture", "pdf"}, ("mega", "noise", "a lattice of thick", "one way in many", "clippings of")
 
 
 @pytest.mark.parametrize(

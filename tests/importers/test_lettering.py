@@ -150,11 +150,12 @@ def check_flat(plan: ImportedPlan, pixels_per_metre: float | None = None) -> Non
         assert plan.report.metres_per_unit * pixels_per_metre == pytest.approx(1.0, rel=0.01)
 
 
-@pytest.mark.parametrize(("px_per_m", "text_px"), [(40.0, 13), (110.0, 30)])
+@pytest.mark.parametrize(("px_per_m", "text_px"), [(40.0, 13), pytest.param(110.0, 30, marks=pytest.mark.slow)])
 def test_printed_names_and_dimensions_of_a_picture_are_read(px_per_m: float, text_px: int):
     check_flat(import_plan(PrintedPlan(px_per_m, text_px).file(), limits=LIMITS), px_per_m)
 
 
+@pytest.mark.slow
 def test_straight_scan_with_noise_and_shadow_is_read():
     page = PrintedPlan(40.0, 13)
     grey = np.asarray(page.picture, dtype=float)
@@ -174,6 +175,7 @@ def test_printed_names_and_dimensions_of_a_scan_are_read():
     assert "page 1 was read as a picture" in plan.report.notes
 
 
+@pytest.mark.slow
 def test_letters_that_a_pdf_draws_are_read_and_are_no_pillars():
     plan = import_plan(OutlinedPlan().pdf("Sheet A-101"), limits=LIMITS)
     check_flat(plan, 72.0 / 0.0254 / 50.0)
@@ -198,6 +200,7 @@ def test_scale_that_contradicts_the_texts_gives_warnings():
     assert "multiplied by 0.7" in areas
 
 
+@pytest.mark.slow
 def test_two_names_in_a_room_are_reported():
     page = PrintedPlan(dimensions=False)
     page._box((4.3, 3.1, 9.1, 3.3), 255)
@@ -242,6 +245,7 @@ def test_reading_texts_ends_with_its_share_of_the_time():
     assert budget.elapsed_s < 15.0
 
 
+@pytest.mark.slow
 def test_lack_of_memory_leaves_the_rooms_without_names(tmp_path: Path):
     page = PrintedPlan()
     (tmp_path / "plan.png").write_bytes(page.file())

@@ -121,7 +121,7 @@ def test_rooms_joined_by_a_wide_passage_are_divided_by_their_names(names: tuple[
     assert [opening.kind for opening in sketch.openings] == ["passage"] * is_divided
 
 
-@pytest.mark.parametrize("is_hatched", [False, True])
+@pytest.mark.parametrize("is_hatched", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_furniture_at_outlined_walls_is_no_wall(is_hatched: bool):
     page = Image.new("L", (1200, 900), 255)
     pen = ImageDraw.Draw(page)
@@ -180,6 +180,7 @@ def test_picture_is_a_draft_with_its_guesses(drawn: dict[Style, DrawnPlan]):
     assert any("texts of the picture were read" in line for line in plan.report.notes)
 
 
+@pytest.mark.slow
 def test_draft_uses_its_openings_as_far_as_they_seem_complete(drawn: dict[Style, DrawnPlan]):
     draft = import_plan(drawn["thick"].png(), ImportOptions(metres_per_pixel=drawn["thick"].metres_per_pixel))
     assert draft.plan().opening_kinds == frozenset()
@@ -187,7 +188,7 @@ def test_draft_uses_its_openings_as_far_as_they_seem_complete(drawn: dict[Style,
     assert {entry.kind: entry.trust for entry in draft.report.opening_trust}["door"] < 1.0
 
 
-@pytest.mark.parametrize("options", [ImportOptions(), ImportOptions(units="m")])
+@pytest.mark.parametrize("options", [ImportOptions(), pytest.param(ImportOptions(units="m"), marks=pytest.mark.slow)])
 def test_picture_without_scale_gets_that_of_its_doors(drawn: dict[Style, DrawnPlan], options: ImportOptions):
     report = import_plan(drawn["thick"].png(), options).report
     assert 0.0 < report.scale_std < 0.1
@@ -231,7 +232,7 @@ def test_scan_resolution_and_paper_scale_set_the_scale(drawn: dict[Style, DrawnP
         import_plan(plan.png(), ImportOptions(scale=125.0))
 
 
-@pytest.mark.parametrize("factor", [0.02, 30.0])
+@pytest.mark.parametrize("factor", [0.02, pytest.param(30.0, marks=pytest.mark.slow)])
 def test_wrong_scale_is_rejected(drawn: dict[Style, DrawnPlan], factor: float):
     plan = drawn["thick"]
     options = ImportOptions(metres_per_pixel=factor * plan.metres_per_pixel)

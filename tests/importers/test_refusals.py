@@ -74,7 +74,10 @@ def _refusal(content: bytes, options: ImportOptions) -> str:
     return ""
 
 
-@pytest.mark.parametrize("format", FORMATS)
+# Variants of a PDF take seconds.
+@pytest.mark.parametrize(
+    "format", [pytest.param(format, marks=[pytest.mark.slow] if format == "pdf" else []) for format in FORMATS]
+)
 def test_refusal_has_no_words_of_a_library(format: str):
     if format == "ifc":
         pytest.importorskip("ifcopenshell")

@@ -32,6 +32,7 @@ def test_exported_plan_is_imported_unchanged(flat: FloorPlan, format):
     back.plan()
 
 
+@pytest.mark.slow
 def test_equal_plans_give_equal_bytes_in_every_process(flat: FloorPlan):
     program = (
         "import hashlib, json, sys\nfrom lalaloc_core.floorplan import FloorPlan\n"

@@ -92,6 +92,7 @@ def test_written_areas_of_a_picture_give_its_scale():
     assert report.scale_source.startswith("estimated from the thickness of walls, 3 written areas (±")
 
 
+@pytest.mark.slow
 def test_false_scale_is_corrected_by_the_factor_of_the_report():
     page = PrintedPlan()
     first = import_plan(page.file(), ImportOptions(metres_per_pixel=0.02), LIMITS).report

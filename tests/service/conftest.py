@@ -274,6 +274,7 @@ def serve(app: FastAPI) -> Iterator[str]:
             assert not thread.is_alive(), "the app did not stop"
 
 
+@cache
 def encode_picture(width: int, height: int, picture_format: str, **options: Any) -> bytes:
     """Return a smooth picture as encoded bytes."""
     x, y = np.meshgrid(np.linspace(0.0, 6.28, width), np.linspace(0.0, 3.14, height))

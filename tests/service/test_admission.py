@@ -158,6 +158,7 @@ def test_slot_of_a_cancelled_query_goes_to_the_next() -> None:
     asyncio.run(scenario())
 
 
+@pytest.mark.slow
 def test_query_that_would_miss_its_deadline_is_refused_at_once() -> None:
     async def scenario() -> None:
         slots = Slots(16, 16)

@@ -490,6 +490,7 @@ def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: st
     assert_problem(client.get(f"/albums/{album_id}"), 404, "unknown-album")
 
 
+@pytest.mark.slow
 def test_pins_move_with_a_new_revision_of_the_plan(client: httpx.Client, pictures: list[bytes]) -> None:
     plan_id = upload(client, HOME)
     album_id = create(client, plan_id)
@@ -526,6 +527,7 @@ def test_correction_of_a_room_that_is_gone_is_left_out(client: httpx.Client, pic
     assert "its correction was left out" in row["pin"]["warnings"][-1]
 
 
+@pytest.mark.slow
 def test_album_of_another_model_can_only_be_read(
     client: httpx.Client, database_of: DatabaseOf, start_app: StartApp, tmp_path: Path, pictures: list[bytes]
 ) -> None:
@@ -545,6 +547,7 @@ def test_album_of_another_model_can_only_be_read(
         store.close()
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_expired_lease_is_taken_over(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
@@ -580,6 +583,7 @@ def test_expired_lease_is_taken_over(
         store.close()
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_album_that_cannot_be_solved_states_why(
     start_app: StartApp, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch

@@ -432,6 +432,7 @@ def test_streams_of_one_client_leave_slots_for_others(start_app: StartApp, tmp_p
         assert client.delete(path).status_code == 204
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     slow = _endless_picture()

@@ -248,6 +248,7 @@ def test_service_can_refuse_photographs(start_app: StartApp, tmp_path: Path, dev
             assert "on_device" in assert_problem(answer, 403, "features-required")["detail"]
 
 
+@pytest.mark.slow
 def test_nothing_of_a_photograph_remains(
     tiny_view_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -107,6 +107,7 @@ def own(start_app: StartApp, tmp_path: Path) -> Iterator[httpx.Client]:
         yield started
 
 
+@pytest.mark.slow
 def test_plan_of_a_client_that_left_is_stored(own: httpx.Client, picture: tuple[bytes, dict[str, str]]) -> None:
     content, fields = picture
     request = own.build_request("POST", "/floorplans", files={"file": ("plan", content)}, data=fields, headers=LINES)

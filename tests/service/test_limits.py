@@ -99,6 +99,7 @@ def test_adversarial_plans_are_refused(client: httpx.Client, body: str) -> None:
     assert_problem(response, 422, "invalid-floorplan")
 
 
+@pytest.mark.slow
 def test_plan_of_very_many_vertices_is_refused(start_app: StartApp, tmp_path: Path) -> None:
     body = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 900_000) + "]}]}"
     with start_app(tmp_path, max_plan_bytes=10**7) as client:

@@ -334,6 +334,7 @@ def test_query_waits_for_a_preparing_plan(client: httpx.Client, sphere: bytes) -
     client.delete(f"/floorplans/{plan_id}")
 
 
+@pytest.mark.slow
 def test_waiting_ends_at_the_deadline(
     start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,7 @@ def test_torch_is_loaded_with_the_first_job_by_latents(bundle: Bundle, job: Refi
         assert loaded()
 
 
+@pytest.mark.slow
 def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: RefinementJob) -> None:
     jobs = [replace(job, position_m=job.position_m + 0.05 * index) for index in range(4)]
     alone = [_refine(pool, job, _LONG_S) for job in jobs]
@@ -179,6 +180,7 @@ def test_stalled_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     assert _refine(pool, job, _LONG_S) is not None
 
 
+@pytest.mark.slow
 def test_full_queue_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
     for pid in _workers():
         os.kill(pid, signal.SIGSTOP)

@@ -89,6 +89,7 @@ def is_same_album(client: httpx.Client, album_id: str, album: Any, rows: Any) ->
     return same and albums.photographs(client, album_id)[0]["pin"]["place"] is not None
 
 
+@pytest.mark.slow
 def test_sqlite_backup_restores_albums(start_app: StartApp, data: Path, tmp_path: Path) -> None:
     backup = str(tmp_path / "backup.sqlite3")
     shipped = on_sqlite(data) | {"bundle": default_bundle(), "request_deadline_s": 90.0, "sweep_s": 0.2}

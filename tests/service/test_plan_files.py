@@ -209,6 +209,7 @@ def test_several_levels_require_the_level_option(client: httpx.Client) -> None:
     assert "has no level '7'; set level to one of '0', '1'" in nowhere["detail"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(DUPLEX is None, reason="the sample model is not available")
 def test_sample_model_of_two_storeys(client: httpx.Client) -> None:
     assert DUPLEX is not None
@@ -341,6 +342,7 @@ class TestHostileFiles:
         assert store_plan(strict, plan_file("svg"))["rooms"]
 
 
+@pytest.mark.slow
 @pytest.mark.one_replica
 def test_stalled_worker_is_replaced(start_app: StartApp, tmp_path: Path) -> None:
     earlier = import_workers()

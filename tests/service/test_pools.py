@@ -374,6 +374,7 @@ def test_failing_starts_back_off(log: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert not pool.state.warmed_up
 
 
+@pytest.mark.slow
 def test_worker_that_never_gets_ready_is_killed(log: Path, gate: Path) -> None:
     slow = {"target": worker_jobs.run_after_gate, "arguments": (str(log), str(gate))}
     with _pool(log, max_start_s=1.0, **slow) as pool:

@@ -94,6 +94,7 @@ def _warm(client: httpx.Client) -> bool:
     return client.get("/readyz").json()["lpo_pool"]["ready"] > 0
 
 
+@pytest.mark.slow
 def test_plans_and_grids_survive_a_restart(tiny_bundle: Path, tmp_path: Path, sphere: bytes) -> None:
     environment = environment_of(tiny_bundle, tmp_path / "data", LPO_DEADLINE_S="9")
     with _uvicorn(environment, tmp_path / "log") as (process, client):

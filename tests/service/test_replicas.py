@@ -90,6 +90,7 @@ def test_two_replicas_act_as_one_service(
             assert localise(a, plan_id, sphere, heading_deg=0).status_code == 404
 
 
+@pytest.mark.slow
 def test_replicas_answer_the_same_album(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
     shared: dict[str, Any] = {
         "database_url": postgres.new_database(),

@@ -202,6 +202,7 @@ def test_sessions_expire_and_are_limited(
         store.close()
 
 
+@pytest.mark.slow
 def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))

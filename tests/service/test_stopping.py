@@ -72,6 +72,7 @@ def _in_flight(client: httpx.Client) -> bool:
     return "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text
 
 
+@pytest.mark.slow
 def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> None:
     body = json.dumps(FLAT).encode()
     with running_service(tiny_bundle, tmp_path / "data") as service:

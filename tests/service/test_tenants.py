@@ -259,6 +259,7 @@ def _usage(client: httpx.Client) -> dict[str, Any]:
     return client.get("/usage").json()["stored_bytes"]
 
 
+@pytest.mark.slow
 def test_full_tenant_is_refused_and_can_delete(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     padded = json.dumps(FLAT).encode() + b" " * MIB
     headers = {"content-type": "application/json"}

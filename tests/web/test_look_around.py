@@ -83,6 +83,7 @@ def _no_violations(page: Page) -> None:
     assert results.violations_count == 0, results.generate_report()
 
 
+@pytest.mark.slow
 def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
     page = _open(phone)
     with page.expect_response("**/localise/sequence", timeout=120_000) as answered:
@@ -106,7 +107,6 @@ def test_turn_is_taken_by_itself_and_answered(phone: Visit) -> None:
     wait_until(page, "document.querySelector('#look-dialog video').srcObject === null")
 
 
-@pytest.mark.slow
 def test_gyroscope_gives_directions_and_hints(phone: Visit) -> None:
     page = _open(phone)
     protocol = page.context.new_cdp_session(page)

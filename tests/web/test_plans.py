@@ -147,6 +147,7 @@ def test_imported_picture_is_scaled_and_corrected(desktop: Visit, tmp_path: Path
     assert [opening["kind"] for opening in plan["openings"]] == ["door"]
 
 
+@pytest.mark.slow
 def test_printed_dimensions_give_the_scale_of_a_picture(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     (tmp_path / "printed.png").write_bytes(PrintedPlan().file())
