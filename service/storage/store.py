@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import cache
 from pathlib import Path
 from time import monotonic
 
@@ -153,9 +154,14 @@ def _default_stored_bytes(settings: Settings) -> int:
     return _STORED_BYTES
 
 
+@cache
+def _migrations() -> ScriptDirectory:
+    return ScriptDirectory(str(_MIGRATIONS))
+
+
 def _migrate(database: Database) -> None:
     """Run the missing migrations in one transaction; replicas that start together take turns."""
-    script = ScriptDirectory(str(_MIGRATIONS))
+    script = _migrations()
     head = script.get_current_head()
     assert head is not None
     with database.engine_for_writing.begin() as connection:

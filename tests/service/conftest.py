@@ -216,10 +216,10 @@ def home(shipped: httpx.Client) -> str:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def url(request: pytest.FixtureRequest, tmp_path: Path, empty_database: Path) -> str:
     """Return the URL of an empty database of either kind."""
     if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}"
+        return f"sqlite:///{shutil.copy(empty_database, tmp_path)}"
     return request.getfixturevalue("postgres").new_database()
 
 
@@ -239,9 +239,9 @@ def open_store(url: str) -> Iterator[OpenStore]:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
+def store(tmp_path: Path, empty_database: Path) -> Iterator[Store]:
     """Yield an empty store on SQLite."""
-    with closing(Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")) as opened:
+    with closing(Store(f"sqlite:///{shutil.copy(empty_database, tmp_path / 'test.sqlite3')}")) as opened:
         yield opened
 
 
