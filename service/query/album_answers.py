@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from typing import Any
 
-from lalaloc_core.localise.album.pins import MOVED_M, Album, Pin, PinPose
+from lalaloc_core.localise.album.pins import Album, Pin, PinPose, moved_pin
+from lalaloc_core.localise.answers.pinned import common_document, pin_document
 from service.query.geopose import geopose_at
 from service.query.ground import Ground
 from service.query.queries import AlbumOutcome
-from service.schemas import Position
-from service.schemas.albums import (
-    AlbumSolution,
-    MovedFrom,
-    PinAnswer,
-    PinCounts,
-    PinPlace,
-    PinSuggestion,
-    RoomProbability,
-    SharedCameraAnswer,
-)
+from service.schemas.albums import AlbumSolution, MovedFrom, PinAnswer, PinCounts, PinPlace
 
 
 def compose_outcome(
@@ -44,22 +35,8 @@ def compose_outcome(
         earlier = None if text is None else PinAnswer.model_validate_json(text)
         pins[pin.photograph_id] = places.pin(pin, earlier, dropped.get(pin.photograph_id))
     solution = AlbumSolution(
+        **common_document(album),
         pins=PinCounts(**album.counts, moved=sum(pin.moved is not None for pin in pins.values())),
-        cameras=[
-            SharedCameraAnswer(
-                make=camera.make,
-                model=camera.model,
-                width=camera.width,
-                height=camera.height,
-                photographs=camera.photographs,
-                hfov_deg=math.degrees(camera.hfov),
-                hfov_std_deg=math.degrees(camera.hfov_sd),
-            )
-            for camera in album.cameras
-        ],
-        camera_height_m=album.camera_height_m,
-        scale=album.scale,
-        compass_bias_deg=None if album.compass_bias is None else math.degrees(album.compass_bias),
         warnings=[*ground.warnings, *album.warnings],
     )
     return AlbumOutcome(
@@ -80,49 +57,31 @@ class _Places:
 
     def pin(self, pin: Pin, earlier: PinAnswer | None, dropped: str | None) -> PinAnswer:
         """Return a pin, with what changed since `earlier`."""
-        place = None if pin.pose is None else self._place(pin.pose)
-        geopose = None
-        if pin.pose is not None:
-            position, heading_deg = (pin.pose.x_m, pin.pose.y_m), pin.pose.heading_deg or 0.0
-            geopose = geopose_at(self._anchors[pin.pose.plan_id], position, heading_deg, self._height_m)
-        return PinAnswer(
-            state=pin.state,
-            place=place,
-            confidence=_share(pin.confidence),
-            within_1m=_share(pin.within_1m),
-            reason=pin.reason,
-            rooms=[
-                RoomProbability(
-                    floorplan_id=room.plan_id,
-                    room=room.room,
-                    room_id=room.room_id,
-                    probability=_share(room.probability),
-                )
-                for room in pin.rooms
-            ],
-            suggestions=[
-                PinSuggestion(**vars(self._place(suggestion.pose)), probability=_share(suggestion.probability))
-                for suggestion in pin.suggestions
-            ],
-            warnings=[*pin.warnings, *([] if dropped is None else [dropped])],
-            geopose=geopose,
-            moved=None if pin.state == "corrected" else self._moved(earlier, place),
-        )
+        fields, pose = pin_document(pin), pin.pose
+        place, geopose = None, None
+        if pose is not None:
+            place = PinPlace(**self._named(fields["place"]))
+            anchor = self._anchors[pose.plan_id]
+            geopose = geopose_at(anchor, (pose.x_m, pose.y_m), pose.heading_deg or 0.0, self._height_m)
+        fields |= {
+            "place": place,
+            "rooms": [{"floorplan_id": room.pop("plan"), **room} for room in fields["rooms"]],
+            "suggestions": [self._named(suggestion) for suggestion in fields["suggestions"]],
+            "warnings": [*pin.warnings, *([] if dropped is None else [dropped])],
+            "geopose": geopose,
+            "moved": self._moved(pin, earlier, place),
+        }
+        return PinAnswer(**fields)
 
-    def _place(self, pose: PinPose) -> PinPlace:
-        return PinPlace(
-            floorplan_id=pose.plan_id,
-            floorplan_revision=self._revisions[pose.plan_id],
-            level=self._levels[pose.plan_id],
-            room=pose.room,
-            room_id=pose.room_id,
-            position=Position(x_m=pose.x_m, y_m=pose.y_m),
-            heading_deg=pose.heading_deg,
-        )
+    def _named(self, fields: dict[str, Any]) -> dict[str, Any]:
+        """Return the fields of a place with its stored plan."""
+        plan_id = fields.pop("plan")
+        plan = {"floorplan_revision": self._revisions[plan_id], "level": self._levels[plan_id]}
+        return {"floorplan_id": plan_id, **plan, **fields}
 
-    def _moved(self, earlier: PinAnswer | None, after: PinPlace | None) -> MovedFrom | None:
+    def _moved(self, pin: Pin, earlier: PinAnswer | None, after: PinPlace | None) -> MovedFrom | None:
         """Return the change of a pin by new revisions of its plan; that by an earlier solve of this one stays."""
-        if earlier is None:
+        if earlier is None or pin.state == "corrected":
             return None
         before = earlier.place
         # Without a place, the revision is not known.
@@ -132,20 +91,17 @@ class _Places:
         # Of large venues, the plans that are searched depend on the photographs: others are left out unchanged.
         if revision == before.floorplan_revision or (revision is None and self._is_same_place):
             return earlier.moved
-        return MovedFrom(before=before, distance_m=None, new_room=True) if after is None else _change(before, after)
+        moved = moved_pin(pin.photograph_id, _pose(before), None if after is None else _pose(after))
+        return moved and MovedFrom(before=before, distance_m=moved.distance_m, new_room=moved.new_room)
 
 
-def _change(before: PinPlace, after: PinPlace) -> MovedFrom | None:
-    same_plan = before.floorplan_id == after.floorplan_id
-    distance_m = None
-    if same_plan:
-        distance_m = math.dist((before.position.x_m, before.position.y_m), (after.position.x_m, after.position.y_m))
-    new_room = not same_plan or before.room_id != after.room_id
-    if not new_room and (distance_m is None or distance_m <= MOVED_M):
-        return None
-    return MovedFrom(before=before, distance_m=distance_m, new_room=new_room)
-
-
-def _share(value: float) -> float:
-    # Sums of shares can exceed 1 by rounding.
-    return min(max(value, 0.0), 1.0)
+def _pose(place: PinPlace) -> PinPose:
+    position = place.position
+    return PinPose(
+        plan_id=place.floorplan_id,
+        room_id=place.room_id,
+        room=place.room,
+        x_m=position.x_m,
+        y_m=position.y_m,
+        heading=None,
+    )

@@ -11,7 +11,7 @@ from lalaloc_core.conventions import heading_to_degrees
 
 PinState = Literal["sure", "uncertain", "set_aside", "corrected"]
 # A pin moved if it did by more (m), or changed its room.
-MOVED_M = 0.5
+_MOVED_M = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,25 +152,19 @@ def moved_pins(before: Sequence[Pin], after: Sequence[Pin]) -> list[MovedPin]:
     Photographs that are in one of the two only are left out.
     """
     known = {pin.photograph_id: pin.pose for pin in before}
-    found = []
-    for pin in after:
-        if pin.photograph_id not in known:
-            continue
-        old, new = known[pin.photograph_id], pin.pose
-        if old is None or new is None:
-            if old is not new:
-                changed = MovedPin(
-                    photograph_id=pin.photograph_id, before=old, after=new, distance_m=None, new_room=True
-                )
-                found.append(changed)
-            continue
-        same_plan = old.plan_id == new.plan_id
-        distance_m = math.hypot(new.x_m - old.x_m, new.y_m - old.y_m) if same_plan else None
-        new_room = not same_plan or old.room_id != new.room_id
-        if new_room or (distance_m is not None and distance_m > MOVED_M):
-            found.append(
-                MovedPin(
-                    photograph_id=pin.photograph_id, before=old, after=new, distance_m=distance_m, new_room=new_room
-                )
-            )
-    return found
+    changes = [
+        moved_pin(pin.photograph_id, known[pin.photograph_id], pin.pose) for pin in after if pin.photograph_id in known
+    ]
+    return [change for change in changes if change is not None]
+
+
+def moved_pin(photograph_id: str, before: PinPose | None, after: PinPose | None) -> MovedPin | None:
+    """Return the change of a pin; None if it moved by at most 0.5 m in its room."""
+    distance_m, new_room = None, before is not after
+    if before is not None and after is not None:
+        same_plan = before.plan_id == after.plan_id
+        distance_m = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m) if same_plan else None
+        new_room = not same_plan or before.room_id != after.room_id
+    if not new_room and (distance_m is None or distance_m <= _MOVED_M):
+        return None
+    return MovedPin(photograph_id=photograph_id, before=before, after=after, distance_m=distance_m, new_room=new_room)

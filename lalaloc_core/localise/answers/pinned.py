@@ -15,6 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.pins import Album, Pin, PinPose, moved_pins
 
 _VERSION = 1
+_NOWHERE = dict.fromkeys(("plan", "room_id", "room", "position", "heading_deg"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +41,10 @@ class PinnedPhotograph:
     def document(self) -> dict[str, Any]:
         """Return the photograph as plain data."""
         head = {"number": self.number, "photograph": self.name, "sha256": self.id, "taken": self.taken or None}
-        pin = self.pin
-        if pin is None:
-            return {**head, **_pose_fields(None), "confidence": 0.0, "state": "set_aside", "reason": self.reason}
-        suggestions = [{**_pose_fields(row.pose), "probability": row.probability} for row in pin.suggestions]
-        rooms = [{"plan": row.plan_id, "room": row.room, "probability": row.probability} for row in pin.rooms]
-        return {
-            **head,
-            **_pose_fields(pin.pose),
-            "confidence": pin.confidence,
-            "state": pin.state,
-            "reason": pin.reason,
-            "rooms": rooms,
-            "suggestions": suggestions,
-            "warnings": list(pin.warnings),
-        }
+        if self.pin is None:
+            return {**head, **_NOWHERE, "confidence": 0.0, "state": "set_aside", "reason": self.reason}
+        fields = pin_document(self.pin)
+        return {**head, **(fields.pop("place") or _NOWHERE), **fields}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,24 +67,13 @@ class PinnedAlbum:
 
     def document(self) -> dict[str, Any]:
         """Return the album as plain data: `pins.json` of `lalaloc pin`."""
-        album, counts = self.album, self.album.counts
+        counts = self.album.counts
         unread = sum(photograph.id is None for photograph in self.photographs)
         return {
             "version": _VERSION,
             "plans": [{"id": id, "name": plan.name} for id, plan in zip(self.plan_ids, self.plans, strict=True)],
             "counts": {**counts, "set_aside": counts["set_aside"] + unread},
-            "camera_height_m": album.camera_height_m,
-            "scale": album.scale,
-            "cameras": [
-                {
-                    "make": camera.make,
-                    "model": camera.model,
-                    "photographs": camera.photographs,
-                    "hfov_deg": math.degrees(camera.hfov),
-                    "hfov_std_deg": math.degrees(camera.hfov_sd),
-                }
-                for camera in album.cameras
-            ],
+            **common_document(self.album),
             "photographs": [photograph.document() for photograph in self.photographs],
             "notes": list(self.notes),
         }
@@ -113,9 +92,45 @@ class PinnedAlbum:
         return lines or ["no pin moved by more than 0.5 m or changed its room"]
 
 
-def _pose_fields(pose: PinPose | None) -> dict[str, Any]:
-    if pose is None:
-        return {"plan": None, "room_id": None, "room": None, "position": None, "heading_deg": None}
+def pin_document(pin: Pin) -> dict[str, Any]:
+    """Return a pin as plain data: its place, None if it is set aside, and how sure it is."""
+    return {
+        "place": None if pin.pose is None else _place(pin.pose),
+        "state": pin.state,
+        "confidence": _share(pin.confidence),
+        "within_1m": _share(pin.within_1m),
+        "reason": pin.reason,
+        "rooms": [
+            {"plan": room.plan_id, "room_id": room.room_id, "room": room.room, "probability": _share(room.probability)}
+            for room in pin.rooms
+        ],
+        "suggestions": [{**_place(row.pose), "probability": _share(row.probability)} for row in pin.suggestions],
+        "warnings": list(pin.warnings),
+    }
+
+
+def common_document(album: Album) -> dict[str, Any]:
+    """Return what the photographs of an album have in common as plain data."""
+    return {
+        "cameras": [
+            {
+                "make": camera.make,
+                "model": camera.model,
+                "width": camera.width,
+                "height": camera.height,
+                "photographs": camera.photographs,
+                "hfov_deg": math.degrees(camera.hfov),
+                "hfov_std_deg": math.degrees(camera.hfov_sd),
+            }
+            for camera in album.cameras
+        ],
+        "camera_height_m": album.camera_height_m,
+        "scale": album.scale,
+        "compass_bias_deg": None if album.compass_bias is None else math.degrees(album.compass_bias),
+    }
+
+
+def _place(pose: PinPose) -> dict[str, Any]:
     return {
         "plan": pose.plan_id,
         "room_id": pose.room_id,
@@ -123,6 +138,11 @@ def _pose_fields(pose: PinPose | None) -> dict[str, Any]:
         "position": {"x_m": pose.x_m, "y_m": pose.y_m},
         "heading_deg": pose.heading_deg,
     }
+
+
+def _share(value: float) -> float:
+    # Sums of shares can exceed 1 by rounding.
+    return min(max(value, 0.0), 1.0)
 
 
 def read_pins(path: str | PathLike[str]) -> list[Pin]:
