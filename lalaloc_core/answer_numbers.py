@@ -17,7 +17,10 @@ def _rounded(digits: int) -> AfterValidator:
 Metres = Annotated[float, _rounded(3)]
 SquareMetres = Annotated[float, _rounded(3)]
 Variance = Annotated[float, _rounded(6)]
-HeadingDeg = Annotated[float, AfterValidator(lambda value: round(value, 2) % 360.0)]
+_HEADING = AfterValidator(lambda value: round(value, 2) % 360.0)
+HeadingDeg = Annotated[float, _HEADING]
+HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
+Heading = Annotated[float, Field(ge=0, lt=360, description=f"The {HEADING_MEANING}."), _HEADING]
 Degrees = Annotated[float, Field(ge=0), _rounded(2)]
 # An angle of either sign.
 SignedDegrees = Annotated[float, _rounded(2)]
@@ -27,3 +30,18 @@ Share = Annotated[float, Field(ge=0, le=1), _rounded(4)]
 Score = Annotated[float, _rounded(4)]
 # Probability of one place among thousands.
 Mass = Annotated[float, Field(ge=0, le=1), _rounded(6)]
+Cost = Annotated[
+    float,
+    Field(
+        ge=0,
+        description="Matching cost between the walls around the pose and the photograph, dimensionless; lower is "
+        "better. Candidates are ranked by it and by hints. Candidates that were refined less than the first come last, "
+        "and their costs are not comparable with the others.",
+    ),
+    _rounded(4),
+]
+LatentDistance = Annotated[
+    float,
+    Field(ge=0, le=2, description="Distance between the latents of the pose's layout and of the photograph."),
+    _rounded(4),
+]

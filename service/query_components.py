@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.answers.documents import ModelAnswer
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from service.capacity.admission_control import Admission
 from service.capacity.cores import usable_cores
@@ -19,7 +20,6 @@ from service.grids import GridProvider
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
 from service.query import Executor, Grounds, Localiser, LocalLocaliser, LpoPool, Optimiser, PhotographReader, QueryParts
-from service.schemas import ModelAnswer
 from service.settings import Settings
 from service.storage import Store
 from service.storage.records import DEFAULT_TENANT

@@ -15,6 +15,7 @@ from ray.serve.handle import DeploymentHandle
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.localise.answers.documents import ModelAnswer
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
@@ -22,7 +23,7 @@ from lalaloc_core.photograph import Photograph
 from service.errors import DeadlineExceededError, OverloadedError
 from service.pools import LostReason, PoolState
 from service.query import SOLVE_S, AlbumQuery, AnyQuery, PictureQuery, QueryContext, Where
-from service.schemas import LocaliseAnswer, ModelAnswer, SequenceAnswer
+from service.schemas import LocaliseAnswer, SequenceAnswer
 from service.schemas.query_fields import HeightFields
 from service.settings import Settings
 from service.storage.records import VenueRecord

@@ -10,10 +10,10 @@ from lalaloc_core.conditions import CONDITIONS, Condition
 from lalaloc_core.draw.plan import bounds_with, draw_rooms
 from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from lalaloc_core.importers import ExportFormat, export_plan
+from lalaloc_core.localise.answers.documents import ModelAnswer
 from lalaloc_core.render.sampling import grid_size
 from service.errors import DamagedDataError
 from service.plan_documents import PlanHead, Rendition, RenditionJob
-from service.schemas import ModelAnswer
 from service.schemas.localisability import LocalisabilityAnswer
 from service.schemas.plan_import import ImportReport
 from service.schemas.stored_plans import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Any
 
 from lalaloc_core.localise.answers.documents import Answer, TurnAnswer
@@ -11,14 +10,7 @@ from lalaloc_core.localise.belief import Posterior, probability_map
 from lalaloc_core.localise.query import Query
 from service.query.geopose import geopose_at
 from service.query.ground import Ground, PlacedCandidate
-from service.schemas import (
-    FilmAnswer,
-    LocaliseAnswer,
-    PosteriorAnswer,
-    SequenceAnswer,
-    SequencePoseAnswer,
-    TimingsAnswer,
-)
+from service.schemas import LocaliseAnswer, PosteriorAnswer, SequenceAnswer, SequencePoseAnswer, TimingsAnswer
 
 # Smaller probabilities are rounded to 0 in the answer.
 _MIN_PROBABILITY = 5e-7
@@ -87,7 +79,7 @@ def sequence_answer(
         ],
         confidence=answer.confidence,
         warnings=answer.warnings,
-        film=None if answer.film is None else FilmAnswer.model_validate(asdict(answer.film)),
+        film=answer.film,
         stage="lpo" if answer.stage == "lpo" else "retrieval",
         camera_height_m=answer.camera_height_m,
         timings_ms=first.timings_ms,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol, TypeVar
 
+from lalaloc_core.localise.answers.documents import ModelAnswer
 from service.capacity.admission_control import Slots
 from service.capacity.fair_share import FairSemaphore
 from service.capacity.threads import Threads
@@ -22,7 +23,6 @@ from service.query.queries import (
 from service.query.sequence_query import SequenceSearch
 from service.query.session_query import SessionSearch
 from service.query.single_query import QueryParts, SingleSearch
-from service.schemas import ModelAnswer
 from service.schemas.query_fields import HeightFields
 
 AnswerT = TypeVar("AnswerT")

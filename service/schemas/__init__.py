@@ -25,14 +25,12 @@ from service.schemas.localise_answer import (
     GeoPoseAngles,
     GeoPosePosition,
     LocaliseAnswer,
-    ModelAnswer,
     PlanProbability,
-    Position,
     PosteriorAnswer,
     TimingsAnswer,
 )
 from service.schemas.query_fields import EarthPoint, LocaliseForm
-from service.schemas.sequence import FilmAnswer, SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading
+from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading
 from service.schemas.sessions import (
     PathPoint,
     PhotographForm,

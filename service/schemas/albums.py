@@ -7,11 +7,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Metres, Score, Share, SignedDegrees
-from service.schemas.fields import Problem, ResponseModel
-from service.schemas.localise_answer import GeoPose, Position
-from service.schemas.photographs import PhotographFields, ReadView
-from service.schemas.query_fields import HEADING_MEANING, HeightFields, PlaceFields, PlanPoint
+from lalaloc_core.answer_numbers import HEADING_MEANING, Degrees, HeadingDeg, Metres, Score, Share, SignedDegrees
+from lalaloc_core.localise.answers.documents import Position
+from lalaloc_core.localise.answers.views import ReadView
+from service.schemas.fields import CoreAnswer, Problem, ResponseModel
+from service.schemas.localise_answer import GeoPose
+from service.schemas.photographs import PhotographFields
+from service.schemas.query_fields import HeightFields, PlaceFields, PlanPoint
 from service.schemas.venues import Document, Name
 
 PinStateName = Literal["sure", "uncertain", "set_aside", "corrected"]
@@ -130,7 +132,7 @@ class PinAnswer(ResponseModel):
     moved: MovedFrom | None = Field(description="Change by the latest revision of the plan; null if there was none.")
 
 
-class PhotographFacts(ReadView):
+class PhotographFacts(CoreAnswer, ReadView, frozen=True):
     """What is kept about a photograph beside its features. Positions and names in its metadata are not kept."""
 
     taken_at: str | None = Field(description="Time by the camera's clock, without a time zone.")

@@ -17,7 +17,7 @@ class ResponseModel(BaseModel):
 
 
 class CoreAnswer(BaseModel, frozen=True, extra="forbid"):
-    """Base of answers whose fields are those of a frozen class of the core."""
+    """Base of answers that have the fields of a frozen class of the core."""
 
 
 def reject_underscores(value: object) -> object:

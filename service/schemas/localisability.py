@@ -8,8 +8,8 @@ from pydantic import Field
 
 from lalaloc_core.answer_numbers import Metres, Score, Share
 from lalaloc_core.conditions import Condition
+from lalaloc_core.localise.answers.documents import ModelAnswer
 from service.schemas.fields import ResponseModel
-from service.schemas.localise_answer import ModelAnswer
 
 RoomId = Annotated[str, Field(description="`id` of a room.")]
 

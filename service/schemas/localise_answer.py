@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import dataclass
+from typing import Annotated
 
 from pydantic import Field
 
-from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Mass, Metres, Milliseconds, Score, Share, Variance
-from lalaloc_core.localise.answers import documents
+from lalaloc_core.answer_numbers import Mass, Metres, Milliseconds, Share
+from lalaloc_core.localise.answers.documents import FoundPose, ModelAnswer, PossiblePose
+from lalaloc_core.localise.answers.views import ViewAnswer
 from service.schemas.fields import CoreAnswer, Problem, ResponseModel
-from service.schemas.photographs import ViewAnswer
-from service.schemas.query_fields import HEADING_MEANING
 
 
 class GeoPosePosition(ResponseModel):
@@ -39,41 +39,21 @@ class GeoPose(ResponseModel):
     angles: GeoPoseAngles
 
 
-_LATENT_DISTANCE = Field(
-    ge=0, le=2, description="Distance between the latents of the pose's layout and of the photograph."
-)
-_COST = Field(
-    ge=0,
-    description="Matching cost between the walls around the pose and the photograph, dimensionless; lower is better. "
-    "Candidates are ranked by it and by hints. Candidates that were refined less than the first come last, and their "
-    "costs are not comparable with the others.",
-)
-
 _GEOPOSE = "Pose on Earth, from the `anchor` of the plan, else of the venue in the request; null without an anchor."
 
-Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
-Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
+
+# Fields of the last base come first: answers begin with the plan.
+@dataclass(frozen=True, kw_only=True)
+class _CandidatePlan:
+    floorplan_id: Annotated[str, Field(description="Plan of the candidate.")]
+    level: Annotated[
+        float | None, Field(description="Level of the plan in the venue; null for a query about one plan.")
+    ]
 
 
-class Position(CoreAnswer, documents.Position, frozen=True):
-    """Point in the plan frame."""
-
-
-class CandidateAnswer(ResponseModel):
+class CandidateAnswer(CoreAnswer, PossiblePose, _CandidatePlan, frozen=True):
     """Possible pose; two candidates differ by at least 1 m or in heading."""
 
-    floorplan_id: str = Field(description="Plan of the candidate.")
-    level: float | None = Field(description="Level of the plan in the venue; null for a query about one plan.")
-    position: Position
-    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
-    room: str = Field(description="Name of the room.")
-    room_id: str = Field(description="`id` of the room, unique in the plan.")
-    probability: Share | None = Field(
-        description="Probability that this candidate, and no better one, is right within 1 m and 25°; null for a model "
-        "without confidence."
-    )
-    cost: Score = _COST
-    latent_distance: Score = _LATENT_DISTANCE
     geopose: GeoPose | None = Field(None, description=_GEOPOSE)
 
 
@@ -107,57 +87,21 @@ class TimingsAnswer(ResponseModel):
     total: Milliseconds = Field(description="Time from the complete upload to the answer, waiting included.")
 
 
-class ModelAnswer(CoreAnswer, documents.Model, frozen=True):
-    """Model that computed the answer."""
+@dataclass(frozen=True, kw_only=True)
+class _AnswerPlan:
+    floorplan_id: Annotated[str, Field(description="Plan of the position.")]
+    floorplan_revision: Annotated[str, Field(description="Revision of the plan that was searched.")]
+    venue_id: Annotated[str | None, Field(description="Venue in the request; null for a query about one plan.")] = None
+    level: Annotated[float | None, Field(description="Level of the plan in the venue; null if `venue_id` is null.")]
+    plans: Annotated[
+        list[PlanProbability] | None,
+        Field(description="Most probable plans of the venue, best first; null if `venue_id` is null."),
+    ] = None
 
 
-class LocaliseAnswer(ResponseModel):
+class LocaliseAnswer(CoreAnswer, FoundPose, _AnswerPlan, frozen=True):
     """Pose of a photograph."""
 
-    floorplan_id: str = Field(description="Plan of the position.")
-    floorplan_revision: str = Field(description="Revision of the plan that was searched.")
-    venue_id: str | None = Field(default=None, description="Venue in the request; null for a query about one plan.")
-    level: float | None = Field(description="Level of the plan in the venue; null if `venue_id` is null.")
-    plans: list[PlanProbability] | None = Field(
-        default=None, description="Most probable plans of the venue, best first; null if `venue_id` is null."
-    )
-    position: Position
-    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
-    room: str
-    room_id: str = Field(description="`id` of the room, unique in the plan.")
-    confidence: Share | None = Field(
-        description="Probability that the position is right within 1 m: the probability that the photograph is of this "
-        "plan, times the share of this place in the posterior over all places (of all plans of a venue). Null for a "
-        "model without confidence."
-    )
-    heading_confidence: Share | None = Field(
-        description="Probability that the heading is right within 5°; null if `confidence` is null."
-    )
-    probability_elsewhere: Share | None = Field(
-        default=None,
-        description="Probability that the photograph is of none of the places of the plan (of a venue: of the plans "
-        "that were searched). It sums to 1 with the probabilities of the candidates and of all places that are near no "
-        "candidate. Null if `confidence` is null.",
-    )
-    warnings: list[str] = Field(
-        description="Parts of the request that were not followed, such as a hint that the photograph contradicts; what "
-        "the photograph was taken for, also in `view`; or the reason of a very low confidence."
-    )
-    heading_source: Literal["given", "photograph", "searched"] = Field(
-        description="Source of the heading: the request, the photograph's metadata, or the search."
-    )
-    stage: Literal["retrieval", "vdr", "lpo"] = Field(description="Last stage that ran.")
-    covariance_m2: Covariance | None = Field(
-        description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m. Along a "
-        "direction that the photograph does not constrain, as in a corridor, it is that of the whole room. Null unless "
-        "`stage` is `lpo`, and for a model without confidence."
-    )
-    heading_std_deg: Degrees | None = Field(
-        description="Standard deviation of a heading that was searched; null if `covariance_m2` is null."
-    )
-    cost: Score = _COST
-    latent_distance: Score = _LATENT_DISTANCE
-    camera_height_m: Metres = Field(description="Best-fitting camera height.")
     candidates: list[CandidateAnswer] = Field(
         description="Candidates, best first (most probable first in a venue); the first is the answer."
     )

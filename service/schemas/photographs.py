@@ -1,4 +1,4 @@
-"""Photographs as requests describe them, and as answers say that they were read."""
+"""Photographs as requests describe them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from lalaloc_core.answer_numbers import Score, Share
-from lalaloc_core.localise.answers import documents
-from lalaloc_core.localise.localisability.reports import AdvisedStep
 from lalaloc_core.photograph import Intrinsics, StatedCamera
-from lalaloc_core.photograph.projection import Source
-from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG, Projection
-from service.schemas.fields import CoreAnswer, Finite, ResponseModel, parse_json, reject_underscores
+from lalaloc_core.photograph.stated_camera import AUTO, HFOV_RANGE_DEG, MAX_PITCH_DEG, MAX_ROLL_DEG
+from service.schemas.fields import Finite, parse_json, reject_underscores
 
 _HFOV_RANGES = ", ".join(
     f"{low:g} to {high:g} ({name})" for name, (low, high) in HFOV_RANGE_DEG.items() if name != AUTO
@@ -87,76 +83,3 @@ class PhotographFields(BaseModel):
             pitch_deg=self.pitch_deg,
             roll_deg=self.roll_deg,
         )
-
-
-class AssumedAngle(CoreAnswer, documents.Angle, frozen=True):
-    """Angle that the photograph was read with."""
-
-
-class CameraAnswer(CoreAnswer, documents.CameraMatrix, frozen=True):
-    """Camera matrix and distortion of the upright photograph, as `intrinsics` of the request."""
-
-
-class SeenArc(CoreAnswer, documents.SeenArc, frozen=True):
-    """Azimuths that photographs show, relative to the centre of the first, clockwise."""
-
-
-class ReadView(ResponseModel):
-    """Assumptions about the photograph, and the azimuths it shows."""
-
-    projection: Projection
-    projection_source: Source
-    hfov: AssumedAngle = Field(description="Horizontal field of view.")
-    pitch: AssumedAngle = Field(description="Elevation of the photograph's centre above the horizon.")
-    roll: AssumedAngle = Field(description="Clockwise rotation of the camera about its optical axis.")
-    wall_direction: AssumedAngle | None = Field(
-        default=None,
-        description="Azimuth of walls relative to the photograph's centre, up to quarter turns, by its straight lines; "
-        "null without lines and for full spheres.",
-    )
-    camera: CameraAnswer | None = Field(
-        description="Camera model, with which the plan's walls can be drawn over the photograph; null for full spheres "
-        "and strips."
-    )
-    seen: list[SeenArc] = Field(description="Azimuths that the photographs behind the answer show.")
-    warnings: list[str] = Field(description="Metadata that were ignored, and estimates to check.")
-
-
-class SeenObjectAnswer(CoreAnswer, documents.SeenObject, frozen=True):
-    """Object that the photograph shows."""
-
-
-class NextStepAnswer(CoreAnswer, AdvisedStep, frozen=True):
-    """Step after an answer that is not sure, and what it is expected to tell."""
-
-
-class ViewAnswer(ReadView):
-    """Assumptions about the photograph, the azimuths it shows, and how much it could tell."""
-
-    information_bits: Score = Field(
-        description="Information about the place, in bits: the divergence of the posterior from the shares of the "
-        "searched area, hints included. 0: all places stay equally likely."
-    )
-    ruled_out: Share = Field(description="Share of the searched area that this rules out: 1 - 2 ** -information_bits.")
-    relative_heading: AssumedAngle | None = Field(
-        default=None,
-        description="Heading minus that of the first photograph of a turn, from the request (`given`) or from what the "
-        "photographs show twice (`estimated`); null where it was searched, and for other queries.",
-    )
-    advice: str | None = Field(
-        description="How to photograph the place for a sure answer, such as `turn around`; null where it is sure, or "
-        "where more of the surroundings would not help."
-    )
-    next_step: NextStepAnswer | None = Field(
-        default=None,
-        description="The single step with the highest expected confidence, by the posterior and the model's measured "
-        "errors. Null where the confidence is null, or 0.5 or more, where no step raises it by 0.02, where the "
-        "photograph is probably of no place of the plan, and for all but the first photograph of a turn.",
-    )
-    room_types: dict[str, Share] | None = Field(
-        description="Probability of each type of room, the most probable first, by recognised objects; types "
-        "below 0.05 are left out. Null for full spheres, and for features or models without objects."
-    )
-    objects: list[SeenObjectAnswer] | None = Field(
-        description="Recognised objects that tell the type of room, the most probable first; null as `room_types`."
-    )

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
+from lalaloc_core.answer_numbers import HEADING_MEANING
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.localise.query import DEFAULT_STD_M, RADIUS_RANGE_M, UNKNOWN_RANGE_M
@@ -171,9 +172,6 @@ class HintFields(BaseModel):
         if "near" in given.data and (given.data["near"] is None) != (value is None):
             raise ValueError("needs near" if value is not None else "is missing; near needs a radius")
         return value
-
-
-HEADING_MEANING = "azimuth of the photograph's centre, clockwise from the plan's +y seen from above"
 
 
 class LocaliseForm(PlaceFields, CameraFields, HintFields, PhotographFields):

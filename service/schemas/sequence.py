@@ -8,10 +8,11 @@ from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_va
 from pydantic.json_schema import SkipJsonSchema
 
 from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Metres, Score, Share
-from lalaloc_core.localise.answers.documents import FilmReading
-from service.schemas.fields import CoreAnswer, Finite, ResponseModel, needs, parse_json, reject_underscores
-from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
-from service.schemas.photographs import PhotographFields, ViewAnswer
+from lalaloc_core.localise.answers.documents import Covariance, FilmAnswer, ModelAnswer, Position
+from lalaloc_core.localise.answers.views import ViewAnswer
+from service.schemas.fields import Finite, ResponseModel, needs, parse_json, reject_underscores
+from service.schemas.localise_answer import CandidateAnswer, GeoPose, TimingsAnswer
+from service.schemas.photographs import PhotographFields
 from service.schemas.query_fields import CameraFields, PlaceFields
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
@@ -127,10 +128,6 @@ class SequencePoseAnswer(ResponseModel):
     candidates: list[CandidateAnswer] = Field(
         description="Poses on the best paths, best path first; the first is the answer."
     )
-
-
-class FilmAnswer(CoreAnswer, FilmReading, frozen=True):
-    """Reading of a film."""
 
 
 class SequenceAnswer(ResponseModel):

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
+from lalaloc_core.localise.answers.documents import ModelAnswer
 from service.schemas.fields import ResponseModel
-from service.schemas.localise_answer import ModelAnswer
 
 
 class LimitsAnswer(ResponseModel):

@@ -9,13 +9,15 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from lalaloc_core.answer_numbers import HeadingDeg, Metres, Share, Variance
+from lalaloc_core.answer_numbers import HEADING_MEANING, Heading, HeadingDeg, Metres, Share, Variance
+from lalaloc_core.localise.answers.documents import ModelAnswer, Position
+from lalaloc_core.localise.answers.views import ReadView
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.walk_motion import MAX_STEP_M, MAX_TURN, usual_stds
 from service.schemas.fields import Finite, ResponseModel, needs, parse_json, reject_underscores
-from service.schemas.localise_answer import GeoPose, ModelAnswer, Position, TimingsAnswer
-from service.schemas.photographs import PhotographFields, ReadView
-from service.schemas.query_fields import HEADING_MEANING, CameraFields, EarthPoint, PlaceFields, PlanPoint
+from service.schemas.localise_answer import GeoPose, TimingsAnswer
+from service.schemas.photographs import PhotographFields
+from service.schemas.query_fields import CameraFields, EarthPoint, PlaceFields, PlanPoint
 
 # `Odometry` checks the limits of motions, which this only describes.
 Step = Annotated[float, Finite, Field(json_schema_extra={"minimum": -MAX_STEP_M, "maximum": MAX_STEP_M})]
@@ -169,7 +171,7 @@ class TrackedPoseAnswer(ResponseModel):
 
     number: int = Field(description="Number of the photograph, from 1.")
     position: Position
-    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    heading_deg: Heading
     room: str
     room_id: str = Field(description="`id` of the room, unique in the plan.")
     floorplan_id: str | None = Field(None, description=PLAN_OF_POSE)

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.schemas import CandidateAnswer, Position
+from lalaloc_core.localise.answers.documents import Position
+from service.schemas import CandidateAnswer
 from tests.service.conftest import localise, upload
 
 

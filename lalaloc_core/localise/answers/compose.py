@@ -11,21 +11,24 @@ import numpy as np
 from lalaloc_core.bundle import Bundle, ConfidenceModel
 from lalaloc_core.conventions import heading_to_degrees, wrap_angle
 from lalaloc_core.localise.answers.documents import (
-    Angle,
     Answer,
-    CameraMatrix,
+    Covariance,
     Evidence,
     Ground,
-    Model,
+    ModelAnswer,
     Placed,
     Position,
     PossiblePose,
-    ReadPhotograph,
-    SeenArc,
-    SeenObject,
     Spot,
-    ToldPhotograph,
     TrackedAnswer,
+)
+from lalaloc_core.localise.answers.views import (
+    AssumedAngle,
+    CameraAnswer,
+    ReadView,
+    SeenArc,
+    SeenObjectAnswer,
+    ViewAnswer,
 )
 from lalaloc_core.localise.belief import (
     Confidence,
@@ -55,7 +58,7 @@ def compose_answer(
     *,
     warnings: Sequence[str] = (),
     with_step: bool = True,
-    relative_heading: Angle | None = None,
+    relative_heading: AssumedAngle | None = None,
 ) -> Answer:
     """Compose the answer of a search.
 
@@ -96,7 +99,7 @@ def compose_answer(
         camera_height_m=found.camera_height_m,
         candidates=candidates,
         view=_told(spot, ground, found, confidence, bundle if with_step else None, relative_heading),
-        model=Model.of(bundle),
+        model=ModelAnswer.of(bundle),
         evidence=Evidence(ground, found, spot.photograph),
     )
 
@@ -114,9 +117,7 @@ def _possible(place: Placed, query: Query, probability: float | None) -> Possibl
     )
 
 
-def _uncertainty(
-    place: Placed, model: ConfidenceModel | None
-) -> tuple[tuple[tuple[float, float], tuple[float, float]] | None, float | None]:
+def _uncertainty(place: Placed, model: ConfidenceModel | None) -> tuple[Covariance | None, float | None]:
     """Return the covariance (m²) of the position and the standard deviation (degrees) of the heading, where known."""
     information = place.candidate.information
     if model is None or information is None:
@@ -125,7 +126,7 @@ def _uncertainty(
     if uncertainty is None:
         return None, None
     (xx, xy), (_, yy) = uncertainty.position_m2.tolist()
-    return ((xx, xy), (xy, yy)), None if uncertainty.heading_std is None else math.degrees(uncertainty.heading_std)
+    return [[xx, xy], [xy, yy]], None if uncertainty.heading_std is None else math.degrees(uncertainty.heading_std)
 
 
 def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
@@ -193,13 +194,13 @@ def compose_tracked(
         motion_contradicted=list(found.contradicted),
         warnings=[*about_motion, *warnings, *spot.photograph.warnings],
         view=read_photograph(spot),
-        model=Model.of(bundle),
+        model=ModelAnswer.of(bundle),
     )
 
 
-def read_photograph(spot: Spot) -> ReadPhotograph:
+def read_photograph(spot: Spot) -> ReadView:
     """Return what was assumed about a photograph."""
-    return ReadPhotograph(**_assumptions(spot))
+    return ReadView(**_assumptions(spot))
 
 
 def _assumptions(spot: Spot) -> dict[str, Any]:
@@ -207,22 +208,22 @@ def _assumptions(spot: Spot) -> dict[str, Any]:
     return {
         "projection": photograph.projection,
         "projection_source": photograph.projection_source,
-        **{name: Angle.of(getattr(photograph, name)) for name in ("hfov", "pitch", "roll")},
-        "wall_direction": None if photograph.wall_direction is None else Angle.of(photograph.wall_direction),
+        **{name: AssumedAngle.of(getattr(photograph, name)) for name in ("hfov", "pitch", "roll")},
+        "wall_direction": None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
         "camera": _camera(photograph),
         "seen": [SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
         "warnings": list(photograph.warnings),
     }
 
 
-def _camera(photograph: Photograph) -> CameraMatrix | None:
+def _camera(photograph: Photograph) -> CameraAnswer | None:
     camera = photograph.camera
     if camera is None or isinstance(camera, Around):
         return None
     names = ("k1", "k2", "k3", "k4") if isinstance(camera, Fisheye) else ("k1", "k2", "p1", "p2", "k3")
     values = vars(intrinsics_of(camera))
     matrix = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-    return CameraMatrix(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])
+    return CameraAnswer(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])
 
 
 def _told(
@@ -231,8 +232,8 @@ def _told(
     found: Localisation,
     confidence: Confidence | None,
     bundle: Bundle | None,
-    relative_heading: Angle | None,
-) -> ToldPhotograph:
+    relative_heading: AssumedAngle | None,
+) -> ViewAnswer:
     """Return the answer's part about its photograph; the next step follows from the model `bundle`, if any."""
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
@@ -251,14 +252,14 @@ def _told(
     objects = None
     if seen is not None:
         objects = [
-            SeenObject(
+            SeenObjectAnswer(
                 name=shown.name,
                 probability=shown.probability,
                 azimuth_deg=math.degrees(float(wrap_angle(shown.azimuth))),
             )
             for shown in seen.objects
         ]
-    return ToldPhotograph(
+    return ViewAnswer(
         **_assumptions(spot),
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from lalaloc_core.answer_numbers import Degrees, Metres, Score, Share, SignedDegrees
+from lalaloc_core.answer_numbers import Cost, Degrees, Heading, LatentDistance, Metres, Share, Variance
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.answers.views import Document, ReadView, ViewAnswer
 from lalaloc_core.localise.belief import union_of_arcs
-from lalaloc_core.localise.localisability.reports import AdvisedStep
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.query.query import HeadingSource
 from lalaloc_core.localise.search.pipeline import Localisation, SearchStage
-from lalaloc_core.photograph import Assumed, Photograph
-from lalaloc_core.photograph.projection import Source
+from lalaloc_core.photograph import Photograph
+
+RoomId = Annotated[str, Field(description="`id` of the room, unique in the plan.")]
+_Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
+Covariance = Annotated[list[_Pair], Field(min_length=2, max_length=2)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,23 +72,9 @@ class Ground:
         return 1.0
 
 
-class _Document:
-    """Base of answers, which are plain data but for fields that `repr` leaves out."""
-
-    def document(self) -> dict[str, Any]:
-        """Return the answer as plain data, for JSON."""
-        return _plain(self)
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {entry.name: _plain(getattr(value, entry.name)) for entry in fields(value) if entry.repr}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
 @dataclass(frozen=True, kw_only=True)
-class Model(_Document):
-    """Name, version and digest of a model."""
+class ModelAnswer(Document):
+    """Model that computed the answer."""
 
     name: str
     version: str
@@ -99,141 +87,87 @@ class Model(_Document):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Position:
-    """Point in the frame of the plan, metres."""
+class Position(Document):
+    """Point in the plan frame."""
 
     x_m: Annotated[Metres, Field(description="Metres to the right on the drawing.")]
     y_m: Annotated[Metres, Field(description="Metres up on the drawing.")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Angle:
-    """Angle, its standard deviation, and where it is from."""
-
-    value_deg: SignedDegrees
-    std_deg: Annotated[Degrees, Field(description="Standard deviation; 0 where it does not apply.")]
-    source: Annotated[
-        Source,
-        Field(
-            description="Origin: the request (`given`), metadata (`gpano`, `exif`), the picture (`estimated`), or a "
-            "usual value (`assumed`)."
-        ),
-    ]
-
-    @classmethod
-    def of(cls, assumed: Assumed) -> Angle:
-        """Return an angle of a photograph."""
-        return cls(value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraMatrix:
-    """Camera matrix and distortion of the upright photograph, pixels."""
-
-    width: Annotated[int, Field(description="Size of the upright photograph, pixels.")]
-    height: int
-    fx: Score
-    fy: Score
-    cx: Score
-    cy: Score
-    distortion: Annotated[
-        list[float],
-        Field(
-            description="k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye camera: OpenCV's order."
-        ),
-    ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SeenArc:
-    """Azimuths that photographs show, relative to the centre of the first, clockwise."""
-
-    from_deg: SignedDegrees
-    to_deg: Annotated[
-        SignedDegrees, Field(description="Greater than `from_deg`; above 180 for an arc that passes the back.")
-    ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SeenObject:
-    """Object that the photograph shows."""
-
-    name: Annotated[str, Field(description="Object, such as `stove`.")]
-    probability: Share
-    azimuth_deg: Annotated[
-        SignedDegrees, Field(description="Direction relative to the photograph's centre, clockwise.")
-    ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReadPhotograph(_Document):
-    """Assumptions about a photograph.
-
-    Attributes:
-        projection: projection, and in `projection_source` where it is from.
-        hfov: horizontal field of view.
-        pitch: elevation of the centre above the horizon.
-        roll: clockwise rotation of the camera about its optical axis.
-        wall_direction: azimuth of walls relative to the centre, up to quarter turns; None without straight lines.
-        camera: camera model; None for full spheres and strips.
-        seen: azimuths that the photographs of the spot show.
-        warnings: metadata that were ignored, and estimates to check.
-    """
-
-    projection: str
-    projection_source: str
-    hfov: Angle
-    pitch: Angle
-    roll: Angle
-    wall_direction: Angle | None
-    camera: CameraMatrix | None
-    seen: list[SeenArc]
-    warnings: list[str]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ToldPhotograph(ReadPhotograph):
-    """Assumptions about a photograph, and how much it tells.
-
-    Attributes:
-        information_bits: information about the place; one more bit halves the area that is left.
-        ruled_out: share of the searched area that this rules out.
-        relative_heading: heading minus that of the first photograph of a turn; None if it was searched.
-        advice: how to photograph the place for a sure answer; None if more surroundings would not help.
-        next_step: the step that raises the confidence most; None if none does.
-        room_types: probability of each type of room by recognised objects; None if the model recognises none.
-        objects: these objects, the most probable first.
-    """
-
-    information_bits: float
-    ruled_out: float
-    relative_heading: Angle | None
-    advice: str | None
-    next_step: AdvisedStep | None
-    room_types: dict[str, float] | None
-    objects: list[SeenObject] | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class PossiblePose:
-    """Possible pose of a photograph.
-
-    Attributes:
-        position: position in the plan.
-        heading_deg: azimuth of the photograph's centre, degrees clockwise from the plan's +y.
-        room: name of the room, and in `room_id` its id.
-        probability: probability that this pose, and no better one, is right within 1 m and 25°.
-        cost: matching cost; lower is better.
-        latent_distance: distance between the latents of the layout and of the photograph.
-    """
+class PossiblePose(Document):
+    """Possible pose of a photograph."""
 
     position: Position
-    heading_deg: float
+    heading_deg: Heading
+    room: Annotated[str, Field(description="Name of the room.")]
+    room_id: RoomId
+    probability: Annotated[
+        Share | None,
+        Field(
+            description="Probability that this candidate, and no better one, is right within 1 m and 25°; null for a "
+            "model without confidence."
+        ),
+    ]
+    cost: Cost
+    latent_distance: LatentDistance
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundPose(Document):
+    """Pose of a photograph, and how certain it is."""
+
+    position: Position
+    heading_deg: Heading
     room: str
-    room_id: str
-    probability: float | None
-    cost: float
-    latent_distance: float
+    room_id: RoomId
+    confidence: Annotated[
+        Share | None,
+        Field(
+            description="Probability that the position is right within 1 m: the probability that the photograph is of "
+            "this plan, times the share of this place in the posterior over all places (of all plans of a venue). Null "
+            "for a model without confidence."
+        ),
+    ]
+    heading_confidence: Annotated[
+        Share | None,
+        Field(description="Probability that the heading is right within 5°; null if `confidence` is null."),
+    ]
+    probability_elsewhere: Annotated[
+        Share | None,
+        Field(
+            description="Probability that the photograph is of none of the places of the plan (of a venue: of the "
+            "plans that were searched). It sums to 1 with the probabilities of the candidates and of all places that "
+            "are near no candidate. Null if `confidence` is null."
+        ),
+    ] = None
+    warnings: Annotated[
+        list[str],
+        Field(
+            description="Parts of the request that were not followed, such as a hint that the photograph contradicts; "
+            "what the photograph was taken for, also in `view`; or the reason of a very low confidence."
+        ),
+    ]
+    heading_source: Annotated[
+        HeadingSource,
+        Field(description="Source of the heading: the request, the photograph's metadata, or the search."),
+    ]
+    stage: Annotated[SearchStage, Field(description="Last stage that ran.")]
+    covariance_m2: Annotated[
+        Covariance | None,
+        Field(
+            description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m. "
+            "Along a direction that the photograph does not constrain, as in a corridor, it is that of the whole room. "
+            "Null unless `stage` is `lpo`, and for a model without confidence."
+        ),
+    ]
+    heading_std_deg: Annotated[
+        Degrees | None,
+        Field(description="Standard deviation of a heading that was searched; null if `covariance_m2` is null."),
+    ]
+    cost: Cost
+    latent_distance: LatentDistance
+    camera_height_m: Annotated[Metres, Field(description="Best-fitting camera height.")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,64 +180,33 @@ class Evidence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answer(_Document):
+class Answer(FoundPose):
     """Pose of a photograph.
 
     Attributes:
-        position: position in the plan.
-        heading_deg: azimuth of the photograph's centre, degrees clockwise from the plan's +y.
-        heading_source: source of the heading: the caller, the photograph's compass, or the search.
-        room: name of the room, and in `room_id` its id.
-        confidence: probability that the position is right within 1 m; None for a model without confidence.
-        heading_confidence: probability that the heading is right within 5°.
-        probability_elsewhere: probability that the photograph shows none of the places of the plan.
-        warnings: statements that were not followed, estimates to check, or the reason of a very low confidence.
-        covariance_m2: covariance ((xx, xy), (xy, yy)) of the position in m²; None where it is unknown.
-        heading_std_deg: standard deviation of a heading that was searched.
-        stage: last stage that ran.
-        cost: matching cost; lower is better.
-        latent_distance: distance between the latents of the layout and of the photograph.
-        camera_height_m: camera height over the floor that fits best.
         candidates: possible poses, best first; the first is the answer.
         view: what was assumed about the photograph, and how much it tells.
         model: the model.
         evidence: the search behind the answer; no part of `document`.
     """
 
-    position: Position
-    heading_deg: float
-    heading_source: HeadingSource
-    room: str
-    room_id: str
-    confidence: float | None
-    heading_confidence: float | None
-    probability_elsewhere: float | None
-    warnings: list[str]
-    covariance_m2: tuple[tuple[float, float], tuple[float, float]] | None
-    heading_std_deg: float | None
-    stage: SearchStage
-    cost: float
-    latent_distance: float
-    camera_height_m: float
     candidates: list[PossiblePose]
-    view: ToldPhotograph
-    model: Model
+    view: ViewAnswer
+    model: ModelAnswer
     evidence: Evidence = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DroppedFrames:
+class DroppedFrames(Document):
     """Frames of a film that were not kept for one reason."""
-
-    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
 
     reason: str
     frames: int
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilmReading:
-    """Frames of a film that were read and kept, and why the others were not."""
+class FilmAnswer(Document):
+    """Reading of a film."""
 
     frames_read: Annotated[int, Field(description="Frames that were decoded.")]
     frames_kept: Annotated[int, Field(description="Frames that became poses.")]
@@ -328,7 +231,7 @@ class TurnAnswer(Answer):
 
     poses: list[Answer]
     times_s: list[float] | None
-    film: FilmReading | None
+    film: FilmAnswer | None
 
     def document(self) -> dict[str, Any]:
         """Return the answer as plain data; poses of a film have their times."""
@@ -342,7 +245,7 @@ class TurnAnswer(Answer):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackedAnswer(_Document):
+class TrackedAnswer(Document):
     """Pose of a moving camera at a photograph.
 
     Attributes:
@@ -367,5 +270,5 @@ class TrackedAnswer(_Document):
     candidates: list[PossiblePose]
     motion_contradicted: list[str]
     warnings: list[str]
-    view: ReadPhotograph
-    model: Model
+    view: ReadView
+    model: ModelAnswer

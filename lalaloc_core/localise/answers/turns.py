@@ -10,7 +10,8 @@ from typing import Any
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.answers.compose import compose_answer
-from lalaloc_core.localise.answers.documents import Angle, DroppedFrames, FilmReading, Ground, Spot, TurnAnswer
+from lalaloc_core.localise.answers.documents import DroppedFrames, FilmAnswer, Ground, Spot, TurnAnswer
+from lalaloc_core.localise.answers.views import AssumedAngle
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.query.query import KnownHeading
@@ -50,7 +51,7 @@ class Turn:
     turns: Sequence[float] | None
     relative: Sequence[RelativeHeading]
     overlap: Sequence[TurnAngles] | None = None
-    relative_headings: Sequence[Angle | None]
+    relative_headings: Sequence[AssumedAngle | None]
     film: Film | None = None
 
     @classmethod
@@ -67,7 +68,7 @@ class Turn:
         several = len({angle.group for angle in overlap}) < len(photographs)
         # Of other groups, only the angles within the group are known.
         told = [
-            Angle(
+            AssumedAngle(
                 value_deg=math.degrees(angle.heading),
                 std_deg=math.degrees(angle.heading_sd),
                 source="assumed" if angle.is_assumed else "estimated",
@@ -114,7 +115,7 @@ class Turn:
             relative_headings=[
                 None
                 if angle is None
-                else Angle(
+                else AssumedAngle(
                     value_deg=math.degrees(wrap_angle(angle)),
                     std_deg=math.degrees(std) if index else 0.0,
                     source="given",
@@ -251,8 +252,8 @@ def compose_turn(
     )
 
 
-def _film_reading(film: Film) -> FilmReading:
-    return FilmReading(
+def _film_reading(film: Film) -> FilmAnswer:
+    return FilmAnswer(
         frames_read=film.frames,
         frames_kept=len(film.photographs),
         dropped=[DroppedFrames(reason=reason, frames=frames) for reason, frames in film.dropped.items()],

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from lalaloc_core.answer_numbers import Score, Share, SignedDegrees
 from lalaloc_core.bundle import Manifest
@@ -126,8 +126,10 @@ def _percent(share: float) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdvisedStep:
+class NextStepAnswer:
     """Step after an answer that is not sure, and what it is expected to tell."""
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
 
     kind: Annotated[
         StepKind,
@@ -160,7 +162,7 @@ def step_after(
     field: float,
     step_m: float,
     rooms_known: bool = False,
-) -> AdvisedStep | None:
+) -> NextStepAnswer | None:
     """Return the next step after an answer; None without a confidence, or a step.
 
     `arcs` are azimuths (radians) that were seen, relative to the photograph's centre; `field` is its horizontal field
@@ -172,7 +174,7 @@ def step_after(
     step = next_step(plan, manifest, known, step_m=step_m)
     if step is None:
         return None
-    return AdvisedStep(
+    return NextStepAnswer(
         kind=step.kind,
         text=words_of(plan, step),
         turn_deg=math.degrees(step.turn) if step.kind in ("turn", "door") else None,
