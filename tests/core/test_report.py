@@ -268,7 +268,7 @@ class TestPage:
 
     def test_charts_have_descriptions(self, page: Page) -> None:
         drawings = [attributes for tag, attributes in page.tags if tag == "img"]
-        assert len(drawings) == 4
+        assert len(drawings) == 2
         assert all(drawing["src"].startswith("data:image/svg+xml;base64,") and drawing["alt"] for drawing in drawings)
 
     def test_text_from_files_is_escaped(self, tmp_path: Path) -> None:
@@ -336,7 +336,7 @@ class TestRuns:
         some = [replace(query, confidence=None) for query in mixed()]
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         assert "nothing to calibrate" in page.text
-        assert sum(tag == "img" for tag, _ in page.tags) == 3
+        assert sum(tag == "img" for tag, _ in page.tags) == 1
 
 
 class TestWorst:
@@ -349,6 +349,4 @@ class TestWorst:
     def test_charts_are_written_as_files(self, tmp_path: Path) -> None:
         write_report([run_folder(tmp_path / "run", mixed())], tmp_path / "report.html", pictures=tmp_path / "charts")
         drawn = {path.stem: ElementTree.parse(path).getroot().tag for path in (tmp_path / "charts").iterdir()}
-        assert drawn == dict.fromkeys(
-            ("calibration", "error-curves", "outcomes", "times"), "{http://www.w3.org/2000/svg}svg"
-        )
+        assert drawn == dict.fromkeys(("calibration", "error-curves"), "{http://www.w3.org/2000/svg}svg")

@@ -1,4 +1,4 @@
-"""Charts of a report, drawn once by matplotlib: error curves, calibration, outcomes and times."""
+"""Charts of a report, drawn once by matplotlib: error curves and calibration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import cycle, islice
 from typing import Any
 
 import matplotlib as mpl
@@ -16,8 +15,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lalaloc_core.evaluate.report.scored_runs import TOTAL, Run, stage_times
-from lalaloc_core.evaluate.runs.score import Outcome, count_outcomes, position_errors_m
+from lalaloc_core.evaluate.report.scored_runs import Run
+from lalaloc_core.evaluate.runs.score import position_errors_m
 
 INK, MUTED, RULE, PAPER = "#1c2128", "#59626d", "#d5dbe1", "#ffffff"
 SERIES = ("#0b63b5", "#c2410c", "#0f7b53", "#a3297a", "#8a6d00", "#0e7c86", "#6d4ed1", "#7a4a2a")
@@ -52,10 +51,7 @@ CURVE_LIMITS_M = (0.001, 20.0)
 CONFIDENCE_BINS = 20
 _TICKS = {0.001: "0.1 cm", 0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m", 10.0: "10 m"}
 _WIDTH_INCHES = 5.6
-_BAR_INCHES = 0.3
 _LEGEND_CHARACTERS = 84
-# Blue for located; the failures in colours that colour-blind readers can distinguish.
-OUTCOME_COLOURS = dict(zip(Outcome, (SERIES[0], SERIES[4], SERIES[1], MUTED), strict=True))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,16 +71,9 @@ class Chart:
 def draw_charts(runs: Sequence[Run]) -> dict[str, Chart]:
     """Draw the charts for which the runs have data, by name."""
     answered = [run for run in runs if run.predictions]
-    charts = []
+    confident = [run for run in answered if run.scores is not None and run.scores.reliability]
     with mpl.rc_context(_STYLE):
-        if answered:
-            charts += [_error_curves(answered), _outcomes(answered)]
-        confident = [run for run in answered if run.scores is not None and run.scores.reliability]
-        if confident:
-            charts.append(_calibration(confident))
-        timed = [run for run in answered if stage_times(run.predictions)]
-        if timed:
-            charts.append(_times(timed))
+        charts = [draw(chosen) for draw, chosen in ((_error_curves, answered), (_calibration, confident)) if chosen]
     return {chart.name: chart for chart in charts}
 
 
@@ -160,57 +149,6 @@ def _calibration(runs: Sequence[Run]) -> Chart:
     )
 
 
-def _outcomes(runs: Sequence[Run]) -> Chart:
-    shares = {
-        run.name: {kind.value: 100.0 * n / len(run.predictions) for kind, n in count_outcomes(run.predictions).items()}
-        for run in runs
-    }
-    figure = _stacked_bars(shares, {kind.value: colour for kind, colour in OUTCOME_COLOURS.items()})
-    _percent(figure.axes[0], "x", "queries")
-    figure.axes[0].set_xlim(0.0, 100.0)
-    return _chart(
-        figure,
-        "outcomes",
-        "Located and failed queries. Share of queries located, misaligned in the right room, in a wrong room, or "
-        "without an answer, one bar per run. The table below the chart has the same figures.",
-    )
-
-
-def _times(runs: Sequence[Run]) -> Chart:
-    medians = {
-        run.name: {name: time.median_ms for name, time in stage_times(run.predictions).items() if name != TOTAL}
-        for run in runs
-    }
-    stages = list(dict.fromkeys(name for row in medians.values() for name in row))
-    figure = _stacked_bars(medians, _bar_colours(stages))
-    figure.axes[0].set_xlabel("median per query (ms)")
-    return _chart(
-        figure,
-        "times",
-        "Time per stage. Median milliseconds of each stage of a query, stacked, one bar per run. The table below the "
-        "chart has the same figures and the 95th percentile.",
-    )
-
-
-def _stacked_bars(rows: dict[str, dict[str, float]], colours: dict[str, str]) -> Figure:
-    height = 0.7 + _BAR_INCHES * len(rows) + _legend_inches(list(colours))
-    figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
-    axes = figure.subplots()
-    place = np.arange(len(rows))
-    left = np.zeros(len(rows))
-    for name, colour in colours.items():
-        width = np.array([row.get(name, 0.0) for row in rows.values()])
-        axes.barh(place, width, left=left, height=0.66, color=colour, edgecolor=PAPER, linewidth=0.8, label=name)
-        left += width
-    axes.set_yticks(place, [""] * len(rows) if len(rows) == 1 else list(rows))
-    axes.invert_yaxis()
-    axes.grid(visible=False, axis="y")
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    _legend(figure, axes.containers, list(colours))
-    return figure
-
-
 def _percent(axes: Axes, axis: str, label: str, step: int | None = 20) -> None:
     chosen = axes.xaxis if axis == "x" else axes.yaxis
     if step is not None:
@@ -246,7 +184,3 @@ def _line_styles(count: int) -> list[dict[str, Any]]:
         {"color": SERIES[index % len(SERIES)], "linestyle": _DASHES[index // len(SERIES) % len(_DASHES)]}
         for index in range(count)
     ]
-
-
-def _bar_colours(names: Sequence[str]) -> dict[str, str]:
-    return dict(zip(names, islice(cycle(SERIES), len(names)), strict=True))

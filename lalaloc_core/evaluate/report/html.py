@@ -14,9 +14,6 @@ from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.evaluate.runs.score import ALIGNMENT_LIMIT_M, Outcome
 from lalaloc_core.files import atomic_write
 
-# Queries that the page lists as the worst of each run.
-_WORST = 20
-
 
 def write_report(folders: Sequence[Path], out: Path, *, pictures: Path | None = None) -> None:
     """Write the report on some runs; `pictures` is a folder for the page's charts as files, None for none."""
@@ -47,7 +44,6 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart]) -> str:
         several=len(runs) > 1,
         outcomes=[outcome.value for outcome in Outcome],
         alignment_limit_m=ALIGNMENT_LIMIT_M,
-        worst_count=_WORST,
         calibrated=[run for run in runs if run.scores is not None and run.scores.calibration_error is not None],
         curve_points=[
             f"{100.0 * limit_m:g} cm" if limit_m < 1.0 else f"{limit_m:g} m" for limit_m in report_tables.CURVE_POINTS_M

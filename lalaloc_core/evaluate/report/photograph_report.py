@@ -42,6 +42,8 @@ FIGURES_FILE = "photographs.json"
 _HEADINGS = {"known": True, "unknown": False}
 # Views of each photograph, at equal angles.
 _VIEWS = 8
+# Measures of a photograph's walls that are shown for each.
+_MEASURES = ("median_error", "error_90", "bias", "scale_ratio")
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,16 +61,20 @@ class PhotographResults:
     read_views: Mapping[str, ReadViews] = dataclasses.field(default_factory=dict)
     foreign: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
 
+    @property
+    def azimuths(self) -> AzimuthSummary:
+        """Summary of the photographs that count."""
+        return summarise_azimuths([read.measures for read in self.read if read.photograph.counts], OPENING_CLASSES)
+
     def figures(self) -> dict[str, Any]:
-        """Return all figures as plain data; summaries are over the photographs that count."""
-        counting = [read.measures for read in self.read if read.photograph.counts]
+        """Return all figures as plain data."""
         scores, *views = (
             {heading: dataclasses.asdict(score_galleries(results)) for heading, results in answers.items()}
             for answers in (self.answers, *self.views.values())
         )
         return without_infinity(
             {
-                "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
+                "azimuths": dataclasses.asdict(self.azimuths),
                 "read_views": {field_deg: dataclasses.asdict(read) for field_deg, read in self.read_views.items()},
                 "galleries": scores,
                 "views": dict(zip(self.views, views, strict=True)),
@@ -96,26 +102,17 @@ class PhotographResults:
         return counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0) if counts.any() else None
 
     def _figures(self, read: ReadPhotograph) -> dict[str, Any]:
-        measures, name = read.measures, read.photograph.name
+        name = read.photograph.name
         galleries = {
             heading: [dataclasses.asdict(answer) for answer in results if answer.photograph == name]
             for heading, results in self.answers.items()
         }
-        return {
-            "name": name,
-            "quality": read.photograph.quality,
-            "outline": measures.outline,
-            "median_error": measures.median_error,
-            "error_90": measures.error_90,
-            "bias": measures.bias,
-            "scale_ratio": measures.scale_ratio,
-            "galleries": galleries,
-        }
+        measures = {measure: getattr(read.measures, measure) for measure in ("outline", *_MEASURES)}
+        return {"name": name, "quality": read.photograph.quality, **measures, "galleries": galleries}
 
     def markdown(self) -> str:
         """Return the figures as Markdown tables: all photographs together, the classes read, and each photograph."""
-        counting = [read.measures for read in self.read if read.photograph.counts]
-        azimuths = summarise_azimuths(counting, OPENING_CLASSES)
+        azimuths = self.azimuths
         within = ", ".join(f"{percent(share)} within {float(q):.0%}" for q, share in azimuths.within.items())
         rows = [
             ("photographs, good or fair", str(azimuths.n)),
@@ -127,10 +124,8 @@ class PhotographResults:
         ]
         for field_deg, reading in self.read_views.items():
             rows += _view_rows(f"views of {field_deg}°", reading)
-        for what, answers in (
-            ("galleries", self.answers),
-            *((f"views of {deg}°", of) for deg, of in self.views.items()),
-        ):
+        shown = {"galleries": self.answers, **{f"views of {deg}°": found for deg, found in self.views.items()}}
+        for what, answers in shown.items():
             for heading, results in answers.items():
                 rows += _gallery_rows(f"{what}, heading {heading}", score_galleries(results))
         for heading, found in self._accepted().items():
@@ -144,10 +139,10 @@ class PhotographResults:
         return "\n".join([*tables, markdown_table(columns, [self._cells(read) for read in self.read])])
 
     def _cells(self, read: ReadPhotograph) -> list[str]:
-        measures, name = read.measures, read.photograph.name
-        numbers = (measures.median_error, measures.error_90, measures.bias, measures.scale_ratio)
+        name = read.photograph.name
+        numbers = (_number(getattr(read.measures, measure)) for measure in _MEASURES)
         located = (describe_answers(results, name) for results in self.answers.values())
-        return [name, read.photograph.quality, *map(_number, numbers), *located]
+        return [name, read.photograph.quality, *numbers, *located]
 
 
 def evaluate_photographs(
@@ -172,7 +167,8 @@ def evaluate_photographs(
             f"all {len(dataset.photographs)} photographs at '{data}' are of quality 'poor'; "
             "at least one must be 'fair' or 'good'"
         )
-    encoders = PhotographEncoder(Bundle.open(bundle), threads=1)
+    opened = Bundle.open(bundle)
+    encoders = PhotographEncoder(opened, threads=1)
     read = read_photographs(encoders, dataset.photographs)
     counting = [item for item in read if item.photograph.counts]
     readings = {f"{field_deg:g}": read_views(encoders, counting, field_deg, _VIEWS) for field_deg in views_deg}
@@ -200,7 +196,7 @@ def evaluate_photographs(
         {heading: located(field_deg, heading, known) for heading, known in headings.items()}
         for field_deg in (None, *views_deg)
     )
-    opened, plans = Bundle.open(bundle), foreign_plans() if galleries else []
+    plans = foreign_plans() if galleries else []
     foreign = {
         heading: foreign_confidences(opened, [item.photograph for item in counting], plans, heading_known=known)
         for heading, known in headings.items()
@@ -219,21 +215,15 @@ def _view_rows(what: str, read: ReadViews) -> list[tuple[str, str]]:
     view, sphere, constant = (read.by_reader[reader] for reader in ("view", "sphere", "constant"))
     within = ", ".join(f"{percent(share)} within {limit}°" for limit, share in read.walls_within.items())
 
-    def openings(summary: AzimuthSummary) -> str:
-        return "–" if summary.classes is None else percent(summary.classes.balanced_accuracy)
+    def bounded(measure: str) -> str:
+        own, constant_distance, whole = (_number(getattr(by, measure)) for by in (view, constant, sphere))
+        return f"{own} (constant distance {constant_distance}, whole sphere {whole})"
 
+    accuracy, of_sphere = (_share(by.classes and by.classes.balanced_accuracy) for by in (view, sphere))
     return [
-        (
-            f"{what}: median error of the walls' shape",
-            f"{_number(view.shape_error)} (constant distance {_number(constant.shape_error)}, "
-            f"whole sphere {_number(sphere.shape_error)})",
-        ),
-        (
-            "… of log distance",
-            f"{_number(view.median_error)} (constant distance {_number(constant.median_error)}, "
-            f"whole sphere {_number(sphere.median_error)})",
-        ),
-        ("… openings, balanced accuracy", f"{openings(view)} (whole sphere {openings(sphere)})"),
+        (f"{what}: median error of the walls' shape", bounded("shape_error")),
+        ("… of log distance", bounded("median_error")),
+        ("… openings, balanced accuracy", f"{accuracy} (whole sphere {of_sphere})"),
         ("… direction of the walls by lines", within),
     ]
 
@@ -243,10 +233,7 @@ def _gallery_rows(what: str, scores: GalleryScores) -> list[tuple[str, str]]:
         (f"{what}: located", f"{percent(scores.located)} of {scores.galleries}"),
         ("… located, heading error above 10°", percent(scores.turned)),
         ("… right room", percent(scores.right_room)),
-        (
-            "… right room among the first three, five candidates",
-            f"{percent(scores.among_3)}, {percent(scores.among_5)}",
-        ),
+        ("… among the first three, five candidates", f"{percent(scores.among_3)}, {percent(scores.among_5)}"),
         ("… expected calibration error of confidence", _number(scores.calibration_error)),
     ]
 

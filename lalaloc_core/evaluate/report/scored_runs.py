@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from lalaloc_core.errors import RunError
-from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo, read_runs
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import Scores, score
 
 _MAX_LABEL = 48
+TOTAL = "total"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -23,7 +25,6 @@ class Run:
     """
 
     name: str
-    folder: Path
     info: RunInfo
     predictions: list[Prediction]
     scores: Scores | None
@@ -38,29 +39,18 @@ def open_runs(folders: Sequence[Path]) -> list[Run]:
     """Read and score runs."""
     if not folders:
         raise RunError("a report needs at least one run")
-    several = len(folders) > 1
-    return [
-        Run(
-            name=f"{number}. {_shortened(info.label)}" if several else _shortened(info.label),
-            folder=folder,
-            info=info,
-            predictions=predictions,
-            scores=score(predictions) if predictions else None,
-        )
-        for number, (folder, (info, predictions)) in enumerate(zip(folders, read_runs(folders), strict=True), start=1)
-    ]
+    runs = []
+    for number, folder in enumerate(map(RunFolder, folders), start=1):
+        info, predictions = folder.read_info(), folder.read_predictions()
+        name = info.label if len(info.label) <= _MAX_LABEL else info.label[: _MAX_LABEL - 1] + "…"
+        name = f"{number}. {name}" if len(folders) > 1 else name
+        scores = score(predictions) if predictions else None
+        runs.append(Run(name=name, info=info, predictions=predictions, scores=scores))
+    return runs
 
 
-def _shortened(label: str) -> str:
-    return label if len(label) <= _MAX_LABEL else label[: _MAX_LABEL - 1] + "…"
-
-
-TOTAL = "total"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageTime:
-    """Duration of one stage over the queries that passed it."""
+class StageTime(NamedTuple):
+    """Number of queries that passed a stage, and its median and 95th percentile."""
 
     count: int
     median_ms: float
@@ -70,11 +60,8 @@ class StageTime:
 def stage_times(predictions: Sequence[Prediction]) -> dict[str, StageTime]:
     """Return times by stage, and of whole queries under `TOTAL`; empty without times."""
     timed = [prediction.timings_ms for prediction in predictions if prediction.timings_ms]
-    names = list(dict.fromkeys(name for timings in timed for name in timings))
-    times = {name: _summary([timings[name] for timings in timed if name in timings]) for name in names}
-    return {**times, TOTAL: _summary([sum(timings.values()) for timings in timed])} if timed else {}
-
-
-def _summary(milliseconds: list[float]) -> StageTime:
-    median, p95 = np.percentile(milliseconds, [50.0, 95.0])
-    return StageTime(count=len(milliseconds), median_ms=float(median), p95_ms=float(p95))
+    names = dict.fromkeys(name for timings in timed for name in timings)
+    times_ms = {name: [timings[name] for timings in timed if name in timings] for name in names}
+    if timed:
+        times_ms[TOTAL] = [sum(timings.values()) for timings in timed]
+    return {name: StageTime(len(ms), *map(float, np.percentile(ms, [50.0, 95.0]))) for name, ms in times_ms.items()}

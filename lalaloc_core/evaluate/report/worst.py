@@ -13,8 +13,9 @@ import numpy as np
 
 from lalaloc_core.errors import BundleError, DatasetError, LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, encode, read_image
-from lalaloc_core.evaluate.methods.method import Pose, Question
-from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance, require_bundle
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.runs.evaluation import question_of
+from lalaloc_core.evaluate.runs.factories import build_dataset, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import (
     Outcome,
@@ -71,18 +72,16 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
     info, predictions = folder.read_info(), folder.read_predictions()
     if not predictions:
         raise RunError(f"the run at '{run}' has no predictions; run `lalaloc lab evaluate` first")
-    chosen = choose_worst(predictions, count)
-    reopened = _ReopenedRun(info)
-    queries: list[WorstQuery] = []
-    left_out: list[str] = []
+    chosen, reopened = choose_worst(predictions, count), _ReopenedRun(info)
+    queries, left_out = list[WorstQuery](), list[str]()
     for prediction in chosen:
         try:
             queries.append(reopened.analyse(prediction))
         except (LaLaLocError, OSError) as error:
             left_out.append(str(error))
-    out.mkdir(parents=True, exist_ok=True)
     summary = {"left_out": left_out, **summarise(predictions, chosen, queries)}
     content = {**summary, "worst": [dataclasses.asdict(query) for query in queries]}
+    out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / SUMMARY_FILE, json.dumps(content, indent=2, allow_nan=False) + "\n")
     return summary
 
@@ -94,11 +93,8 @@ def summarise(
     errors_m = position_errors_m(chosen)
     answered = errors_m[~np.isnan(errors_m)]
     misaligned = [query for query in examined if query.outcome is Outcome.WRONG_ALIGNMENT]
-    costs = [
-        (query.true_cost, query.found_cost)
-        for query in examined
-        if query.true_cost is not None and query.found_cost is not None
-    ]
+    pairs = [(query.true_cost, query.found_cost) for query in examined]
+    costs = [(true, found) for true, found in pairs if true is not None and found is not None]
     biases = [query.distance_bias for query in examined if query.distance_bias is not None]
     kinds = outcomes(chosen)
     first = next((name for prediction in predictions for name in prediction.stages), None)
@@ -139,7 +135,6 @@ class _ReopenedRun:
 
     def __init__(self, info: RunInfo) -> None:
         self._info, self._dataset, self._encoders = info, build_dataset(info), None
-        self._appearance = choose_appearance(self._dataset, info.furniture, info.lighting)
         if info.bundle is not None:
             bundle = require_bundle(info)
             if info.model is not None and info.model.get("sha256") not in (None, bundle.sha256):
@@ -154,14 +149,14 @@ class _ReopenedRun:
         found = prediction.final_pose
         fit: dict[str, float | None] = {}
         if self._encoders is not None:
-            question = self._question(scene, camera)
+            question = question_of(scene, camera, self._info, pose_grid(scene.plan, self._info.grid_step_m))
             query = encode(self._encoders, question, read_image(self._encoders, question))
             weights = self._encoders.manifest.evidence_for(view=query.is_view)
             fit["true_cost"] = cost_of_pose(query, scene.plan, prediction.truth, weights)
             fit["found_cost"] = None if found is None else cost_of_pose(query, scene.plan, found, weights)
             fit["distance_bias"] = _distance_bias(query, scene, prediction.truth)
-        errors_m = position_errors_m([prediction])
-        first_m = position_errors_m([prediction], next(iter(prediction.stages), None))
+        (error_m,) = position_errors_m([prediction]).tolist()
+        (first_m,) = position_errors_m([prediction], next(iter(prediction.stages), None)).tolist()
         (outcome,) = outcomes([prediction])
         return WorstQuery(
             scene=prediction.scene,
@@ -169,8 +164,8 @@ class _ReopenedRun:
             room=prediction.room,
             found_room=None if found is None else scene.plan.rooms[found.room_index].name,
             outcome=outcome,
-            error_m=None if found is None else float(errors_m[0]),
-            first_error_m=None if found is None else float(first_m[0]),
+            error_m=None if found is None else error_m,
+            first_error_m=None if found is None else first_m,
             confidence=prediction.confidence,
             facts=prediction.facts,
             symmetric=is_symmetric(scene.plan, prediction),
@@ -190,18 +185,6 @@ class _ReopenedRun:
                 scene=scene.name,
             )
         return scene, camera
-
-    def _question(self, scene: Scene, camera: Camera) -> Question:
-        info = self._info
-        return Question(
-            plan=scene.plan,
-            grid=pose_grid(scene.plan, info.grid_step_m),
-            grid_step_m=info.grid_step_m,
-            camera=camera,
-            kind=info.kind,
-            photograph=scene.photograph(camera, self._appearance) if info.kind == "photograph" else None,
-            heading_known=info.heading_known,
-        )
 
 
 def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:

@@ -164,6 +164,20 @@ def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list
     return predictions, problems or []
 
 
+def question_of(scene: Scene, camera: Camera, info: RunInfo, grid: PoseSet) -> Question:
+    """Return the question of a run about one camera."""
+    appearance = Appearance(info.furniture, info.lighting)
+    return Question(
+        plan=scene.plan,
+        grid=grid,
+        grid_step_m=info.grid_step_m,
+        camera=camera,
+        kind=info.kind,
+        photograph=scene.photograph(camera, appearance) if info.kind == "photograph" else None,
+        heading_known=info.heading_known,
+    )
+
+
 class _SceneEvaluator:
     """Queries of one scene, with the recall of retrieval."""
 
@@ -174,18 +188,7 @@ class _SceneEvaluator:
 
     def predict(self, camera: Camera, method: Method) -> Prediction:
         info, scene = self._info, self._scene
-        photograph = None
-        if info.kind == "photograph":
-            photograph = scene.photograph(camera, Appearance(info.furniture, info.lighting))
-        question = Question(
-            plan=scene.plan,
-            grid=self._grid,
-            grid_step_m=info.grid_step_m,
-            camera=camera,
-            kind=info.kind,
-            photograph=photograph,
-            heading_known=info.heading_known,
-        )
+        question = question_of(scene, camera, info, self._grid)
         answer = method.locate(question)
         return Prediction(
             scene=scene.name,
@@ -204,7 +207,7 @@ class _SceneEvaluator:
             heading_confidence=answer.heading_confidence,
             found_height_m=answer.camera_height_m,
             timings_ms=answer.timings_ms,
-            facts=tuple(sorted(photograph_facts(photograph))),
+            facts=tuple(sorted(photograph_facts(question.photograph))),
         )
 
     def _layout_hit(self, question: Question, answer: Answer) -> bool | None:

@@ -13,7 +13,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -179,13 +179,6 @@ class RunFolder:
             return build_config(Prediction, json.loads(line), path=f"line {number}")
         except (ValueError, ConfigError) as error:
             raise RunError(f"'{self.path / PREDICTIONS_FILE}' line {number} is not a prediction: {error}") from error
-
-
-def read_runs(folders: Iterable[Path]) -> Iterator[tuple[RunInfo, list[Prediction]]]:
-    """Yield the description and the predictions of several runs."""
-    for folder in folders:
-        run = RunFolder(folder)
-        yield run.read_info(), run.read_predictions()
 
 
 def _lines(predictions: Iterable[Prediction]) -> str:
