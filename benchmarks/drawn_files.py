@@ -18,7 +18,7 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 from shapely.geometry.base import BaseGeometry
 
-from benchmarks.plan_drawing import Model, OpeningSymbol, door_leaves, hatch_lines, scan
+from benchmarks.plan_drawing import Model, OpeningSymbol, door_leaves, encoded, hatch_lines, scan
 from lalaloc_core.draw import rasterise
 from lalaloc_core.draw.canvas import font_file
 
@@ -79,6 +79,8 @@ _LAYERS: tuple[Layer, ...] = get_args(Layer)
 # Length on paper at 1:100, points per metre, resolution of pictures, and pens (m).
 _PAPER_MM, _POINTS, _PIXELS_PER_M = 10.0, 72.0 / 2.54, 80
 _THICK_PEN, _THIN_PEN, _TEXT_M, _HATCH_M = 0.025, 0.012, 0.2, 0.1
+# Options of files of pictures, on paper at 1:100.
+_PAPER: dict[str, Any] = {"resolution": _PIXELS_PER_M * 2.54, "quality": 70}
 _SHADES = ("#faf0dc", "#e2f0fa", "#e8f6e4", "#fae8ee")
 
 
@@ -114,18 +116,16 @@ def draw_file(
 
     None for a style that a format does not have: SVG and DXF are not scanned.
     """
+    known = {"metres_per_pixel": str(1.0 / _PIXELS_PER_M)} if format == "png" else {"scale": "1:100"}
     if style == "scanned":
         picture = scan(_picture(drawing), 2.0 if seed % 2 else -2.0, np.random.default_rng(seed))
-        if format == "png":
-            return _encode(picture, "JPEG"), {"metres_per_pixel": str(1.0 / _PIXELS_PER_M)}
-        if format == "pdf":
-            return _encode(picture, "PDF"), {"scale": "1:100"}
-        return None
+        kind = {"png": "JPEG", "pdf": "PDF"}.get(format)
+        return None if kind is None else (encoded(picture, kind, **_PAPER), known)
     if format == "png":
-        return _encode(_picture(drawing), "PNG"), {"metres_per_pixel": str(1.0 / _PIXELS_PER_M)}
+        return encoded(_picture(drawing), "PNG", **_PAPER), known
     if format == "svg":
-        return svg(drawing).encode(), {"scale": "1:100"}
-    return (dxf(drawing), {}) if format == "dxf" else (pdf(drawing), {"scale": "1:100"})
+        return svg(drawing).encode(), known
+    return (dxf(drawing), {}) if format == "dxf" else (pdf(drawing), known)
 
 
 def draw_home(model: Model, style: FileStyle, language: str, rng: np.random.Generator) -> HomeDrawing:
@@ -323,10 +323,3 @@ def _picture(drawing: HomeDrawing) -> np.ndarray:
     text = svg(drawing)
     sized = text.replace(text[text.index("width=") : text.index(" viewBox")], pixels, 1)
     return np.asarray(Image.open(io.BytesIO(rasterise(sized))).convert("RGB"))
-
-
-def _encode(picture: np.ndarray, format: str) -> bytes:
-    stream = io.BytesIO()
-    # On paper at 1:100.
-    Image.fromarray(picture).save(stream, format, resolution=_PIXELS_PER_M * 2.54, quality=70)
-    return stream.getvalue()

@@ -199,10 +199,7 @@ def overload(options: argparse.Namespace) -> dict[str, Any]:
     }
     report = {"capacity": capacity, "waiting": waiting, "clients": _CROWD * capacity}
     parts = {"alone": alone.answered, "accepted": accepted, "refused": refused, "after": after.answered}
-    for name, requests in parts.items():
-        report[name] = {"count": requests.count, "per_second": round(requests.per_second, 1)}
-        report[name]["milliseconds"] = requests.percentiles_ms()
-    return report | {"expected": expected}
+    return report | {name: requests.figures() for name, requests in parts.items()} | {"expected": expected}
 
 
 def soak(options: argparse.Namespace) -> dict[str, Any]:
@@ -234,12 +231,9 @@ def soak(options: argparse.Namespace) -> dict[str, Any]:
             harness.wait_until(lambda: _all_are_ready(service.url), "workers restart", _RESTART_TIMEOUT_S, 0.2)
         restarted = _all_are_ready(service.url)
     warm = memory_mb[int(_WARM_UP_SHARE * len(memory_mb)) :]
-    answered = result.answered
     return {
-        "answered": answered.count,
-        "per_second": round(answered.per_second, 1),
+        "answered": result.answered.figures(),
         "stages": result.stages,
-        "milliseconds": answered.percentiles_ms(),
         "refused": result.refused.count,
         "failed": result.failures,
         "workers_killed": len(killed),
@@ -258,11 +252,8 @@ def _worker_processes(process: psutil.Process) -> list[psutil.Process]:
     """Return the worker processes of a service, without Python's resource tracker."""
     workers = []
     for child in process.children(recursive=True):
-        try:
-            if "spawn_main" in " ".join(child.cmdline()):
-                workers.append(child)
-        except psutil.NoSuchProcess:
-            continue
+        with suppress(psutil.NoSuchProcess):
+            workers += [child] if "spawn_main" in " ".join(child.cmdline()) else []
     return workers
 
 
@@ -320,7 +311,7 @@ def outage(options: argparse.Namespace) -> dict[str, Any]:
     return {
         "outage_s": seconds,
         "cached_plan": {
-            name: {"answered": result.answered.count, "milliseconds": result.answered.percentiles_ms()}
+            name: result.answered.figures()
             for name, result in (("before", before), ("during", during), ("after", after))
         },
         "other_statuses": dict(Counter(str(status) for status, _ in refused)),

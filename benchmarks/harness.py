@@ -34,7 +34,7 @@ from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
 
 _JSON = "application/json"
-_REQUEST_TIMEOUT_S, _IDLE_S = 600.0, 5.0
+_REQUEST_TIMEOUT_S, _PLAN_TIMEOUT_S, _IDLE_S = 600.0, 120.0, 5.0
 _SMALL_BUFFER = 4096
 _REFUSED = "refused"
 _KINDS = ("lpo", "vdr", _REFUSED)
@@ -51,7 +51,12 @@ def argument_parser(doc: str | None) -> argparse.ArgumentParser:
 
 def print_table_head(*names: str) -> None:
     """Print the head of a Markdown table."""
-    print(f"{table_row(*names)}\n|{'---|' * len(names)}", flush=True)
+    print(table_head(*names), flush=True)
+
+
+def table_head(*names: str) -> str:
+    """Return the head of a Markdown table."""
+    return f"{table_row(*names)}\n|{'---|' * len(names)}"
 
 
 def table_row(*cells: object) -> str:
@@ -106,10 +111,8 @@ def upload_example_plan(url: str) -> str:
     with httpx.Client(base_url=url, timeout=60.0) as client:
         response = client.post("/floorplans", files={"file": (PLAN_PATH.name, PLAN_PATH.read_bytes())})
         plan_id: str = response.raise_for_status().json()["id"]
-        while (status := client.get(f"/floorplans/{plan_id}").json()["status"]) == "preparing":
-            time.sleep(0.1)
-    if status != "ready":
-        raise RuntimeError(f"the example plan has status '{status}'; it must be 'ready'")
+        path = f"/floorplans/{plan_id}"
+        wait_until(lambda: client.get(path).json()["status"] == "ready", "the example plan is ready", _PLAN_TIMEOUT_S)
     return plan_id
 
 
@@ -233,6 +236,11 @@ class Requests:
         """Return median, 95th and 99th percentile."""
         return {f"p{percent}": round(self.percentile_ms(percent), 1) for percent in (50, 95, 99)}
 
+    def figures(self) -> dict[str, Any]:
+        """Return number, rate and percentiles as plain data."""
+        rate = round(self.per_second, 1)
+        return {"count": self.count, "per_second": rate, "milliseconds": self.percentiles_ms()}
+
 
 @dataclass(frozen=True)
 class LoadResult:
@@ -268,14 +276,21 @@ def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float) ->
     The clients take the plans in turns and pause for about a second after a refusal. They run in a process of their
     own, whose clock no other thread delays.
     """
+    with child_process(_send_load, url, plan_ids, clients, seconds) as pipe:
+        return pipe.recv()
+
+
+@contextmanager
+def child_process(target: Callable[..., None], *arguments: Any) -> Iterator[Connection]:
+    """Run a function in another process, with a pipe after its arguments; yield the other end, which ends with it."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_send_load, args=(url, plan_ids, clients, seconds, theirs), daemon=True)
+    process = context.Process(target=target, args=(*arguments, theirs), daemon=True)
     process.start()
     # The end of the process ends the waiting for its result.
     theirs.close()
     try:
-        return ours.recv()
+        yield ours
     finally:
         process.kill()
         process.join()
@@ -327,9 +342,20 @@ def cpu_s(process: psutil.Process) -> float:
     total_s = 0.0
     for part in (process, *process.children(recursive=True)):
         with suppress(psutil.NoSuchProcess):
-            times = part.cpu_times()
-            total_s += times.user + times.system
+            total_s += sum(part.cpu_times()[:2])
     return total_s
+
+
+class Stopwatch:
+    """Wall clock and CPU time of a service and its workers since the stopwatch was made."""
+
+    def __init__(self, process: psutil.Process) -> None:
+        self._process, self._wall, self._cpu = process, time.perf_counter(), cpu_s(process)
+
+    def times_s(self) -> tuple[float, float]:
+        """Return the duration and the CPU time (s)."""
+        wall_s = time.perf_counter() - self._wall
+        return wall_s, cpu_s(self._process) - self._cpu
 
 
 def service_memory_mb(process: psutil.Process) -> float:

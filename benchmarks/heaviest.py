@@ -100,6 +100,12 @@ def created_id(answer: Answer) -> str:
     return answer.json()["id"]
 
 
+def _create(caller: Caller, path: str, content: bytes, media: str = "application/json") -> str:
+    """Create a resource and return its path; empty if it is refused."""
+    answer = caller.send("POST", path, content, media)
+    return f"{path}/{answer.json()['id']}" if answer.status == 201 else ""
+
+
 def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
     """Store homes and a venue of them; return its id and entity tag, and the ids of the homes."""
     ids = [created_id(caller.send("POST", "/floorplans", _body(home(number)))) for number in range(homes)]
@@ -184,9 +190,8 @@ def _post_and_delete(content: Callable[[int], bytes], media: str = "application/
     """Return the work of storing a plan and deleting it."""
 
     def work(caller: Caller, _stored: Stored, size: int) -> None:
-        answer = caller.send("POST", "/floorplans", content(size), media)
-        if answer.status == 201:
-            caller.send("DELETE", f"/floorplans/{answer.json()['id']}")
+        if plan := _create(caller, "/floorplans", content(size), media):
+            caller.send("DELETE", plan)
 
     return work
 
@@ -206,9 +211,8 @@ def _prepare_hall(caller: Caller, _stored: Stored, size: int) -> None:
 
 
 def _follow_events(caller: Caller, _stored: Stored, size: int) -> None:
-    answer = caller.send("POST", "/floorplans", _hall(size))
-    if answer.status == 201:
-        caller.send("GET", f"/floorplans/{answer.json()['id']}/events")
+    if plan := _create(caller, "/floorplans", _hall(size)):
+        caller.send("GET", f"{plan}/events")
 
 
 def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **fields: str) -> Work:
@@ -238,9 +242,8 @@ def _batch(caller: Caller, stored: Stored, _size: int) -> None:
 
 
 def _post_venue(caller: Caller, stored: Stored, _size: int) -> None:
-    answer = caller.send("POST", "/venues", _venue(stored.member_ids))
-    if answer.status == 201:
-        caller.send("DELETE", f"/venues/{answer.json()['id']}")
+    if venue := _create(caller, "/venues", _venue(stored.member_ids)):
+        caller.send("DELETE", venue)
 
 
 @cache
@@ -266,9 +269,8 @@ def _delete_with_plans(caller: Caller, venue: str) -> None:
 
 
 def _post_levels(caller: Caller, _stored: Stored, size: int) -> None:
-    answer = caller.send("POST", "/venues", *_levels_body(size))
-    if answer.status == 201:
-        _delete_with_plans(caller, f"/venues/{answer.json()['id']}")
+    if venue := _create(caller, "/venues", *_levels_body(size)):
+        _delete_with_plans(caller, venue)
 
 
 @cache
@@ -279,9 +281,7 @@ def _homes_body(homes: int) -> tuple[bytes, str]:
 
 def _extend_venue(caller: Caller, _stored: Stored, size: int) -> None:
     body = _homes_body(size)
-    answer = caller.send("POST", "/venues", _venue([]))
-    if answer.status == 201:
-        path = f"/venues/{answer.json()['id']}"
+    if path := _create(caller, "/venues", _venue([])):
         caller.send("PATCH", path, *body)
         _delete_with_plans(caller, path)
 
@@ -306,9 +306,7 @@ def _read_and_delete_answer(caller: Caller, stored: Stored, _size: int) -> None:
 
 def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool = False) -> None:
     place = {"venue_id": stored.venue_id} if venue else {"floorplan_id": stored.plan_id}
-    answer = caller.send("POST", "/sessions", _body(place))
-    if answer.status == 201:
-        path = f"/sessions/{answer.json()['id']}"
+    if path := _create(caller, "/sessions", _body(place)):
         sphere = (("projection", "equirectangular"),)
         for fields in (sphere, (*sphere, ("forward_m", "1"), ("turn_deg", "0"))):
             caller.send("POST", f"{path}/photographs", *form(fields, (("photo", _sphere()),)))
@@ -317,10 +315,8 @@ def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool =
 
 
 def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
-    answer = caller.send("POST", "/albums", _body({"floorplan_id": stored.plan_id}))
-    if answer.status != 201:
+    if not (album := _create(caller, "/albums", _body({"floorplan_id": stored.plan_id}))):
         return
-    album = f"/albums/{answer.json()['id']}"
     for first in range(0, size, _PHOTOGRAPHS):
         # Bytes after the picture make it another one.
         files = (("photo", _sphere() + str(first + number).encode()) for number in range(_PHOTOGRAPHS))
@@ -356,18 +352,14 @@ def _partial_body(caller: Caller, _stored: Stored, size: int) -> None:
 
 def _unread_answer(caller: Caller, _stored: Stored, size: int) -> None:
     """Ask for a file that is larger than a socket's buffers, and do not read it."""
-    answer = caller.send("POST", "/floorplans", _body(home(0)) + b" " * (1024 * size))
-    if answer.status == 201:
-        path = f"/floorplans/{answer.json()['id']}"
+    if path := _create(caller, "/floorplans", _body(home(0)) + b" " * (1024 * size)):
         caller.send_bytes(f"GET {path}/original HTTP/1.1", hold_s=2.0)
         caller.send("DELETE", path)
 
 
 def _administer(caller: Caller, _stored: Stored, _size: int) -> None:
     document = {"tenant": "new", "name": "n" * 200, "scopes": ["metrics", "read", "localise", "write"]}
-    answer = caller.send("POST", "/admin/keys", _body(document))
-    if answer.status == 201:
-        path = f"/admin/keys/{answer.json()['id']}"
+    if path := _create(caller, "/admin/keys", _body(document)):
         caller.send("POST", f"{path}/rotation", _body({"overlap_s": 0}))
         caller.send("GET", path)
         caller.send("DELETE", path)

@@ -19,7 +19,6 @@ import io
 import itertools
 import json
 import math
-import multiprocessing
 import os
 import re
 import resource
@@ -33,7 +32,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Literal
@@ -110,11 +109,8 @@ def send_requests() -> bool:
             failed |= seconds > _MAX_ANSWER_S and not (attack.is_slow or accepted)
             failed |= risen_mb > (_MAX_DECODING_MB if accepted else _MAX_MB)
             shown = ", ".join(f"{count} x {status}" for status, count in sorted(statuses.items()))
-            times = f"{seconds:.1f}", f"{seen.slowest_s:.2f} s"
-            print(
-                harness.table_row(attack.name, f"{attack.size_bytes:,}", shown, *times, f"{risen_mb:+.0f} MB"),
-                flush=True,
-            )
+            times = f"{seconds:.1f}", f"{seen.slowest_s:.2f} s", f"{risen_mb:+.0f} MB"
+            print(harness.table_row(attack.name, f"{attack.size_bytes:,}", shown, *times), flush=True)
         left_mb = harness.service_memory_mb(service.process) - memory_before
         failed |= left_mb > _MAX_LEFT_MB
         print(f"\nMemory after all requests: {left_mb:+.0f} MB against before.")
@@ -290,12 +286,11 @@ def _stored_plans(url: str) -> list[dict[str, Any]]:
 
 def _wait_until_prepared(url: str) -> int:
     """Return 200 when no plan is preparing any more, 0 after the timeout."""
-    deadline = time.monotonic() + _SETTLE_TIMEOUT_S
-    while any(plan["status"] == "preparing" for plan in _stored_plans(url)):
-        if time.monotonic() > deadline:
-            return 0
-        time.sleep(0.1)
-    return httpx.codes.OK
+    with suppress(TimeoutError):
+        is_prepared = lambda: all(plan["status"] != "preparing" for plan in _stored_plans(url))  # noqa: E731
+        harness.wait_until(is_prepared, "all plans are prepared", _SETTLE_TIMEOUT_S, 0.1)
+        return httpx.codes.OK
+    return 0
 
 
 def _fetch_newest(url: str, path: str, clients: int) -> list[int]:
@@ -384,24 +379,16 @@ def _import_here(number: int, size: int, pipe: Connection) -> None:
 
 def _import(number: int, size: int) -> tuple[int, float, float, str]:
     """Import a file in a process of its own; return its bytes, CPU time (s), memory (MB) and the result in words."""
-    ours, theirs = multiprocessing.get_context("spawn").Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=_import_here, args=(number, size, theirs))
-    process.start()
-    theirs.close()
-    begin_s = time.monotonic()
-    bytes_sent = 0
-    try:
-        bytes_sent = ours.recv()
-        if not ours.poll(_WALL_TIMEOUT_S):
-            process.kill()
-            raise EOFError
-        seconds, memory_mb, outcome = ours.recv()
-    except EOFError:
-        process.join()
-        seconds, memory_mb = time.monotonic() - begin_s, math.nan
-        outcome = f"process ended with {process.exitcode}"
-    process.join()
-    return bytes_sent, seconds, memory_mb, outcome
+    begin_s, bytes_sent = time.monotonic(), 0
+    with harness.child_process(_import_here, number, size) as pipe:
+        try:
+            bytes_sent = pipe.recv()
+            if pipe.poll(_WALL_TIMEOUT_S):
+                return bytes_sent, *pipe.recv()
+            outcome = f"process was killed after {_WALL_TIMEOUT_S:g} s"
+        except EOFError:
+            outcome = "process ended"
+    return bytes_sent, time.monotonic() - begin_s, math.nan, outcome
 
 
 def import_files(expression: str, size: int) -> bool:

@@ -10,6 +10,7 @@ from benchmarks.hostile_files import MODELS, PICTURES, Point, boxes, chords, cir
 from lalaloc_core.importers import ImportOptions
 
 _POINTS = ImportOptions(metres_per_pixel=0.02)
+_THICK = 'fill="none" stroke="#000" stroke-width=".2"'
 
 
 def _svg(content: str, attributes: str = "") -> bytes:
@@ -27,14 +28,9 @@ def _svg_rings(rings: Sequence[Sequence[Point]], attributes: str = "") -> bytes:
     return _svg(f'<path d="{path}" {attributes}/>')
 
 
-def _svg_many(rings: Sequence[Sequence[Point]], attributes: str = "") -> bytes:
-    path = ("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in ring) + "z" for ring in rings)
+def _svg_many(rings: Sequence[Sequence[Point]], attributes: str = "", end: str = "z") -> bytes:
+    path = ("M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in ring) + end for ring in rings)
     return _svg("".join(f'<path {attributes} d="{line}"/>' for line in path))
-
-
-def _svg_lattices(size: int) -> bytes:
-    path = '<path fill="none" stroke="#000" stroke-width=".2" d="M{:.1f} {:.1f}L{:.1f} {:.1f}"/>'
-    return _svg("".join(path.format(*start, *end) for start, end in lattice(size // 80, 150.0)))
 
 
 def _svg_patches(size: int) -> bytes:
@@ -209,18 +205,15 @@ def ifc_space(profile: Sequence[Point], height: float | str = 2.5, *more: str) -
     return _ifc(*_IFC_BASE, *solid, *more, *points)
 
 
-def _ifc_placements(_size: int) -> bytes:
-    lines: list[str] = list(_IFC_BASE)
-    lines[6] = "IFCLOCALPLACEMENT(#7,#4)"
-    return _ifc(*lines, "IFCPOLYLINE((#3,#3))")
+def _ifc_placed(parent: int, *placements: str) -> bytes:
+    """Return a space whose placement is relative to another one."""
+    base = (*_IFC_BASE[:6], f"IFCLOCALPLACEMENT(#{parent},#4)", *_IFC_BASE[7:])
+    return _ifc(*base, "IFCPOLYLINE((#3,#3))", *placements)
 
 
 def _ifc_chain(size: int) -> bytes:
-    count = size // 40
-    lines: list[str] = list(_IFC_BASE)
-    lines[6] = "IFCLOCALPLACEMENT(#14,#4)"
-    chain = [f"IFCLOCALPLACEMENT(#{14 + k},#4)" for k in range(1, count)]
-    return _ifc(*lines, "IFCPOLYLINE((#3,#3))", *chain, "IFCLOCALPLACEMENT($,#4)")
+    chain = [f"IFCLOCALPLACEMENT(#{14 + k},#4)" for k in range(1, size // 40)]
+    return _ifc_placed(14, *chain, "IFCLOCALPLACEMENT($,#4)")
 
 
 def _ifc_clippings(size: int) -> bytes:
@@ -241,7 +234,7 @@ DRAWINGS = (
     plan("svg", "lines that cross", lambda s: _svg_lines(chords(s // 22))),
     plan("svg", "a lattice", lambda s: _svg_lines(lattice(s // 24))),
     plan("svg", "a lattice of thick lines", lambda s: _svg_lines(lattice(s // 24, 200.0), 'stroke-width=".2"')),
-    plan("svg", "lattices of thick lines", _svg_lattices),
+    plan("svg", "lattices of thick lines", lambda s: _svg_many(lattice(s // 80, 150.0), _THICK, "")),
     plan("svg", "an outline that crosses itself", lambda s: _svg_rings([star(s // 16)])),
     plan("svg", "stars of 15 corners", lambda s: _svg_many(stars(s, 15, 16))),
     plan("svg", "subpaths that coincide", lambda s: _svg_rings(boxes(s // 50))),
@@ -275,7 +268,7 @@ DRAWINGS = (
     plan("svg", "a dot of numbers", lambda s: _svg(f'<path d="M0 0{".1" * (s // 2)}"/>')),
     plan("svg", "transforms", lambda s: _svg(f'<path transform="{"rotate(7)" * (s // 9)}" d="M0 0h5v5h-5z"/>')),
     plan("svg", "letters in a transform", lambda s: _svg(f'<path transform="{"a" * s}" d="M0 0h5v5h-5z"/>')),
-    plan("svg", "spaces in a style", lambda s: _svg(f"<style>a{{{' ' * s}</style>" + '<path d="M0 0h5v5h-5z"/>')),
+    plan("svg", "spaces in a style", lambda s: _svg(f"<style>a{{{' ' * s}</style>" + _SQUARE)),
     plan("svg", "nested groups", lambda s: _svg("<g>" * 60 + "<path d='M0 0h5v5h-5z'/>" * (s // 30) + "</g>" * 60)),
     plan(
         "svg",
@@ -332,7 +325,7 @@ DRAWINGS = (
         ),
         _POINTS,
     ),
-    plan("ifc", "a placement in itself", _ifc_placements),
+    plan("ifc", "a placement in itself", lambda _: _ifc_placed(7)),
     plan("ifc", "a chain of placements", _ifc_chain),
     plan("ifc", "numbers of 1e308", lambda s: ifc_space([(0, 0), (5, 0), (5, 5), (0, 5)], "1.E308")),
     plan("ifc", "a number of 1.E400", lambda s: ifc_space([(0, 0), (5, 0), (5, 5), (0, 5)], "1.E400")),

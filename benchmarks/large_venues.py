@@ -17,7 +17,6 @@ import json
 import random
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -69,26 +68,20 @@ def make_venue(service: harness.Service, homes: int) -> str:
 
 def wait_until_ready(client: httpx.Client, venue_id: str) -> dict[str, Any]:
     """Return the venue once all of its plans are ready or failed."""
-    deadline = time.monotonic() + _TIMEOUT_S
-    while True:
-        venue = client.get(f"/venues/{venue_id}").raise_for_status().json()
-        if venue["plans_ready"] + venue["plans_failed"] == venue["plans"]:
-            return venue
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{venue['plans_ready']} of {venue['plans']} plans are ready after {_TIMEOUT_S:g} s")
-        time.sleep(1.0)
+    venue: dict[str, Any] = {}
+
+    def is_ready() -> bool:
+        venue.update(client.get(f"/venues/{venue_id}").raise_for_status().json())
+        return venue["plans_ready"] + venue["plans_failed"] == venue["plans"]
+
+    harness.wait_until(is_ready, "all plans of the venue are ready", _TIMEOUT_S, 1.0)
+    return venue
 
 
-class _Stopwatch:
-    """Wall clock and processor time of a service and its workers since the stopwatch was made."""
-
-    def __init__(self, service: harness.Service) -> None:
-        self._process, self._wall, self._cpu = service.process, time.perf_counter(), harness.cpu_s(service.process)
-
-    def times(self) -> dict[str, float]:
-        """Return the times in ms."""
-        wall, cpu = time.perf_counter() - self._wall, harness.cpu_s(self._process) - self._cpu
-        return {"wall_ms": round(1e3 * wall), "cpu_ms": round(1e3 * cpu)}
+def _times(watch: harness.Stopwatch) -> dict[str, float]:
+    """Return the times (ms) of a service since a stopwatch was made."""
+    wall_s, cpu_s = watch.times_s()
+    return {"wall_ms": round(1e3 * wall_s), "cpu_ms": round(1e3 * cpu_s)}
 
 
 class _Venue:
@@ -99,11 +92,11 @@ class _Venue:
 
     def localise(self, pose: TruePose, *, heading: bool) -> tuple[dict[str, Any], dict[str, float]]:
         """Localise an example photograph, with or without its heading; return the answer and the times."""
-        query, watch = harness.query_of(pose, venue_id=self._id), _Stopwatch(self._service)
+        query, watch = harness.query_of(pose, venue_id=self._id), harness.Stopwatch(self._service.process)
         if not heading:
             del query["data"]["heading_deg"]
         answer = self._client.post("/localise", **query).raise_for_status().json()
-        return answer, watch.times()
+        return answer, _times(watch)
 
     def queries(self) -> _Report:
         """Localise all example photographs several times; return the median times, and whether all were right."""
@@ -136,12 +129,12 @@ class _Venue:
         self, method: str, path: str, document: Mapping[str, Any] | None, *, is_found: bool, plan_id: str = ""
     ) -> _Report:
         """Change a plan; return the times until a query was answered, and whether its answer was as it should be."""
-        watch = _Stopwatch(self._service)
+        watch = harness.Stopwatch(self._service.process)
         self._client.request(method, path, json=document).raise_for_status()
-        request = watch.times()
+        request = _times(watch)
         answer, _ = self.localise(read_poses()[0], heading=True)
         right = (answer["floorplan_id"] == (plan_id or self._service.plan_id)) == is_found
-        return {"request": request, "until_answered": watch.times(), "right": right}
+        return {"request": request, "until_answered": _times(watch), "right": right}
 
 
 @contextmanager
@@ -167,11 +160,11 @@ def measure(plans: int, checkout: Path) -> _Report:
 
             resident = report["resident_mb"] = {"empty": resident_mb()}
             service = replace(service, plan_id=harness.upload_example_plan(service.url))
-            watch = _Stopwatch(service)
+            watch = harness.Stopwatch(service.process)
             venue_id = make_venue(service, plans - 1)
-            report["uploaded"] = watch.times()
+            report["uploaded"] = _times(watch)
             ready = wait_until_ready(client, venue_id)
-            report["until_ready"], resident["ready"] = watch.times(), resident_mb()
+            report["until_ready"], resident["ready"] = _times(watch), resident_mb()
             with Client(service.url) as paging:
                 listed = [(plan.level, plan.floorplan_id) for plan in paging.venue_plans(venue_id, page_size=_PAGE)]
             venue = _Venue(service, client, venue_id)

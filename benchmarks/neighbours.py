@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import multiprocessing
 import os
 import re
 import shutil
@@ -119,7 +118,7 @@ def main() -> int:
     ]
     rows = []
     with _template(options.homes, {load.plan for load in loads}) as template:
-        print("\n".join(_HEAD))
+        print(_HEAD)
         measured = (_measure(group, template, options.seconds) for group in _groups(loads))
         for row in itertools.chain.from_iterable(measured):
             rows.append(row)
@@ -137,16 +136,15 @@ def main() -> int:
     return int(bool(failed))
 
 
-_HEAD = (
-    "| route | input | connections | alone: p50, p99 | beside: p50, p99 | ratios | failed | answers by status "
-    "| busy after |",
-    "|---|---|---|---|---|---|---|---|---|",
+_HEAD = harness.table_head(
+    *("route", "input", "connections", "alone: p50, p99", "beside: p50, p99"),
+    *("ratios", "failed", "answers by status", "busy after"),
 )
 
 
 def markdown(report: Mapping[str, Any]) -> str:
     """Return the table of a report that `--json` wrote."""
-    return "\n".join([*_HEAD, *map(_line, report["rows"])])
+    return "\n".join([_HEAD, *map(_line, report["rows"])])
 
 
 def _line(row: Mapping[str, Any]) -> str:
@@ -182,7 +180,8 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
             venue_id, _, member_ids = store_venue(heavy, homes)
             bodies = {name: json.dumps(documents[name]()).encode() for name in plans}
             plan_ids = {name: created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
-            _wait_until_ready(service.url)
+            preparing = lambda: heavy.send("GET", "/readyz").json()["plans_preparing"]  # noqa: E731
+            harness.wait_until(lambda: not preparing(), "all plans are ready", _READY_TIMEOUT_S, 0.2)
             venue_etag = heavy.send("GET", f"/venues/{venue_id}").etag
             stored = {
                 name: Stored(
@@ -201,16 +200,6 @@ def _new_key(data: Path, tenant: str) -> str:
     finally:
         store.close()
     return key_text(key.id, secret)
-
-
-def _wait_until_ready(url: str) -> None:
-    caller = harness.Caller(url)
-    harness.wait_until(
-        lambda: not caller.send("GET", "/readyz").json()["plans_preparing"],
-        "all plans are ready",
-        _READY_TIMEOUT_S,
-        0.2,
-    )
 
 
 def _groups(loads: Iterable[Load]) -> Iterator[list[Load]]:
@@ -241,17 +230,13 @@ def _measure(loads: Sequence[Load], template: Template, seconds: float) -> Itera
                     beside += probe.run(_ANSWER_TIMEOUT_S - seconds, answered)
                 busy_s = _idle_after(process)
                 after = probe.run(seconds / 2.0)
-                yield _row(load, _latency(before + after), _latency(beside), answers, busy_s)
+                latencies = _latency(before + after), _latency(beside)
+                yield Row(load.routes, load.title, load.connections, *latencies, answers, busy_s)
                 before = after
             # Work that is still in progress belongs to no other row.
             for child in process.children(recursive=True):
                 child.kill()
             process.kill()
-
-
-def _row(load: Load, alone: Latency, beside: Latency, answers: Mapping[str, int], busy_s: float) -> Row:
-    p50_ratio, p99_ratio = beside.p50_ms / alone.p50_ms, beside.p99_ms / alone.p99_ms
-    return Row(load.routes, load.title, load.connections, alone, beside, p50_ratio, p99_ratio, answers, busy_s)
 
 
 class _Probe:
@@ -289,34 +274,24 @@ def _lower_priority() -> None:
 
 
 def _latency(durations_s: Sequence[float]) -> Latency:
-    ordered = sorted(durations_s)
-    p99_s = ordered[math.ceil(0.99 * len(ordered)) - 1]
-    return Latency(len(ordered), ordered.count(math.inf), 1e3 * statistics.median(ordered), 1e3 * p99_s)
+    p50_s, p99_s = statistics.median(durations_s), harness.Requests(durations_s, math.nan).percentile_ms(99)
+    return Latency(len(durations_s), durations_s.count(math.inf), 1e3 * p50_s, 1e3 * p99_s)
 
 
 @contextmanager
 def _flood(url: str, template: Template, load: Load) -> Iterator[tuple[dict[str, int], Callable[[], bool]]]:
     """Repeat a load in another process."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
     # The work itself cannot be sent to a process, so its place in the table is.
     number = [known.work for known in LOADS].index(load.work)
-    arguments = (url, template.heavy_key, number, load.size, template.stored[load.plan], theirs)
-    process = context.Process(target=_send_flood, args=arguments, daemon=True)
-    process.start()
-    # So that the end of the process ends the waiting for it.
-    theirs.close()
+    arguments = (url, template.heavy_key, number, load.size, template.stored[load.plan])
     answers: dict[str, int] = {}
-    try:
-        ours.recv()
-        yield answers, ours.poll
-        ours.send("end")
-        while isinstance(message := ours.recv(), str):
+    with harness.child_process(_send_flood, *arguments) as pipe:
+        pipe.recv()
+        yield answers, pipe.poll
+        pipe.send("end")
+        while isinstance(message := pipe.recv(), str):
             pass
         answers |= message
-    finally:
-        process.kill()
-        process.join()
 
 
 def _send_flood(url: str, key: str, number: int, size: int, stored: Stored, pipe: Connection) -> None:

@@ -22,9 +22,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -72,14 +72,13 @@ class Checkout:
         self.answers[known, number % len(poses)] = response.json()
         return response
 
-    def burst(self, clients: int) -> Burst:
-        """Answer queries of several clients with unknown headings."""
-        before_s, begin = harness.cpu_s(self.service.process), time.perf_counter()
+    def burst(self, clients: int) -> tuple[Spent, list[float]]:
+        """Answer queries of several clients with unknown headings; return the time per answer and each duration (s)."""
+        watch = harness.Stopwatch(self.service.process)
         with ThreadPoolExecutor(clients) as threads:
             parts = threads.map(lambda first: self._series(range(first, _SEVERAL, clients)), range(clients))
             durations_s = [duration for part in parts for duration in part]
-        wall_s, spent_s = time.perf_counter() - begin, harness.cpu_s(self.service.process) - before_s
-        return Burst(Spent(wall_s / _SEVERAL, spent_s / _SEVERAL), durations_s)
+        return Spent(*(seconds / _SEVERAL for seconds in watch.times_s())), durations_s
 
     def _series(self, numbers: Sequence[int]) -> list[float]:
         with httpx.Client(base_url=self.service.url, timeout=_TIMEOUT_S) as client:
@@ -93,13 +92,6 @@ class Spent(NamedTuple):
     cpu_s: float
 
 
-class Burst(NamedTuple):
-    """Time per answer, and the duration of each (s)."""
-
-    per_answer: Spent
-    durations_s: list[float]
-
-
 def main() -> int:
     """Measure; return 1 when answers differ."""
     parser = harness.argument_parser(__doc__)
@@ -108,7 +100,10 @@ def main() -> int:
     parser.add_argument("--only", action="append", choices=tuple(FIGURES), help="a figure of these; repeatable")
     options = parser.parse_args()
     with ExitStack() as stack:
-        checkouts = [stack.enter_context(_running_checkout(folder.resolve())) for folder in options.checkouts]
+        checkouts = []
+        for folder in map(Path.resolve, options.checkouts):
+            service = stack.enter_context(harness.example_service(_SETTINGS, folder))
+            checkouts.append(Checkout(folder.name, folder, service))
         _print_figures(checkouts, options.rounds, options.only or list(FIGURES))
     differences = _differences(*checkouts)
     print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
@@ -120,11 +115,10 @@ def _sent(send: Callable[[httpx.Client, Checkout], httpx.Response], repeats: int
 
     def measure(checkout: Checkout) -> Spent:
         with httpx.Client(base_url=checkout.service.url, timeout=_TIMEOUT_S) as client:
-            before_s, begin = harness.cpu_s(checkout.service.process), time.perf_counter()
+            watch = harness.Stopwatch(checkout.service.process)
             for _ in range(repeats):
                 send(client, checkout).raise_for_status()
-            wall_s = (time.perf_counter() - begin) / repeats
-            return Spent(wall_s, (harness.cpu_s(checkout.service.process) - before_s) / repeats)
+            return Spent(*(seconds / repeats for seconds in watch.times_s()))
 
     return measure
 
@@ -193,7 +187,7 @@ def _spheres(*, known: bool) -> Callable[[Checkout], Spent]:
 
 def _spread(checkout: Checkout) -> Spent:
     """Return the 99th percentile of four clients over the median of one, in place of a duration."""
-    one, four = (checkout.burst(clients).durations_s for clients in (1, 4))
+    one, four = (checkout.burst(clients)[1] for clients in (1, 4))
     return Spent(float(np.quantile(four, 0.99) / np.median(one)), float("nan"))
 
 
@@ -245,7 +239,7 @@ FIGURES: Mapping[str, Callable[[Checkout], Spent]] = {
     "photograph of 12 megapixels": _sent(_photograph, _SINGLE),
     "sphere, heading known": _spheres(known=True),
     "sphere, heading unknown": _spheres(known=False),
-    "four clients, per answer": lambda checkout: checkout.burst(4).per_answer,
+    "four clients, per answer": lambda checkout: checkout.burst(4)[0],
     "p99 of four over p50 of one": _spread,
     "turn of twelve photographs": _sent(lambda client, checkout: _sequence(client, checkout, "photo", _turn())),
     "film of 10 s, 1080p": _sent(lambda client, checkout: _sequence(client, checkout, "film", [_film()])),
@@ -292,13 +286,6 @@ def _differences(before: Checkout, after: Checkout) -> dict[str, float]:
         found = moved, abs(turned), abs((new["confidence"] or 0.0) - (old["confidence"] or 0.0))
         largest = {name: max(value, part) for (name, value), part in zip(largest.items(), found, strict=True)}
     return largest
-
-
-@contextmanager
-def _running_checkout(folder: Path) -> Iterator[Checkout]:
-    """Run the service of the checkout in a folder, with a temporary data folder and the example plan."""
-    with harness.example_service(_SETTINGS, folder) as service:
-        yield Checkout(folder.name, folder, service)
 
 
 if __name__ == "__main__":
