@@ -423,11 +423,11 @@ class TestEvaluating:
         # At the azimuths of all four views, the reading of the sphere is that of the whole photograph.
         assert by_reader["sphere"].median_error == pytest.approx(read[0].measures.median_error, rel=0.5)
         results = PhotographResults(read=read, answers={}, read_views={"80": reading})
-        shape = f"{view.shape_error:.3f} (constant distance {constant.shape_error:.3f}, whole sphere "
-        assert f"| views of 80°: median error of the walls' shape | {shape}" in results.markdown()
+        for reader, summary in by_reader.items():
+            row = f"| read_views, 80, by_reader, {reader}, shape_error | {summary.shape_error:.3f} |"
+            assert row in results.markdown()
         assert results.figures()["read_views"]["80"]["by_reader"]["view"]["shape_error"] == view.shape_error
-        within = f"{percent(reading.walls_within['2'])} within 2°"
-        assert f"| … direction of the walls by lines | {within}" in results.markdown()
+        assert f"| read_views, 80, walls_within, 2 | {reading.walls_within['2']:.3f} |" in results.markdown()
 
     def test_shape_error_ignores_scale(self) -> None:
         true_m, errors = np.linspace(1.0, 3.0, 9), np.array([0.1, -0.2, 0.0, 0.3, -0.1, 0.2, 0.0, 0.1, -0.3])
@@ -449,12 +449,12 @@ class TestEvaluating:
         none, every = percent(0.0), percent(1.0)
         assert f"| door | {none} | {none} | {every} | {none} |" in markdown
         assert figures["read_as"][OPENING_CLASSES.index("door")] == [0.0, 0.0, 1.0, 0.0]
-        assert f"heading known: confidence above 0.5 | {percent(0.25)} of 4 |" in markdown
+        assert "| foreign_plans, known, n | 4 |\n| foreign_plans, known, accepted | 0.250 |" in markdown
         assert figures["foreign_plans"] == {"known": {"n": 4, "accepted": 0.25}}
-        assert (
-            f"{percent(2 / 3)} (walls {percent(1.0)} found, {percent(1.0)} right; doors {percent(0.0)} found, –"
-            in markdown
-        )
+        for measured in ("balanced_accuracy | 0.667", "recall, wall | 1.000", "recall, door | 0.000"):
+            assert f"| azimuths, classes, {measured} |" in markdown
+        for measured in ("precision, wall | 1.000", "precision, door | –"):
+            assert f"| azimuths, classes, {measured} |" in markdown
 
     @pytest.mark.slow
     def test_command_prints_measures(
@@ -470,7 +470,7 @@ class TestEvaluating:
         assert [entry["name"] for entry in figures["photographs"]] == ["den", "hall", "nook"]
         # One gallery per photograph, with the better of two outlines; poor photographs have none.
         assert [len(entry["galleries"]["unknown"]) for entry in figures["photographs"]] == [0, 1, 1]
-        assert f"| median of the median error of log distance | {figures['azimuths']['median_error']:.3f} |" in printed
+        assert f"| azimuths, median_error | {figures['azimuths']['median_error']:.3f} |" in printed
         assert "not evaluated" in printed
         # Without galleries, walls and openings are the same.
         assert main([*command[:-1], "0", "--out", str(tmp_path / "walls")]) == 0

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, WALL_CODE, wrap_angle
-from lalaloc_core.evaluate.bench.measured import Setting
+from lalaloc_core.evaluate.bench.measured import Setting, evaluate
 from lalaloc_core.evaluate.calibrate.measured_errors import outcomes_of, predicted_shares
 from lalaloc_core.evaluate.methods.method import QueryKind
-from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
-from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.evaluate.runs.score import StageScores, score
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Dataset, Scene
@@ -42,6 +39,7 @@ from lalaloc_core.render.sampling import PoseSet
 # Limits for minor figures, for those that repeat their queries six times, and for spots that are localised six times.
 _MINOR_HOMES, _REPEATED_HOMES, _SPOT_HOMES = 100, 50, 65
 _RESAMPLES = 2000
+_SHOWN = ("median_cm", "within_1cm", "within_5cm", "within_10cm", "within_1m")
 _HEADINGS = {"known_heading": True, "unknown_heading": False}
 
 
@@ -62,6 +60,28 @@ class Benchmark:
     stated: Stated = "field"
     settings: Mapping[str, Any] = field(default_factory=dict)
     max_homes: int = 10_000
+
+    def run(self, setting: Setting) -> list[Prediction]:
+        """Return the predictions."""
+        homes, textures = min(setting.homes, self.max_homes), setting.textures
+        generated: dict[str, Any] = {"generator": self.generator, "homes": homes}
+        if self.generator == "heldout":
+            generated["homes"] = min(homes, HELDOUT_HOMES)
+        else:
+            generated |= {"furniture": self.furniture, "textures": None if textures is None else str(textures)}
+        info = RunInfo(
+            label=f"{self.kind}, {self.generator}, {self.furniture}",
+            kind=self.kind,
+            dataset="generated homes",
+            split="test",
+            settings=dict(self.settings),
+            generated=generated,
+            views=None if self.view_deg is None else {"field_deg": self.view_deg, "stated": self.stated},
+            bundle=str(setting.bundle.folder),
+            furniture=self.furniture,
+            heading_known=self.heading_known,
+        )
+        return evaluate(info)
 
 
 def _view(view_deg: float, *, heading_known: bool = False, **changes: Any) -> Benchmark:
@@ -84,6 +104,7 @@ _TERMS: Mapping[str, Mapping[str, Any]] = {
     "without_room_type": {"room_type": False},
     "walls_alone": {"openings": False, "see_through": False, "ceiling": False, "room_type": False},
 }
+_OF_COPIES = ("all", "without_openings")
 # Benchmarks, or groups of them, by group and row.
 GROUPS: Mapping[str, Mapping[str, Any]] = {
     "accuracy": {
@@ -104,13 +125,9 @@ GROUPS: Mapping[str, Mapping[str, Any]] = {
         "heldout_view_80_unknown_heading": _view(80.0, generator="heldout"),
         "heldout_view_106_unknown_heading": _view(106.0, generator="heldout"),
     },
-    "evidence": {
-        heading: {
-            term: Benchmark(settings={"evidence": term}, heading_known=known, max_homes=_REPEATED_HOMES)
-            for term in ("latent", "profile", "both")
-        }
-        for heading, known in _HEADINGS.items()
-    },
+    "evidence": _by_heading(
+        {term: {"evidence": term} for term in ("latent", "profile", "both")}, max_homes=_REPEATED_HOMES
+    ),
     "terms": {"test": _by_heading(_TERMS), "heldout": _by_heading(_TERMS, generator="heldout")},
     "heights": {
         "test": _by_heading(
@@ -123,9 +140,7 @@ GROUPS: Mapping[str, Mapping[str, Any]] = {
         )
     },
     "copies": {
-        "test": _by_heading(
-            {name: _TERMS[name] for name in ("all", "without_openings")}, generator="copies", max_homes=_MINOR_HOMES
-        )
+        "test": _by_heading({name: _TERMS[name] for name in _OF_COPIES}, generator="copies", max_homes=_MINOR_HOMES)
     },
 }
 
@@ -133,45 +148,17 @@ GROUPS: Mapping[str, Mapping[str, Any]] = {
 def measure(rows: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
     """Return the figures of benchmarks, nested as they are."""
     return {
-        name: summarise(run_benchmark(setting, row)) if isinstance(row, Benchmark) else measure(row, setting)
+        name: summarise(row.run(setting)) if isinstance(row, Benchmark) else measure(row, setting)
         for name, row in rows.items()
     }
-
-
-def run_benchmark(setting: Setting, benchmark: Benchmark) -> list[Prediction]:
-    """Return the predictions of a benchmark."""
-    heldout = benchmark.generator == "heldout"
-    homes = min(setting.homes, benchmark.max_homes)
-    if heldout:
-        generated = {"generator": "heldout", "homes": min(homes, HELDOUT_HOMES)}
-    else:
-        textures = None if setting.textures is None else str(setting.textures)
-        generated = {"homes": homes, "furniture": benchmark.furniture, "textures": textures}
-        if benchmark.generator == "copies":
-            generated["generator"] = "copies"
-    info = RunInfo(
-        label=f"{benchmark.kind}, {benchmark.furniture}",
-        kind=benchmark.kind,
-        dataset="out-of-distribution homes" if heldout else "generated homes",
-        split="test",
-        settings=dict(benchmark.settings),
-        generated=generated,
-        views=None if benchmark.view_deg is None else {"field_deg": benchmark.view_deg, "stated": benchmark.stated},
-        bundle=str(setting.bundle.folder),
-        furniture=benchmark.furniture if benchmark.kind == "photograph" else None,
-        heading_known=benchmark.heading_known,
-    )
-    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
-        return run_evaluation(RunFolder(Path(folder)), info)
 
 
 def summarise(predictions: list[Prediction]) -> dict[str, Any]:
     """Return the figures of some predictions that tables show."""
     scores = score(predictions)
-    shares = ("within_1cm", "within_5cm", "within_10cm", "within_1m")
 
     def figures(stage: StageScores) -> dict[str, float]:
-        return {name: getattr(stage, name).value for name in ("median_cm", *shares)}
+        return {name: getattr(stage, name).value for name in _SHOWN}
 
     interval = scores.final.within_1m
     return {
@@ -190,9 +177,8 @@ def summarise(predictions: list[Prediction]) -> dict[str, Any]:
 
 def _is_among(prediction: Prediction, count: int) -> bool:
     """Return whether one of the first candidates is within 1 m of the truth."""
-    truth = prediction.truth
     poses = [candidate.pose for candidate in prediction.candidates[:count]]
-    return any(math.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < 1.0 for pose in poses)
+    return any(math.dist(pose.position_m, prediction.truth.position_m) < 1.0 for pose in poses)
 
 
 def bench_azimuths(setting: Setting) -> dict[str, Any]:
@@ -212,11 +198,10 @@ def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, 
     confusion = None
     if confusions:
         counts = np.sum(confusions, axis=0)
-        shares = (counts / counts.sum(axis=1, keepdims=True).clip(1)).tolist()
-        confusion = {
-            true: dict(zip(OPENING_CLASSES, row, strict=True))
-            for true, row in zip(OPENING_CLASSES, shares, strict=True)
-        }
+        shares = [
+            zip(OPENING_CLASSES, row.tolist(), strict=True) for row in counts / counts.sum(1, keepdims=True).clip(1)
+        ]
+        confusion = {true: dict(row) for true, row in zip(OPENING_CLASSES, shares, strict=True)}
     return {**dataclasses.asdict(summarise_azimuths(measures, OPENING_CLASSES)), "confusion": confusion}
 
 
@@ -226,8 +211,8 @@ def _measured(encoders: PhotographEncoder, scene: Scene, camera: Camera) -> Azim
     image = photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
-    pose = (camera.position_m[None], heading, room, scene.plan.geometry, len(log_m), camera.camera_height_m)
-    view = render_layout(*pose)
+    place = camera.position_m[None], heading, room
+    view = render_layout(*place, scene.plan.geometry, len(log_m), camera.camera_height_m)
     return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0], scores)
 
 
@@ -243,23 +228,13 @@ def bench_localisability(setting: Setting) -> dict[str, Any]:
     rng, rows = np.random.default_rng(0), dict[str, Any]()
     for name in CONDITIONS:
         found = np.array([float(outcome.found[name]) for outcome in outcomes])
-        rows[name] = {
-            "found": float(found.mean()),
-            "predicted": float(predicted[name].mean()),
-            "interval": _difference_interval(predicted[name] - found, homes, rng),
-        }
+        # Spots are sorted by home.
+        by_home = (predicted[name] - found).reshape(homes, -1).mean(axis=1)
+        means = by_home[rng.integers(homes, size=(_RESAMPLES, homes))].mean(axis=1)
+        interval = np.quantile(means, (0.025, 0.975)).tolist()
+        rows[name] = {"found": float(found.mean()), "predicted": float(predicted[name].mean()), "interval": interval}
     difference = [abs(row["found"] - row["predicted"]) for row in rows.values()]
     return {"n": len(outcomes), "mean_difference": float(np.mean(difference)), **rows}
-
-
-def _difference_interval(
-    difference: Float[np.ndarray, "n"], homes: int, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return the 95 % interval of the mean difference of spots, which are sorted by home."""
-    by_home = difference.reshape(homes, -1).mean(axis=1)
-    means = by_home[rng.integers(homes, size=(_RESAMPLES, homes))].mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return float(low), float(high)
 
 
 _SPHERE_SIZE, _VIEW_SIZE = (512, 1024), (640, 480)
@@ -283,8 +258,7 @@ def bench_uninformative(setting: Setting) -> dict[str, Any]:
             height = CameraHeight(camera.camera_height_m)
             grid = model.grid(scene.plan, height.height_m)
             rng = np.random.default_rng([len(confidence["ceiling"]), number])
-            for kind, picture in _pictures(scene.plan, camera, rng).items():
-                field_deg = _WALL_DEG if kind == "blank_wall" else _FIELD_DEG
+            for kind, (picture, field_deg) in _pictures(scene.plan, camera, rng).items():
                 stated = StatedCamera(projection="perspective", hfov_deg=field_deg)
                 query = model.encoder.query(model.open(encode_jpeg(picture), stated), None, height)
                 answer = model.localise(scene.plan, grid, query)
@@ -293,19 +267,22 @@ def bench_uninformative(setting: Setting) -> dict[str, Any]:
     return {kind: _summary(found) for kind, found in confidence.items()}
 
 
-def _pictures(plan: FloorPlan, camera: Camera, rng: np.random.Generator) -> dict[str, UInt8[np.ndarray, "h w 3"]]:
+def _pictures(
+    plan: FloorPlan, camera: Camera, rng: np.random.Generator
+) -> dict[str, tuple[UInt8[np.ndarray, "h w 3"], float]]:
+    """Return the pictures at a place with their fields of view (degrees)."""
     (photograph,) = camera.photographs.values()
-    sphere = photograph.image(*_SPHERE_SIZE)
-    wide = Perspective.of_hfov(*_VIEW_SIZE, math.radians(_FIELD_DEG))
-    azimuth = float(rng.uniform(-math.pi, math.pi))
-    pictures = {
-        "ceiling": cut_view(sphere, wide, azimuth=azimuth, pitch=math.radians(_CEILING_DEG), roll=0.0),
-        "landscape": cut_view(landscape(rng), wide, azimuth=azimuth, pitch=0.0, roll=0.0),
+    sphere, azimuth = photograph.image(*_SPHERE_SIZE), float(rng.uniform(-math.pi, math.pi))
+    shown = {
+        "ceiling": (sphere, azimuth, _CEILING_DEG, _FIELD_DEG),
+        "landscape": (landscape(rng), azimuth, 0.0, _FIELD_DEG),
     }
-    blank = blank_azimuth(plan, camera)
-    if blank is not None:
-        narrow = Perspective.of_hfov(*_VIEW_SIZE, math.radians(_WALL_DEG))
-        pictures["blank_wall"] = cut_view(sphere, narrow, azimuth=blank, pitch=0.0, roll=0.0)
+    if (blank := blank_azimuth(plan, camera)) is not None:
+        shown["blank_wall"] = (sphere, blank, 0.0, _WALL_DEG)
+    pictures = {}
+    for kind, (pixels, towards, pitch_deg, field_deg) in shown.items():
+        lens = Perspective.of_hfov(*_VIEW_SIZE, math.radians(field_deg))
+        pictures[kind] = cut_view(pixels, lens, azimuth=towards, pitch=math.radians(pitch_deg), roll=0.0), field_deg
     return pictures
 
 
@@ -319,9 +296,8 @@ def blank_azimuth(plan: FloorPlan, camera: Camera) -> float | None:
     if layouts.kind is not None:
         farthest[(layouts.kind[0][around] != WALL_CODE).any(axis=1)] = np.inf
     best = int(farthest.argmin())
-    if not np.isfinite(farthest[best]):
-        return None
-    return float(wrap_angle((best + 0.5) / _COLUMNS * 2.0 * math.pi - math.pi))
+    azimuth = float(wrap_angle((best + 0.5) / _COLUMNS * 2.0 * math.pi - math.pi))
+    return azimuth if np.isfinite(farthest[best]) else None
 
 
 def landscape(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:

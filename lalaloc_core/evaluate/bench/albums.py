@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.evaluate.bench.measured import Found, Setting, summary
-from lalaloc_core.evaluate.methods.lalaloc import found_pose
+from lalaloc_core.evaluate.bench.measured import Found, Setting, best_pose, summary
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
@@ -39,24 +36,6 @@ _ROOMS, _APART_M, _FIELD_DEG = 10, 3.0, 70.0
 _BEGIN = datetime(2026, 1, 1, 12)
 
 
-class _Score(NamedTuple):
-    """Result of one photograph: right room, errors of position (m) and heading (radians), and the room's confidence."""
-
-    room: bool
-    error_m: float
-    turned: float
-    confidence: float
-
-    @classmethod
-    def of(cls, truth: Pose, pose: Pose | None, confidence: float) -> _Score:
-        """Compare a pose with the true one; None is a miss."""
-        if pose is None:
-            return cls(False, math.inf, math.inf, 0.0)
-        turned = abs(float(wrap_angle(pose.heading - truth.heading)))
-        error_m = float(np.linalg.norm(pose.position_m - truth.position_m))
-        return cls(pose.room_index == truth.room_index, error_m, turned, confidence)
-
-
 def bench_albums(setting: Setting) -> dict[str, Any]:
     """Measure albums of 20 photographs, with unknown field of view, camera height and heading.
 
@@ -65,7 +44,7 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
     paper, are counted and in no other figure.
     """
     model, refused = setting.model, 0
-    scores: defaultdict[str, list[_Score]] = defaultdict(list)
+    scores: defaultdict[str, list[Found]] = defaultdict(list)
     clicks, seconds, again_s = list[int](), list[float](), list[float]()
     for index in range(setting.homes):
         case = _home(setting, index, spheres=False)
@@ -136,15 +115,13 @@ def _entry(
     return album_entry(model, f"{number:03d}", encode_jpeg(pixels), StatedCamera(projection=projection), taken)
 
 
-def _solved(model: LocalModel, case: AlbumCase, memory: AlbumMemory, *, by_time: bool = True) -> list[_Score]:
+def _solved(model: LocalModel, case: AlbumCase, memory: AlbumMemory, *, by_time: bool = True) -> list[Found]:
     pins = case.solve(model, memory, by_time=by_time)
-    return [
-        _Score.of(truth, None if pin.pose is None else case.pose(pin.pose), pin.confidence)
-        for pin, truth in zip(pins, case.truth, strict=True)
-    ]
+    poses = (None if pin.pose is None else case.pose(pin.pose) for pin in pins)
+    return [Found.of(pose, truth, pin.confidence) for pose, truth, pin in zip(poses, case.truth, pins, strict=True)]
 
 
-def _alone(model: LocalModel, case: AlbumCase) -> list[_Score]:
+def _alone(model: LocalModel, case: AlbumCase) -> list[Found]:
     """Localise each photograph alone, as the service does."""
     ground, manifest = case.ground, model.bundle.manifest
     found = []
@@ -155,14 +132,14 @@ def _alone(model: LocalModel, case: AlbumCase) -> list[_Score]:
         room_share = float(answer.posterior.pose[ground.grid.poses.room_index == best.room_index].sum())
         confidence = answer.confidence(manifest.confidence_for(view=query.is_view))
         fit = 1.0 if confidence is None else confidence.fit
-        found.append(_Score.of(truth, found_pose(query, best), fit * room_share))
+        found.append(Found.of(best_pose(answer), truth, fit * room_share))
     return found
 
 
-def _figures(found: Sequence[_Score]) -> dict[str, float]:
+def _figures(found: Sequence[Found]) -> dict[str, float]:
     """Return the summary with the confidence of the room, which is no probability of a position."""
-    rooms, confidence = np.array([score.room for score in found]), np.array([score.confidence for score in found])
-    figures = summary([Found(score.error_m, score.turned, score.confidence) for score in found])
+    _, _, confidence, right_room = np.array(found).T
+    figures = summary(found)
     del figures["median_cm"]
-    calibration_error = expected_calibration_error(confidence, rooms)
-    return figures | {"right_room": float(rooms.mean()), "expected_calibration_error": calibration_error}
+    calibration_error = expected_calibration_error(confidence, right_room.astype(bool))
+    return figures | {"right_room": float(right_room.mean()), "expected_calibration_error": calibration_error}

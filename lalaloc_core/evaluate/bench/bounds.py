@@ -84,13 +84,8 @@ def bench_bounds(setting: Setting) -> dict[str, Any]:
 def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str, Any]:
     photographs = AnnotatedPhotographs(folder)
     scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
-    found = {
-        key.photograph: _outcomes(model, _asked(model, scenes.load(key.scene), 1))
-        for key in photographs.keys(galleries=1)
-        if not key.outline
-    }
-    total = {name: sum((each[name] for each in found.values()), Counter[str]()) for name in _ROWS}
-    return _shares(total) | {"by_photograph": {name: _shares(each) for name, each in found.items()}}
+    galleries = [scenes.load(key.scene) for key in photographs.keys(galleries=1) if not key.outline]
+    return _shares(_outcomes(model, (asked for scene in galleries for asked in _asked(model, scene, 1))))
 
 
 def _outcomes(model: LocalModel, every: Iterable[Asked]) -> dict[str, Counter[str]]:

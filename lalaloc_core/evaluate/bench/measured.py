@@ -1,9 +1,10 @@
-"""Setting of a benchmark, and the summary of its answers."""
+"""Setting of a benchmark, what benchmarks localise, and the summary of their answers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +14,19 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.evaluate.methods.lalaloc import found_pose
+from lalaloc_core.evaluate.methods.method import Pose
+from lalaloc_core.evaluate.runs.evaluation import run_evaluation
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.learn.data.dataset import Camera
-from lalaloc_core.learn.synth.scene.shots import Shot
-from lalaloc_core.localise.belief import photograph_heading
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RendererCache, split_renderer_cache
+from lalaloc_core.learn.synth.homes.plans import home_of
+from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.search.pipeline import Localisation
+
+_SPLIT = SPLIT_NUMBERS["test"]
 
 
 @dataclass(frozen=True)
@@ -35,26 +43,51 @@ class Setting:
         """The bundle, ready to localise."""
         return LocalModel(self.bundle)
 
+    @cached_property
+    def renderers(self) -> RendererCache:
+        """Renderers of the test split."""
+        return split_renderer_cache(_SPLIT, 0, self.textures)
+
+    def shots(self, per_home: int) -> Iterator[tuple[list[Shot], np.random.Generator]]:
+        """Yield shots of each furnished test home, and the home's random numbers."""
+        for index in range(self.homes):
+            home, rng = home_of(_SPLIT, 0, index)
+            yield sample_shots(home, per_home, rng, "full"), rng
+
+
+def evaluate(info: RunInfo) -> list[Prediction]:
+    """Return the predictions of a run that is not kept."""
+    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
+        return run_evaluation(RunFolder(Path(folder)), info)
+
+
+def best_pose(found: Localisation) -> Pose:
+    """Return the pose of an answer."""
+    return found_pose(found.query, found.candidates[0])
+
 
 class Found(NamedTuple):
-    """Errors of an answer's position (m) and heading (radians), and its confidence; NaN without one."""
+    """Errors of an answer's position (m) and heading (radians), its confidence, NaN without one, and right room."""
 
     error_m: float
     turned: float
     confidence: float
+    right_room: bool
 
     @classmethod
-    def of(cls, found: Localisation, camera: Camera | Shot, confidence: float | None, turn: float = 0.0) -> Found:
-        """Compare an answer with the pose of a camera, from whose heading the photograph is turned."""
-        answer = found.candidates[0]
-        turned = photograph_heading(found.query, answer) - camera.heading - turn
-        error_m = float(np.linalg.norm(answer.position_m - camera.position_m))
-        return cls(error_m, abs(float(wrap_angle(turned))), math.nan if confidence is None else confidence)
+    def of(cls, pose: Pose | None, truth: Pose | Camera | Shot, confidence: float | None) -> Found:
+        """Compare a pose with the true one; None is a miss."""
+        if pose is None:
+            return cls(math.inf, math.inf, 0.0, right_room=False)
+        turned = abs(float(wrap_angle(pose.heading - truth.heading)))
+        error_m = float(np.linalg.norm(pose.position_m - truth.position_m))
+        known = math.nan if confidence is None else confidence
+        return cls(error_m, turned, known, pose.room_index == truth.room_index)
 
 
 def summary(answers: Sequence[Found]) -> dict[str, float]:
     """Return the figures of some answers."""
-    error_m, turned, confidence = np.array(answers).T
+    error_m, turned, confidence, _ = np.array(answers).T
     near = error_m < 1.0
     return {
         "n": len(answers),
@@ -64,3 +97,9 @@ def summary(answers: Sequence[Found]) -> dict[str, float]:
         "mean_confidence": float(confidence.mean()),
         "expected_calibration_error": expected_calibration_error(confidence, near),
     }
+
+
+def means(rows: Sequence[NamedTuple]) -> dict[str, float]:
+    """Return the number of rows of one kind, and the mean of each figure."""
+    named = zip(rows[0]._fields, np.mean(rows, axis=0).tolist(), strict=True) if rows else ()
+    return {"n": len(rows), **dict(named)}

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,10 @@ import httpx
 import numpy as np
 
 from lalaloc_core.evaluate.bench.measured import Setting
-from lalaloc_core.evaluate.bench.speed import home_of_area
+from lalaloc_core.evaluate.bench.speed import spheres_of_home
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.foreign import without_openings
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
-from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
-from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.photograph.cameras import Perspective
 
 _REQUESTS = 40
@@ -37,33 +34,28 @@ _PHONE_SIZE, PHONE_FIELD_DEG, _PHONE_PHOTOGRAPHS = (4032, 3024), 80.0, 4
 
 def bench_service(setting: Setting) -> dict[str, Any]:
     """Measure the latency of `POST /localise` from one client, and the memory of the service's processes."""
-    home = home_of_area(100.0)
-    shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
-    materials = MaterialLibrary.create(np.random.default_rng(1), setting.textures)
-    images = SphereRenderer(materials, height=512, width=1024).render(shots).numpy()
-    pictures = [encode_jpeg(image) for image in images]
+    shots, images = spheres_of_home(_REQUESTS, (512, 1024), setting.textures)
+    plan, pictures = shots[0].home.plan, [encode_jpeg(image) for image in images]
+    heights = [{"camera_height_m": f"{plan.camera_height_m}"}] * _REQUESTS
+    headings = [{"heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
+    known = [{**height, **heading} for height, heading in zip(heights, headings, strict=True)]
+    rows = {
+        "known_heading": list(zip(pictures, known, strict=True)),
+        "unknown_heading": list(zip(pictures, heights, strict=True)),
+    }
+    rows["without_openings"] = rows["unknown_heading"]
+    if setting.bundle.manifest.view is not None:
+        views = [phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
+        lens = {"hfov_deg": f"{PHONE_FIELD_DEG:g}"}
+        rows["phone"] = [(views[k % len(views)], {**height, **lens}) for k, height in enumerate(heights)]
     with running_service(setting.bundle.folder) as (client, process):
-        plan_id, bare_id = _upload(client, home.plan), _upload(client, without_openings(home.plan))
+        plan_id, bare_id = _upload(client, plan), _upload(client, without_openings(plan))
         report: dict[str, Any] = {"requests": _REQUESTS, "sphere": "1024x512 JPEG"}
-        heights = [{"camera_height_m": f"{shot.home.plan.camera_height_m}"} for shot in shots]
-        headings = [{"heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
-        rows = {
-            "known_heading": [
-                (file, {**height, **heading}) for file, height, heading in zip(pictures, heights, headings, strict=True)
-            ],
-            "unknown_heading": list(zip(pictures, heights, strict=True)),
-        }
-        rows["without_openings"] = rows["unknown_heading"]
-        if setting.bundle.manifest.view is not None:
-            views = [phone_photograph(image) for image in images[:_PHONE_PHOTOGRAPHS]]
-            lens = {"hfov_deg": f"{PHONE_FIELD_DEG:g}"}
-            rows["phone"] = [(views[k % len(views)], {**height, **lens}) for k, height in enumerate(heights)]
         for name, requests in rows.items():
             report[name] = _latency(client, bare_id if name == "without_openings" else plan_id, requests)
-        report["service_resident_mb"] = resident_mb(process.pid)
-        sizes = [resident_mb(pid) for pid in children_of(process.pid)]
+        report["service_resident_mb"] = _resident_mb(process.pid)
         # The smaller child is Python's resource tracker.
-        report["workers_resident_mb"] = [size for size in sizes if size > _SMALL_PROCESS_MB]
+        report["workers_resident_mb"] = [size for size in _children_mb(process.pid) if size > _SMALL_PROCESS_MB]
     return report
 
 
@@ -103,53 +95,41 @@ def running_service(bundle_folder: Path) -> Iterator[tuple[httpx.Client, subproc
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
+    settings = {"LALALOC_BUNDLE": str(bundle_folder.resolve()), "LALALOC_LOG_LEVEL": "warning"}
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as data:
-        environment = {**os.environ, "LALALOC_DATA_DIR": data, "LALALOC_BUNDLE": str(bundle_folder.resolve())}
-        environment["LALALOC_LOG_LEVEL"] = "warning"
-        process = subprocess.Popen(command, env=environment)
+        process = subprocess.Popen(command, env={**os.environ, **settings, "LALALOC_DATA_DIR": data})
         try:
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
-                _wait_until(lambda: _is_ready(client), f"the service is not ready after {_STARTUP_SECONDS:g} s")
+                _wait_until(lambda: client.get("/readyz").status_code == 200, "the service is ready")
                 yield client, process
         finally:
             process.terminate()
             process.wait(timeout=30)
 
 
-def resident_mb(pid: int) -> float:
+def _resident_mb(pid: int) -> float:
     """Return the resident memory (MB) of a process (Linux)."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) / 1024.0
-    return float("nan")
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmRSS:")[2].split()[0]) / 1024.0
 
 
-def children_of(pid: int) -> list[int]:
-    """Return the ids of the direct children of a process (Linux)."""
+def _children_mb(pid: int) -> list[float]:
+    """Return the resident memory (MB) of the direct children of a process (Linux)."""
     listings = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children")]
-    return [int(child) for listing in listings for child in listing.split()]
+    return [_resident_mb(int(child)) for listing in listings for child in listing.split()]
 
 
 def _upload(client: httpx.Client, plan: FloorPlan) -> str:
-    response = client.post("/floorplans", json=plan.to_dict())
-    plan_id = response.raise_for_status().json()["id"]
-    _wait_until(
-        lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready",
-        f"the plan is not ready after {_STARTUP_SECONDS:g} s",
-    )
+    plan_id: str = client.post("/floorplans", json=plan.to_dict()).raise_for_status().json()["id"]
+    _wait_until(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready", "the plan is ready")
     return plan_id
 
 
-def _is_ready(client: httpx.Client) -> bool:
-    try:
-        return client.get("/readyz").status_code == 200
-    except httpx.TransportError:
-        return False
-
-
-def _wait_until(condition: Callable[[], bool], message: str) -> None:
+def _wait_until(is_true: Callable[[], bool], condition: str) -> None:
     deadline = time.monotonic() + _STARTUP_SECONDS
-    while not condition():
-        if time.monotonic() > deadline:
-            raise TimeoutError(message)
+    while time.monotonic() < deadline:
+        with suppress(httpx.TransportError):
+            if is_true():
+                return
         time.sleep(0.1)
+    raise TimeoutError(f"it does not hold after {_STARTUP_SECONDS:g} s that {condition}")

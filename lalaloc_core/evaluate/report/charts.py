@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from lalaloc_core.evaluate.report.scored_runs import Run
 from lalaloc_core.evaluate.runs.score import position_errors_m
 
-INK, MUTED, RULE, PAPER = "#1c2128", "#59626d", "#d5dbe1", "#ffffff"
+MUTED, PAPER = "#59626d", "#ffffff"
 SERIES = ("#0b63b5", "#c2410c", "#0f7b53", "#a3297a", "#8a6d00", "#0e7c86", "#6d4ed1", "#7a4a2a")
 _DASHES = ("-", "--", ":", "-.")
 _STYLE: dict[Any, Any] = {
@@ -26,32 +26,20 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "lalaloc",
     # Names of runs can contain dollar signs.
     "text.parse_math": False,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "grid.color": RULE,
+    "grid.color": "#d5dbe1",
     "grid.linewidth": 0.7,
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "text.color": INK,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "figure.facecolor": PAPER,
-    "axes.facecolor": PAPER,
-    "savefig.facecolor": "auto",
     "legend.frameon": False,
 }
 CURVE_LIMITS_M = (0.001, 20.0)
-CONFIDENCE_BINS = 20
 _TICKS = {0.001: "0.1 cm", 0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m", 10.0: "10 m"}
 _WIDTH_INCHES = 5.6
-_LEGEND_CHARACTERS = 84
+# Names of runs have at most some fifty characters.
+_LEGEND_COLUMNS = 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,7 +74,7 @@ def curves(runs: Sequence[Run]) -> dict[str, Float[np.ndarray, "n"]]:
 
 def _error_curves(runs: Sequence[Run]) -> Chart:
     lines = curves(runs)
-    figure = Figure(figsize=(_WIDTH_INCHES, 3.3 + _legend_inches(list(lines))), layout="constrained")
+    figure = Figure(figsize=(_WIDTH_INCHES, 3.3 + _legend_inches(len(lines))), layout="constrained")
     axes = figure.subplots()
     low, high = CURVE_LIMITS_M
     for errors_m, style in zip(lines.values(), _line_styles(len(lines)), strict=True):
@@ -110,65 +98,43 @@ def _error_curves(runs: Sequence[Run]) -> Chart:
 
 
 def _calibration(runs: Sequence[Run]) -> Chart:
-    figure = Figure(figsize=(_WIDTH_INCHES, 2.6 + _legend_inches([run.name for run in runs])), layout="constrained")
-    diagram, histogram = figure.subplots(1, 2)
-    diagram.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
+    figure = Figure(figsize=(_WIDTH_INCHES, 4.6 + _legend_inches(len(runs))), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
     for run, style in zip(runs, _line_styles(len(runs)), strict=True):
-        assert run.scores is not None
-        bins = run.scores.reliability
+        bins = run.scores.reliability if run.scores is not None else ()
         points = [100.0 * part.confidence for part in bins], [100.0 * part.frequency for part in bins]
-        diagram.plot(*points, linewidth=1.2, **style)
+        axes.plot(*points, linewidth=1.2, **style)
         largest = max(part.count for part in bins)
-        diagram.scatter(
-            *points,
-            s=[10.0 + 50.0 * part.count / largest for part in bins],
-            color=style["color"],
-            edgecolor=PAPER,
-            zorder=3,
-            clip_on=False,
-        )
-        edges = np.linspace(0.0, 100.0, CONFIDENCE_BINS + 1)
-        confidences = (prediction.confidence for prediction in run.predictions)
-        confidence = [100.0 * confidence for confidence in confidences if confidence is not None]
-        count, _ = np.histogram(confidence, edges)
-        histogram.stairs(100.0 * count / len(confidence), edges, fill=len(runs) == 1, linewidth=1.5, **style)
-    diagram.set(xlim=(0, 100), ylim=(0, 100), aspect="equal")
-    histogram.set_xlim(0, 100)
-    histogram.set_box_aspect(1)
-    _percent(diagram, "x", "confidence", step=50)
-    _percent(diagram, "y", "within 1 m", step=50)
-    _percent(histogram, "x", "confidence", step=50)
-    _percent(histogram, "y", "queries", step=None)
-    _legend(figure, diagram.get_lines()[1:], [run.name for run in runs])
+        sizes = [10.0 + 50.0 * part.count / largest for part in bins]
+        axes.scatter(*points, s=sizes, color=style["color"], edgecolor=PAPER, zorder=3, clip_on=False)
+    axes.set(xlim=(0, 100), ylim=(0, 100), aspect="equal")
+    _percent(axes, "x", "confidence")
+    _percent(axes, "y", "within 1 m")
+    _legend(figure, axes.get_lines()[1:], [run.name for run in runs])
     return _chart(
         figure,
         "calibration",
-        "Calibration of the confidence. Left: share of answers within 1 m against their mean confidence, in ten bins; "
-        "the dashed diagonal is perfect calibration, and larger dots have more queries. Right: distribution of the "
-        "confidence. The table below the chart has the same figures.",
+        "Calibration of the confidence. Share of answers within 1 m against their mean confidence, in ten bins; the "
+        "dashed diagonal is perfect calibration, and larger dots have more queries. The table below the chart has the "
+        "same figures.",
     )
 
 
-def _percent(axes: Axes, axis: str, label: str, step: int | None = 20) -> None:
+def _percent(axes: Axes, axis: str, label: str) -> None:
     chosen = axes.xaxis if axis == "x" else axes.yaxis
-    if step is not None:
-        chosen.set_ticks(range(0, 101, step))
+    chosen.set_ticks(range(0, 101, 20))
     chosen.set_major_formatter(lambda value, _: f"{value:g} %")
     chosen.set_label_text(label)
 
 
 def _legend(figure: Figure, marks: Sequence[Any], names: Sequence[str]) -> None:
     if len(names) > 1:
-        columns = _legend_columns(names)
-        figure.legend(marks, names, loc="outside lower left", ncols=columns, fontsize=8.5, columnspacing=1.4)
+        figure.legend(marks, names, loc="outside lower left", ncols=_LEGEND_COLUMNS, fontsize=8.5)
 
 
-def _legend_columns(names: Sequence[str]) -> int:
-    return max(1, min(4, len(names), _LEGEND_CHARACTERS // (max(map(len, names)) + 6)))
-
-
-def _legend_inches(names: Sequence[str]) -> float:
-    return 0.2 * math.ceil(len(names) / _legend_columns(names)) if len(names) > 1 else 0.0
+def _legend_inches(names: int) -> float:
+    return 0.2 * math.ceil(names / _LEGEND_COLUMNS) if names > 1 else 0.0
 
 
 def _chart(figure: Figure, name: str, alt: str) -> Chart:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from lalaloc_core.evaluate.runs.factories import describe_model
 from lalaloc_core.evaluate.runs.galleries import (
     ACCEPTED,
     GalleryAnswer,
-    GalleryScores,
     answers_in_galleries,
     describe_answers,
     foreign_confidences,
@@ -35,7 +34,7 @@ from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, ReadVi
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.metrics import AzimuthSummary, ClassScores, summarise_azimuths
+from lalaloc_core.learn.metrics import summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 FIGURES_FILE = "photographs.json"
@@ -61,36 +60,28 @@ class PhotographResults:
     read_views: Mapping[str, ReadViews] = dataclasses.field(default_factory=dict)
     foreign: Mapping[str, Sequence[float]] = dataclasses.field(default_factory=dict)
 
-    @property
-    def azimuths(self) -> AzimuthSummary:
-        """Summary of the photographs that count."""
-        return summarise_azimuths([read.measures for read in self.read if read.photograph.counts], OPENING_CLASSES)
-
     def figures(self) -> dict[str, Any]:
         """Return all figures as plain data."""
+        counting = [read.measures for read in self.read if read.photograph.counts]
         scores, *views = (
             {heading: dataclasses.asdict(score_galleries(results)) for heading, results in answers.items()}
             for answers in (self.answers, *self.views.values())
         )
         return without_infinity(
             {
-                "azimuths": dataclasses.asdict(self.azimuths),
+                "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
                 "read_views": {field_deg: dataclasses.asdict(read) for field_deg, read in self.read_views.items()},
                 "galleries": scores,
                 "views": dict(zip(self.views, views, strict=True)),
                 "read_as": None if (shares := self._read_as()) is None else shares.tolist(),
-                "foreign_plans": self._accepted(),
+                "foreign_plans": {
+                    heading: {"n": len(found), "accepted": float(np.mean(np.array(found) > ACCEPTED))}
+                    for heading, found in self.foreign.items()
+                    if found
+                },
                 "photographs": [self._figures(read) for read in self.read],
             }
         )
-
-    def _accepted(self) -> dict[str, dict[str, Any]]:
-        """Return the number of queries in plans of other buildings, and the share that is accepted, by heading."""
-        return {
-            heading: {"n": len(found), "accepted": float(np.mean(np.array(found) > ACCEPTED))}
-            for heading, found in self.foreign.items()
-            if found
-        }
 
     def _read_as(self) -> Float[np.ndarray, "c c"] | None:
         """Return for each annotated class (rows) the shares of azimuths by the class that is read; None without."""
@@ -112,30 +103,13 @@ class PhotographResults:
 
     def markdown(self) -> str:
         """Return the figures as Markdown tables: all photographs together, the classes read, and each photograph."""
-        azimuths = self.azimuths
-        within = ", ".join(f"{percent(share)} within {float(q):.0%}" for q, share in azimuths.within.items())
-        rows = [
-            ("photographs, good or fair", str(azimuths.n)),
-            ("median of the median error of log distance", _number(azimuths.median_error)),
-            ("… of the 90th percentile of its error", _number(azimuths.error_90)),
-            ("errors within quantiles of the predicted scale", within),
-            ("error relative to the predicted scale", _number(azimuths.scale_ratio)),
-            ("openings, balanced accuracy", _classes(azimuths.classes)),
-        ]
-        for field_deg, reading in self.read_views.items():
-            rows += _view_rows(f"views of {field_deg}°", reading)
-        shown = {"galleries": self.answers, **{f"views of {deg}°": found for deg, found in self.views.items()}}
-        for what, answers in shown.items():
-            for heading, results in answers.items():
-                rows += _gallery_rows(f"{what}, heading {heading}", score_galleries(results))
-        for heading, found in self._accepted().items():
-            name = f"plans of other buildings, heading {heading}: confidence above {ACCEPTED:g}"
-            rows.append((name, f"{percent(found['accepted'])} of {found['n']}"))
-        columns = ["photograph", "quality", "median", "90 %", "bias", "by scale", *self.answers]
-        tables = [markdown_table(["figure", "measured"], rows)]
-        if (shares := self._read_as()) is not None:
-            kinds = [(name, *map(percent, row)) for name, row in zip(OPENING_CLASSES, shares.tolist(), strict=True)]
+        figures = self.figures()
+        totals = {name: figures[name] for name in ("azimuths", "read_views", "galleries", "views", "foreign_plans")}
+        tables = [markdown_table(["figure", "measured"], _rows(totals))]
+        if figures["read_as"] is not None:
+            kinds = [(name, *map(percent, row)) for name, row in zip(OPENING_CLASSES, figures["read_as"], strict=True)]
             tables.append(markdown_table(["annotated, read as", *OPENING_CLASSES], kinds))
+        columns = ["photograph", "quality", *_MEASURES, *self.answers]
         return "\n".join([*tables, markdown_table(columns, [self._cells(read) for read in self.read])])
 
     def _cells(self, read: ReadPhotograph) -> list[str]:
@@ -210,46 +184,13 @@ def evaluate_photographs(
     return results
 
 
-def _view_rows(what: str, read: ReadViews) -> list[tuple[str, str]]:
-    """Return figures of the encoder of views; in brackets those of the readers that bound it."""
-    view, sphere, constant = (read.by_reader[reader] for reader in ("view", "sphere", "constant"))
-    within = ", ".join(f"{percent(share)} within {limit}°" for limit, share in read.walls_within.items())
-
-    def bounded(measure: str) -> str:
-        own, constant_distance, whole = (_number(getattr(by, measure)) for by in (view, constant, sphere))
-        return f"{own} (constant distance {constant_distance}, whole sphere {whole})"
-
-    accuracy, of_sphere = (_share(by.classes and by.classes.balanced_accuracy) for by in (view, sphere))
-    return [
-        (f"{what}: median error of the walls' shape", bounded("shape_error")),
-        ("… of log distance", bounded("median_error")),
-        ("… openings, balanced accuracy", f"{accuracy} (whole sphere {of_sphere})"),
-        ("… direction of the walls by lines", within),
-    ]
-
-
-def _gallery_rows(what: str, scores: GalleryScores) -> list[tuple[str, str]]:
-    return [
-        (f"{what}: located", f"{percent(scores.located)} of {scores.galleries}"),
-        ("… located, heading error above 10°", percent(scores.turned)),
-        ("… right room", percent(scores.right_room)),
-        ("… among the first three, five candidates", f"{percent(scores.among_3)}, {percent(scores.among_5)}"),
-        ("… expected calibration error of confidence", _number(scores.calibration_error)),
-    ]
-
-
-def _classes(classes: ClassScores | None) -> str:
-    if classes is None:
-        return "none predicted"
-    found = (
-        f"{name}s {_share(classes.recall[name])} found, {_share(classes.precision[name])} right"
-        for name in OPENING_CLASSES
-    )
-    return f"{percent(classes.balanced_accuracy)} ({'; '.join(found)})"
-
-
-def _share(share: float | None) -> str:
-    return "–" if share is None else percent(share)
+def _rows(figures: Mapping[str, Any], names: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+    """Yield the names of all figures, from the outermost inwards, and their values."""
+    for name, value in figures.items():
+        if isinstance(value, Mapping):
+            yield from _rows(value, (*names, name))
+        else:
+            yield ", ".join((*names, name)), f"{value}" if isinstance(value, int) else _number(value)
 
 
 def _number(value: float | None) -> str:
