@@ -28,8 +28,6 @@ class Bench:
     annotated: Annotated[Path | None, "folder of annotated photographs, for albums, bounds and films of real rooms"] = (
         None
     )
-    profile: Annotated[bool, "print the time of each stage of a query instead of measuring figures"] = False
-    queries: Annotated[int, "queries for `profile`"] = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,13 +63,7 @@ class Reproduce:
 
 
 def _bench(arguments: Bench) -> None:
-    check_range(arguments, 1, "homes", "queries")
-    if arguments.profile:
-        from lalaloc_core.bundle import Bundle
-        from lalaloc_core.evaluate.bench.speed import profile_table
-
-        print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
-        return
+    check_range(arguments, 1, "homes")
     from lalaloc_core.evaluate.bench.bench_groups import run_bench
 
     report = run_bench(

@@ -136,6 +136,13 @@ class AzimuthSummary:
     classes: ClassScores | None = None
 
 
+def confusion_shares(measures: Sequence[AzimuthMeasures]) -> list[list[float]] | None:
+    """Return by true class (rows) the shares of azimuths by the class that is predicted; None without predictions."""
+    confusions = [measure.confusion for measure in measures if measure.confusion is not None]
+    counts = np.sum(confusions, axis=0)
+    return (counts / counts.sum(axis=1, keepdims=True).clip(1)).tolist() if confusions else None
+
+
 def measure_azimuths(
     profiles_m: Sequence[Float[np.ndarray, "w"]],
     log_profile: Float[np.ndarray, "w"],

@@ -16,8 +16,7 @@ import pytest
 from lalaloc_core.errors import RunError
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.report import write_report
-from lalaloc_core.evaluate.report.report_tables import distance, number
-from lalaloc_core.evaluate.report.scored_runs import TOTAL, stage_times
+from lalaloc_core.evaluate.report.report_tables import TOTAL, distance, number, stage_times
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import (
     ALIGNMENT_LIMIT_M,

@@ -25,7 +25,7 @@ from lalaloc_core.learn.data.folder import HeldoutScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, cut_view, encode_jpeg
 from lalaloc_core.learn.dataset_names import HELDOUT_HOMES
-from lalaloc_core.learn.metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
+from lalaloc_core.learn.metrics import AzimuthMeasures, confusion_shares, measure_azimuths, summarise_azimuths
 from lalaloc_core.localise.belief import CONFIDENT
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.localisability.predicted_localisability import errors_of
@@ -194,14 +194,10 @@ def azimuth_figures(encoders: PhotographEncoder, dataset: Dataset) -> dict[str, 
     """Return the `AzimuthSummary` of a test split, and its `confusion`: shares by true and predicted class."""
     scenes = map(dataset.load, dataset.scenes("test"))
     measures = [_measured(encoders, scene, camera) for scene in scenes for camera in scene.cameras]
-    confusions = [measure.confusion for measure in measures if measure.confusion is not None]
     confusion = None
-    if confusions:
-        counts = np.sum(confusions, axis=0)
-        shares = [
-            zip(OPENING_CLASSES, row.tolist(), strict=True) for row in counts / counts.sum(1, keepdims=True).clip(1)
-        ]
-        confusion = {true: dict(row) for true, row in zip(OPENING_CLASSES, shares, strict=True)}
+    if (shares := confusion_shares(measures)) is not None:
+        rows = zip(OPENING_CLASSES, shares, strict=True)
+        confusion = {true: dict(zip(OPENING_CLASSES, row, strict=True)) for true, row in rows}
     return {**dataclasses.asdict(summarise_azimuths(measures, OPENING_CLASSES)), "confusion": confusion}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.evaluate.bench.measured import Found, Setting, best_pose, summary
+from lalaloc_core.evaluate.bench.measured import Found, Setting, best_pose, summary, timed
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
@@ -49,15 +48,15 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
     for index in range(setting.homes):
         case = _home(setting, index, spheres=False)
         refused += _PHOTOGRAPHS - len(case.photographs)
-        memory, begin = AlbumMemory(), time.perf_counter()
-        scores["walk"] += _solved(model, case, memory)
-        seconds.append(time.perf_counter() - begin)
+        memory = AlbumMemory()
+        solve_s, walk = timed(_solved, model, case, memory)
+        seconds.append(solve_s)
+        scores["walk"] += walk
         scores["without_order"] += _solved(model, case, memory, by_time=False)
         scores["each_alone"] += _alone(model, case)
-        begin = time.perf_counter()
-        count = case.clicks(model, memory)
+        clicks_s, count = timed(case.clicks, model, memory)
         clicks.append(count)
-        again_s.append((time.perf_counter() - begin) / (count + 1))
+        again_s.append(clicks_s / (count + 1))
         scores["spheres"] += _solved(model, _home(setting, index, spheres=True), AlbumMemory())
     for case in [] if setting.annotated is None else _annotated(model, setting.annotated):
         scores["annotated"] += _solved(model, case, AlbumMemory())

@@ -65,17 +65,12 @@ def bench_bounds(setting: Setting) -> dict[str, Any]:
     """
     model = setting.model
     homes = GeneratedScenes(homes=setting.homes, furniture="full", textures=setting.textures)
-    kinds = {"sphere": None, **{f"view_{field:g}": (1, field) for field in _FIELDS_DEG}, "turn": _TURN}
+    views = {f"view_{field:g}": (1, field) for field in _FIELDS_DEG}
     figures: dict[str, Any] = {}
-    for kind, shown in kinds.items():
-        count, field_deg = shown or (1, _FIELDS_DEG[0])
-        scenes = ViewScenes(homes, field_deg, count)
-        asked = (
-            asked
-            for name in scenes.scenes("test")
-            for asked in _asked(model, scenes.load(name), None if shown is None else count)
-        )
-        figures[kind] = _shares(_outcomes(model, asked))
+    for kind, (count, field_deg) in {"sphere": (None, _FIELDS_DEG[0]), **views, "turn": _TURN}.items():
+        scenes = ViewScenes(homes, field_deg, count or 1)
+        loaded = (scenes.load(name) for name in scenes.scenes("test"))
+        figures[kind] = _shares(_outcomes(model, (asked for scene in loaded for asked in _asked(model, scene, count))))
     if setting.annotated is not None:
         figures |= {f"annotated_{field:g}": _of_annotated(model, setting.annotated, field) for field in _ANNOTATED_DEG}
     return figures

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.search.pipeline import Localisation
 
 _SPLIT = SPLIT_NUMBERS["test"]
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,13 @@ def evaluate(info: RunInfo) -> list[Prediction]:
     """Return the predictions of a run that is not kept."""
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
         return run_evaluation(RunFolder(Path(folder)), info)
+
+
+def timed(call: Callable[..., _T], *arguments: Any) -> tuple[float, _T]:
+    """Return the duration (s) and the result of a call."""
+    begin = time.perf_counter()
+    result = call(*arguments)
+    return time.perf_counter() - begin, result
 
 
 def best_pose(found: Localisation) -> Pose:

@@ -37,8 +37,7 @@ def bench_service(setting: Setting) -> dict[str, Any]:
     shots, images = spheres_of_home(_REQUESTS, (512, 1024), setting.textures)
     plan, pictures = shots[0].home.plan, [encode_jpeg(image) for image in images]
     heights = [{"camera_height_m": f"{plan.camera_height_m}"}] * _REQUESTS
-    headings = [{"heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
-    known = [{**height, **heading} for height, heading in zip(heights, headings, strict=True)]
+    known = [{**heights[0], "heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
     rows = {
         "known_heading": list(zip(pictures, known, strict=True)),
         "unknown_heading": list(zip(pictures, heights, strict=True)),

@@ -1,11 +1,10 @@
-"""Speed of rendering, of LaLaLoc against ICP, of data sets, and of the stages of a query."""
+"""Speed of rendering, of LaLaLoc against ICP, and of data sets."""
 
 from __future__ import annotations
 
 import os
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate.bench.measured import Setting, evaluate
+from lalaloc_core.evaluate.bench.measured import Setting, evaluate, timed
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, local_refiner
 from lalaloc_core.evaluate.methods.method import Method, Question
-from lalaloc_core.evaluate.report.report_tables import markdown_table
 from lalaloc_core.evaluate.runs.evaluation import question_of
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.learn.data.structured3d import Structured3D
@@ -30,8 +27,6 @@ from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
-from lalaloc_core.localise.query import CameraHeight
-from lalaloc_core.localise.search.pipeline import StageClock, localise
 from lalaloc_core.render.profile import layout_depth, wall_profile
 from lalaloc_core.render.reference import reference_depth
 from lalaloc_core.render.sampling import pose_grid, random_poses
@@ -55,12 +50,7 @@ def spheres_of_home(
 def median_ms(call: Callable[[], object], repeats: int = 9) -> float:
     """Return the median duration (ms) of a call, after a warm-up."""
     call()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        times.append((time.perf_counter() - begin) * 1e3)
-    return statistics.median(times)
+    return 1e3 * statistics.median(timed(call)[0] for _ in range(repeats))
 
 
 def bench_rendering(setting: Setting) -> dict[str, float]:
@@ -130,20 +120,13 @@ _QUERIES = 300
 
 def bench_datasets(setting: Setting) -> dict[str, Any]:
     """Measure writing synthetic test scenes on all cores, reading them on one, and localising 300 spheres on all."""
-    cores = os.cpu_count() or 1
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as scratch:
         root = Path(scratch) / "scenes"
         settings = Synthesis(root=root, height=_SPHERE_HEIGHT, textures=setting.textures)
-        begin = time.perf_counter()
-        synthesise(settings, share_out(_SCENES, "test"), workers=cores)
-        writing = time.perf_counter() - begin
-
+        writing_s, _ = timed(lambda: synthesise(settings, share_out(_SCENES, "test"), workers=os.cpu_count() or 1))
         dataset = Structured3D(root)
         names = dataset.scenes("test")
-        begin = time.perf_counter()
-        cameras = sum(len(dataset.load(name).cameras) for name in names)
-        reading = time.perf_counter() - begin
-
+        reading_s, scenes = timed(lambda: list(map(dataset.load, names)))
         info = RunInfo(
             label="all stages",
             dataset=dataset.description,
@@ -154,44 +137,14 @@ def bench_datasets(setting: Setting) -> dict[str, Any]:
             limit=_QUERIES,
             bundle=str(setting.bundle.folder),
         )
-        begin = time.perf_counter()
-        answered = len(evaluate(info))
-        evaluating = time.perf_counter() - begin
-    spheres = PICTURES_PER_ROOM * cameras
+        evaluating_s, answers = timed(evaluate, info)
+    spheres = PICTURES_PER_ROOM * sum(len(scene.cameras) for scene in scenes)
     return {
         "sphere_height": _SPHERE_HEIGHT,
         "scenes": len(names),
         "spheres_written": spheres,
-        "spheres_written_per_second": spheres / writing,
-        "scenes_read_per_second": len(names) / reading,
-        "queries": answered,
-        "evaluation_seconds": evaluating,
+        "spheres_written_per_second": spheres / writing_s,
+        "scenes_read_per_second": len(names) / reading_s,
+        "queries": len(answers),
+        "evaluation_seconds": evaluating_s,
     }
-
-
-_STAGES = ("encode", "retrieve", "vdr", "lpo")
-
-
-def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
-    """Return a table of the times of stages, of queries in one thread."""
-    model = LocalModel(bundle)
-    shots, images = spheres_of_home(queries, (bundle.manifest.image_height, bundle.manifest.image_width), textures)
-    plan = shots[0].home.plan
-    grid = model.grid(plan, plan.camera_height_m)
-
-    def time_query(index: int, *, known: bool) -> dict[str, float]:
-        clock, shot = StageClock(), shots[index]
-        with clock.stage("encode"):
-            heading = shot.heading if known else None
-            query = model.encoder.spheres.query(images[index], heading, CameraHeight(shot.camera_height_m))
-        localise(plan, grid, model.encoder.layouts, query, refiner=model.refiner, clock=clock)
-        return clock.timings_ms
-
-    for known in (True, False):
-        time_query(0, known=known)
-    timings = {known: [time_query(index, known=known) for index in range(queries)] for known in (True, False)}
-    rows = [
-        (stage, *(f"{statistics.median(query[stage] for query in timings[known]):.1f} ms" for known in (True, False)))
-        for stage in _STAGES
-    ]
-    return markdown_table((f"stage, median of {queries} queries", "known heading", "unknown heading"), rows)

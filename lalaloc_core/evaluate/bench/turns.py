@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -176,14 +177,11 @@ def _annotated_films(setting: Setting, folder: Path) -> dict[str, Any]:
     Hand-held as in generated homes but without parallax, as nothing is known from beside the sphere's centre.
     """
     scenes = AnnotatedPhotographs(folder)
-    photographs, keys = {photograph.name: photograph for photograph in scenes.photographs}, scenes.keys(_GALLERIES)
-    films: dict[str, tuple[Film, float]] = {}
+    keys, by_name = scenes.keys(_GALLERIES), {photograph.name: photograph for photograph in scenes.photographs}
+    film_of = cache(lambda name: _filmed(setting.model, by_name[name]))
     filmed: list[Prediction] = []
     for key in keys:
-        if key.photograph not in films:
-            films[key.photograph] = _filmed(setting.model, photographs[key.photograph])
-        film, turn = films[key.photograph]
-        scene = scenes.load(key.scene)
+        (film, turn), scene = film_of(key.photograph), scenes.load(key.scene)
         found = _localised_film(setting.model, scene.plan, film, CAMERA_HEIGHT_M)
         filmed.append(_prediction(scene, found, turn, found.confidence(setting.bundle.manifest)))
     spheres = evaluate(

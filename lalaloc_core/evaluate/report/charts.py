@@ -11,12 +11,10 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lalaloc_core.evaluate.report.scored_runs import Run
-from lalaloc_core.evaluate.runs.score import position_errors_m
+from lalaloc_core.evaluate.report.report_tables import Run, curves
 
 MUTED, PAPER = "#59626d", "#ffffff"
 SERIES = ("#0b63b5", "#c2410c", "#0f7b53", "#a3297a", "#8a6d00", "#0e7c86", "#6d4ed1", "#7a4a2a")
@@ -63,13 +61,6 @@ def draw_charts(runs: Sequence[Run]) -> dict[str, Chart]:
     with mpl.rc_context(_STYLE):
         charts = [draw(chosen) for draw, chosen in ((_error_curves, answered), (_calibration, confident)) if chosen]
     return {chart.name: chart for chart in charts}
-
-
-def curves(runs: Sequence[Run]) -> dict[str, Float[np.ndarray, "n"]]:
-    """Return position errors (m; NaN without an answer) by curve: stages of a single run, or final poses of each."""
-    if len(runs) == 1 and len(runs[0].stages) > 1:
-        return {stage: position_errors_m(runs[0].predictions, stage) for stage in runs[0].stages}
-    return {run.name: position_errors_m(run.predictions) for run in runs}
 
 
 def _error_curves(runs: Sequence[Run]) -> Chart:

@@ -9,8 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lalaloc_core.evaluate.report import report_tables
 from lalaloc_core.evaluate.report.charts import Chart, draw_charts
-from lalaloc_core.evaluate.report.scored_runs import Run, open_runs
-from lalaloc_core.evaluate.runs.predictions import RunInfo
+from lalaloc_core.evaluate.report.report_tables import Run, open_runs
 from lalaloc_core.evaluate.runs.score import ALIGNMENT_LIMIT_M, Outcome
 from lalaloc_core.files import atomic_write
 
@@ -60,7 +59,7 @@ def _facts(run: Run) -> dict[str, str]:
         "Queries": _queries(run),
         "Heading": "known" if info.heading_known else "unknown",
         "Grid": f"{info.grid_step_m:g} m",
-        "Model": _model(info),
+        "Model": "none" if info.model is None else " ".join(info.model.values()),
     }
     if run.scores is not None and run.scores.clicks_per_album is not None:
         facts["Albums"] = (
@@ -79,10 +78,3 @@ def _queries(run: Run) -> str:
     limit = "" if info.limit is None else f", limited to {info.limit}"
     unanswered = run.scores.unanswered if run.scores is not None else 0
     return f"{len(run.predictions)} {kind}{limit}" + (f", {unanswered} without an answer" if unanswered else "")
-
-
-def _model(info: RunInfo) -> str:
-    if info.model is None:
-        return "none"
-    name = " ".join(info.model[key] for key in ("name", "version") if key in info.model)
-    return name + (f", SHA-256 {info.model['sha256'][:12]}…" if "sha256" in info.model else "")

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
@@ -34,7 +33,7 @@ from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, ReadVi
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.files import atomic_write
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.metrics import summarise_azimuths
+from lalaloc_core.learn.metrics import confusion_shares, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 FIGURES_FILE = "photographs.json"
@@ -73,7 +72,7 @@ class PhotographResults:
                 "read_views": {field_deg: dataclasses.asdict(read) for field_deg, read in self.read_views.items()},
                 "galleries": scores,
                 "views": dict(zip(self.views, views, strict=True)),
-                "read_as": None if (shares := self._read_as()) is None else shares.tolist(),
+                "read_as": confusion_shares(counting),
                 "foreign_plans": {
                     heading: {"n": len(found), "accepted": float(np.mean(np.array(found) > ACCEPTED))}
                     for heading, found in self.foreign.items()
@@ -82,15 +81,6 @@ class PhotographResults:
                 "photographs": [self._figures(read) for read in self.read],
             }
         )
-
-    def _read_as(self) -> Float[np.ndarray, "c c"] | None:
-        """Return for each annotated class (rows) the shares of azimuths by the class that is read; None without."""
-        counts = np.zeros((len(OPENING_CLASSES), len(OPENING_CLASSES)))
-        for read in self.read:
-            if read.photograph.counts and read.class_scores is not None:
-                classes = read.photograph.classes(len(read.class_scores))
-                np.add.at(counts, (classes, read.class_scores.argmax(axis=1)), 1.0)
-        return counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0) if counts.any() else None
 
     def _figures(self, read: ReadPhotograph) -> dict[str, Any]:
         name = read.photograph.name

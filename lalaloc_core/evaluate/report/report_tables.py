@@ -1,30 +1,94 @@
-"""Tables of a report: figures as text, in HTML or Markdown."""
+"""Scored runs of a report and the rows of its tables: figures as text, in HTML or Markdown."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from lalaloc_core.evaluate.report.charts import curves
-from lalaloc_core.evaluate.report.scored_runs import TOTAL, Run, stage_times
+from lalaloc_core.errors import RunError
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import (
     Estimate,
     Outcome,
+    Scores,
     choose_worst,
     count_outcomes,
     heading_errors_deg,
     outcomes,
     position_errors_m,
+    score,
 )
 
 CURVE_POINTS_M = (0.01, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
 METRICS = ("median", "< 1 cm", "< 5 cm", "< 10 cm", "< 1 m", "right room", "heading")
 NOTHING = "–"
+_MAX_LABEL = 48
+TOTAL = "total"
 # Queries that the page lists as the worst of each run.
 WORST = 20
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Run:
+    """Run of a report.
+
+    The shortened name begins with the number if there are several runs; `scores` is None without predictions.
+    """
+
+    name: str
+    info: RunInfo
+    predictions: list[Prediction]
+    scores: Scores | None
+
+    @property
+    def stages(self) -> list[str]:
+        """Stages that any query passed, in order."""
+        return list(self.scores.stages) if self.scores is not None else []
+
+
+def open_runs(folders: Sequence[Path]) -> list[Run]:
+    """Read and score runs."""
+    if not folders:
+        raise RunError("a report needs at least one run")
+    runs = []
+    for number, folder in enumerate(map(RunFolder, folders), start=1):
+        info, predictions = folder.read_info(), folder.read_predictions()
+        name = info.label if len(info.label) <= _MAX_LABEL else info.label[: _MAX_LABEL - 1] + "…"
+        name = f"{number}. {name}" if len(folders) > 1 else name
+        scores = score(predictions) if predictions else None
+        runs.append(Run(name=name, info=info, predictions=predictions, scores=scores))
+    return runs
+
+
+class StageTime(NamedTuple):
+    """Number of queries that passed a stage, and its median and 95th percentile."""
+
+    count: int
+    median_ms: float
+    p95_ms: float
+
+
+def stage_times(predictions: Sequence[Prediction]) -> dict[str, StageTime]:
+    """Return times by stage, and of whole queries under `TOTAL`; empty without times."""
+    timed = [prediction.timings_ms for prediction in predictions if prediction.timings_ms]
+    names = dict.fromkeys(name for timings in timed for name in timings)
+    times_ms = {name: [timings[name] for timings in timed if name in timings] for name in names}
+    if timed:
+        times_ms[TOTAL] = [sum(timings.values()) for timings in timed]
+    return {name: StageTime(len(ms), *map(float, np.percentile(ms, [50.0, 95.0]))) for name, ms in times_ms.items()}
+
+
+def curves(runs: Sequence[Run]) -> dict[str, Float[np.ndarray, "n"]]:
+    """Return position errors (m; NaN without an answer) by curve: stages of a single run, or final poses of each."""
+    if len(runs) == 1 and len(runs[0].stages) > 1:
+        return {stage: position_errors_m(runs[0].predictions, stage) for stage in runs[0].stages}
+    return {run.name: position_errors_m(run.predictions) for run in runs}
 
 
 class Cell(NamedTuple):
@@ -135,15 +199,15 @@ def number(value: float) -> str:
     return "< 0.01" if 0.0 < value < 0.005 else _rounded(value)
 
 
-def distance(distance_m: float) -> str:
-    """Format a distance in metres, or in centimetres below 1 m."""
-    return f"{number(distance_m)} m" if distance_m >= 1.0 else f"{number(100.0 * distance_m)} cm"
-
-
 def _rounded(value: float) -> str:
     if math.isinf(value):
         return "∞"
     return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
+
+
+def distance(distance_m: float) -> str:
+    """Format a distance in metres, or in centimetres below 1 m."""
+    return f"{number(distance_m)} m" if distance_m >= 1.0 else f"{number(100.0 * distance_m)} cm"
 
 
 def _share(estimate: Estimate | None) -> Cell:
