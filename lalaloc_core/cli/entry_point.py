@@ -5,27 +5,22 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import re
 import sys
 
 from lalaloc_core import __version__
-from lalaloc_core.cli import (
-    assistants,
-    encoding,
-    evaluation,
-    lab,
-    localising,
-    measuring,
-    pinning,
-    plans,
-    tracking,
-    training,
-)
+from lalaloc_core.cli import assistants, encoding, localising, pinning, plans, tracking
 from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError
 
 # The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130
 
-_LAB = training.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS
+# Commands whose options are those of the laboratory; making them takes as long as all the rest, so others do without.
+_WITH_LAB = ("bench", "lab", "completion")
+# Commands of `lalaloc lab` that stood outside of it until 0.11.
+_MOVED = re.compile(
+    "add-objects|calibrate|evaluate|export|export-again|photographs|report|reproduce|score|synth|train|worst"
+)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -34,10 +29,11 @@ def main(argv: list[str] | None = None) -> int:
     # It lists every repaired detail of a DXF; the import's report has what matters.
     logging.getLogger("ezdxf").setLevel(logging.ERROR)
     words = sys.argv[1:] if argv is None else argv
-    if words and words[0] in _LAB.keys() - {"bench"}:
-        print(f"error: `lalaloc {words[0]}` is now `lalaloc lab {words[0]}`", file=sys.stderr)
+    command = words[0] if words else ""
+    if _MOVED.fullmatch(command):
+        print(f"error: `lalaloc {command}` is now `lalaloc lab {command}`", file=sys.stderr)
         return 2
-    arguments = build_parser().parse_args(words)
+    arguments = build_parser(with_lab=command in _WITH_LAB).parse_args(words)
     try:
         arguments.run(arguments)
         sys.stdout.flush()
@@ -65,25 +61,34 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of all commands."""
+def build_parser(*, with_lab: bool = True) -> argparse.ArgumentParser:
+    """Build the parser of all commands; those of the laboratory have their options only if `with_lab`."""
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise photographs in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for group in (localising, pinning, encoding, tracking, plans, assistants):
         group.add_commands(commands)
-    lab.add_command(commands, "bench", _LAB["bench"])
-    actions = commands.add_parser(
+    bench = commands.add_parser("bench", help="measure the figures of the results page and print them as JSON")
+    laboratory = commands.add_parser(
         "lab", help="train, measure and export models, by configuration files and options (docs/how-to/train.md)"
-    ).add_subparsers(required=True, metavar="COMMAND")
-    for name, command in _LAB.items():
-        lab.add_command(actions, name, command)
+    )
+    if with_lab:
+        _add_lab(bench, laboratory)
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'
     )
     completion.add_argument("shell", choices=("bash", "zsh", "fish"), help="shell")
     completion.set_defaults(run=lambda arguments: _complete(parser, arguments.shell))
     return parser
+
+
+def _add_lab(bench: argparse.ArgumentParser, laboratory: argparse.ArgumentParser) -> None:
+    from lalaloc_core.cli import evaluation, lab, measuring, training
+
+    lab.add_options(bench, measuring.COMMANDS["bench"])
+    actions = laboratory.add_subparsers(required=True, metavar="COMMAND")
+    for name, command in (training.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS).items():
+        lab.add_options(actions.add_parser(name, help=lab.summary(command)), command)
 
 
 def _complete(parser: argparse.ArgumentParser, shell: str) -> None:

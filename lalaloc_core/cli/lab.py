@@ -40,10 +40,14 @@ AsJson = Annotated[bool, "print all figures as JSON"]
 Runs = Annotated[tuple[Path, ...], "folders of runs"]
 
 
-def add_command(commands: Any, name: str, command: Command) -> None:
-    """Add a command, with an option for each field of its configuration."""
+def summary(command: Command) -> str:
+    """Return what a command does."""
     text = inspect.getdoc(command.kind) or ""
-    parser = commands.add_parser(name, help=text[0].lower() + text[1:].rstrip("."))
+    return text[0].lower() + text[1:].rstrip(".")
+
+
+def add_options(parser: argparse.ArgumentParser, command: Command) -> None:
+    """Add the words of a command, and an option for each field of its configuration."""
     parser.add_argument(
         "words",
         nargs="*",
