@@ -127,6 +127,7 @@ def test_solve_does_not_depend_on_the_order_of_arrival(
     assert solve_album(ground, encoder, photographs[::-1]).pins == pins[::-1]
 
 
+@pytest.mark.slow
 def test_memory_gives_the_same_pins_after_storage(
     ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
 ) -> None:

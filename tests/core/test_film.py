@@ -201,6 +201,7 @@ def test_broken_and_soundless_files_are_refused(h264: bytes, tmp_path: Path) -> 
             read_film(content)
 
 
+@pytest.mark.slow
 def test_damaged_frames_end_no_process(tmp_path: Path) -> None:
     rng, film = np.random.default_rng(0), encode(turn()[:12], tmp_path / "turn.mp4")
     for _ in range(8):

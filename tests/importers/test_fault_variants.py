@@ -206,7 +206,7 @@ def test_steep_rows_of_seats_are_one_floor():
     assert floor.rise_m == pytest.approx(2.8)
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 17.0])
+@pytest.mark.parametrize("turn_deg", [0.0, pytest.param(17.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rows", [(20, 80), (60, 130)])
 def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple[int, int]):
     cells = np.full((260, 380), 205, np.uint8)

@@ -191,6 +191,7 @@ def test_drawn_letters_are_no_pillars_where_texts_are_not_read(monkeypatch: pyte
     assert [room.get("holes") for room in plan.document["rooms"]] == [None] * 3
 
 
+@pytest.mark.slow
 def test_scale_that_contradicts_the_texts_gives_warnings():
     plan = import_plan(PrintedPlan().file(), ImportOptions(metres_per_pixel=0.02), LIMITS)
     assert plan.report.metres_per_unit == 0.02

@@ -121,7 +121,7 @@ def test_rooms_joined_by_a_wide_passage_are_divided_by_their_names(names: tuple[
     assert [opening.kind for opening in sketch.openings] == ["passage"] * is_divided
 
 
-@pytest.mark.parametrize("is_hatched", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("is_hatched", [False, True])
 def test_furniture_at_outlined_walls_is_no_wall(is_hatched: bool):
     page = Image.new("L", (1200, 900), 255)
     pen = ImageDraw.Draw(page)

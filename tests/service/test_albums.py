@@ -201,10 +201,10 @@ def test_file_names_are_no_formulas(client: httpx.Client, plan_id: str, pictures
     ("correction", "room"),
     [
         ({"room_id": "kitchen"}, "kitchen"),
-        ({"position": {"x_m": 2.0, "y_m": 2.0}, "heading_deg": 90}, "living room"),
-        ({"position": {"x_m": 7.0, "y_m": 2.0}}, "kitchen"),
+        pytest.param({"position": {"x_m": 2.0, "y_m": 2.0}, "heading_deg": 90}, "living room", marks=pytest.mark.slow),
+        pytest.param({"position": {"x_m": 7.0, "y_m": 2.0}}, "kitchen", marks=pytest.mark.slow),
         ({"elsewhere": True}, None),
-        ({"confirmed": True}, ...),
+        pytest.param({"confirmed": True}, ..., marks=pytest.mark.slow),
     ],
 )
 def test_correction_is_certain_and_can_be_undone(
@@ -332,6 +332,7 @@ def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[by
         )
 
 
+@pytest.mark.slow
 def test_features_take_the_place_of_photographs(
     client: httpx.Client, plan_id: str, pictures: list[bytes], features_of: Callable[[bytes], bytes]
 ) -> None:
@@ -511,6 +512,7 @@ def test_pins_move_with_a_new_revision_of_the_plan(client: httpx.Client, picture
         assert moved["distance_m"] > 0.5
 
 
+@pytest.mark.slow
 def test_correction_of_a_room_that_is_gone_is_left_out(client: httpx.Client, pictures: list[bytes]) -> None:
     plan_id = upload(client, HOME)
     album_id = create(client, plan_id)

@@ -106,6 +106,7 @@ def test_service_for_features_refuses_films(
         assert_problem(send(client, plan_id, ("film", film)), 403, "features-required")
 
 
+@pytest.mark.slow
 def test_python_client_sends_films(client: httpx.Client, flat: str, film: bytes, tmp_path: Path) -> None:
     path = tmp_path / "turn.mp4"
     path.write_bytes(film)
