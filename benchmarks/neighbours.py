@@ -230,8 +230,9 @@ def _measure(loads: Sequence[Load], template: Template, seconds: float) -> Itera
                     beside += probe.run(_ANSWER_TIMEOUT_S - seconds, answered)
                 busy_s = _idle_after(process)
                 after = probe.run(seconds / 2.0)
-                latencies = _latency(before + after), _latency(beside)
-                yield Row(load.routes, load.title, load.connections, *latencies, answers, busy_s)
+                alone, others = _latency(before + after), _latency(beside)
+                ratios = others.p50_ms / alone.p50_ms, others.p99_ms / alone.p99_ms
+                yield Row(load.routes, load.title, load.connections, alone, others, *ratios, answers, busy_s)
                 before = after
             # Work that is still in progress belongs to no other row.
             for child in process.children(recursive=True):
