@@ -39,13 +39,13 @@ serve: $(SERVING) ## run the service at http://127.0.0.1:8000 (or PORT=...) with
 		$(BIN)/lalaloc-service serve --example --port $(PORT)
 
 # Three processes with one thread each keep two cores busy, as many tests wait; each takes whole files, whose tests share
-# services. Browsers need an otherwise idle machine, so their tests are last and alone; they run even if others fail.
+# services. Browsers keep a core busy each, so their tests are last, two at a time; they run even if others fail.
 ALONE := tests/web
 PYTEST := $(BIN)/python -m pytest
 define run_tests
 @status=0; \
 	OMP_NUM_THREADS=1 $(PYTEST) -n 3 --dist loadfile $(ALONE:%=--ignore=%) $(1) || status=1; \
-	$(PYTEST) $(ALONE) $(1) || status=1; \
+	$(PYTEST) -n 2 --dist loadfile $(ALONE) $(1) || status=1; \
 	exit $$status
 endef
 

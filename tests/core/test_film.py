@@ -47,9 +47,7 @@ def check_turn(film: Film) -> None:
     assert film.warnings == ()
 
 
-@pytest.mark.parametrize(
-    ("name", "options"), [("turn.mov", HEVC), pytest.param("turn.webm", VP9, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("name", "options"), [("turn.mov", HEVC), ("turn.webm", VP9)])
 def test_film_of_any_codec_gives_angles(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
     check_turn(read_film(encode(turn(), tmp_path / name, *options), stated=FIELD))
 

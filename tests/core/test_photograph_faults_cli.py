@@ -46,6 +46,7 @@ def test_contradicted_statement_is_named(capsys: pytest.CaptureFixture[str]) -> 
     CONTRADICTED.check_warnings(json.loads(capsys.readouterr().out)[0])
 
 
+@pytest.mark.slow
 def test_track_goes_on_after_a_file_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number, name in enumerate(("two_xmp.jpg", "dual_fisheye.jpg", "jpeg_no_eoi.jpg")):
         shutil.copy(FOLDER / name, tmp_path / f"{number}.jpg")
@@ -65,6 +66,7 @@ def test_track_goes_on_after_a_file_that_cannot_be_used(tmp_path: Path, capsys: 
     assert "none of 2 photographs can be used" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_track_names_odometry_of_optical_frames(capsys: pytest.CaptureFixture[str]) -> None:
     odometry = str(FOLDER / "tum_optical.tum")
     command = ["track", PLAN, str(FOLDER / "tum_optical"), "--hfov", "80", "--odometry", odometry, "--json"]

@@ -124,7 +124,7 @@ def same_weights(first: dict[str, dict[str, Tensor]], second: dict[str, dict[str
 
 
 class TestLoop:
-    @pytest.mark.parametrize("kind", ["adamw", "sgd"])
+    @pytest.mark.parametrize("kind", ["adamw", pytest.param("sgd", marks=pytest.mark.slow)])
     @pytest.mark.parametrize("ema_decay", [0.0, 0.9])
     def test_resumed_run_equals_an_uninterrupted_run(self, tmp_path: Path, kind: Any, ema_decay: float) -> None:
         settings = {"optimiser": OptimiserConfig(kind=kind, learning_rate=0.05), "ema_decay": ema_decay}
@@ -408,6 +408,7 @@ class TestStages:
         assert set(terms(decode_anchors_only=False, all_pairs=False)) == {"log_ratio", "scale", "decode"}
         assert all(term.ndim == 0 and bool(torch.isfinite(term)) for term in terms().values())
 
+    @pytest.mark.slow
     def test_image_encoder_learns_and_teacher_stays_frozen(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

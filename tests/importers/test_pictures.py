@@ -188,7 +188,7 @@ def test_draft_uses_its_openings_as_far_as_they_seem_complete(drawn: dict[Style,
     assert {entry.kind: entry.trust for entry in draft.report.opening_trust}["door"] < 1.0
 
 
-@pytest.mark.parametrize("options", [ImportOptions(), pytest.param(ImportOptions(units="m"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("options", [ImportOptions(), ImportOptions(units="m")])
 def test_picture_without_scale_gets_that_of_its_doors(drawn: dict[Style, DrawnPlan], options: ImportOptions):
     report = import_plan(drawn["thick"].png(), options).report
     assert 0.0 < report.scale_std < 0.1

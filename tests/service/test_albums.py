@@ -314,6 +314,7 @@ def test_repeated_creation_makes_one_album(client: httpx.Client, plan_id: str) -
     assert_problem(reused, 422, "idempotency-key-reused")
 
 
+@pytest.mark.slow
 def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[bytes]) -> None:
     with start_app(tmp_path, max_albums=2, max_album_photographs=2) as client:
         plan_id = upload(client)

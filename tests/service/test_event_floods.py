@@ -110,7 +110,7 @@ def test_turn_of_the_loop_handles_a_bounded_number_of_events(monkeypatch: pytest
     assert max(map(len, turns)) == EVENTS_PER_TURN
 
 
-@pytest.mark.parametrize("path", ["/body", "/refused"])
+@pytest.mark.parametrize("path", [pytest.param("/body", marks=pytest.mark.slow), "/refused"])
 def test_body_in_tiny_chunks_is_refused(port: int, path: str) -> None:
     with _connected(port) as flood:
         sending = threading.Thread(target=_send_quietly, args=(flood, _chunked(path, b"x", 200_000)))

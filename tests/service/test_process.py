@@ -174,6 +174,7 @@ def test_killed_service_leaves_no_workers_and_resumes(tiny_bundle: Path, tmp_pat
     assert (tmp_path / "log").read_text().count("Application shutdown complete") == 1
 
 
+@pytest.mark.slow
 def test_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) -> None:
     script = [sys.executable, "-m", "tests.service.torch_free", str(tiny_bundle), str(tmp_path)]
     environment = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}

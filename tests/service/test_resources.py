@@ -331,6 +331,7 @@ def test_deleting_a_plan_cancels_its_preparation(start_app: StartApp, tmp_path: 
         assert_problem(client.get(f"/floorplans/{plan_id}"), 404, "unknown-floorplan")
 
 
+@pytest.mark.slow
 def test_preparation_resumes_after_a_restart(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, **_hall(), grid_lease_s=0.5) as client:
         plan_id = upload(client, HALL, wait=False)
