@@ -27,14 +27,14 @@ _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a stage: the layout encoder, then the image encoder."""
+    """Train a stage: the layout encoder, then the encoder of spheres or of views."""
 
     stage: Annotated[
         Literal["layout", "image", "view", "end-to-end"],
         "the encoder of layouts, of spheres (image), of views (preset trunk), or the first two at once",
     ]
     preset: Annotated[Literal["ring", "trunk", "paper", "tiny", "tiny-trunk"], "networks and schedule"] = "ring"
-    out: Annotated[Path, "folder of the run, shared by both stages"]
+    out: Annotated[Path, "folder of the run, shared by its stages"]
     data: Annotated[Path | None, "data set (default: homes generated during training)"] = None
     skip_bad: SkipBad = False
     textures: Textures = None

@@ -1,5 +1,7 @@
 """Path of a query: retrieve, re-sample on the Vogel disc (VDR), refine the pose (LPO), rank.
 
+`_Search` retrieves when it is made; `before_lpo` runs VDR, `lpo_job` and `after_lpo` LPO.
+
 The same code answers over HTTP and in evaluation, which records every stage; the refiner, which runs pose refinement,
 differs. A search is therefore a generator: it yields refinement jobs, which the caller runs at once
 (`run_steps`) or wherever it wants (`next_step`).
