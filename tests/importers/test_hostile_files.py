@@ -324,6 +324,8 @@ _DRAWN, _LONG = {"picture", "pdf"}, ("mega", "noise", "a lattice of thick", "one
             marks=[pytest.mark.slow] if plan.format in _DRAWN or any(words in plan.title for words in _LONG) else [],
         )
         for plan in HOSTILE_PLANS
+        # PDFium expands nested forms while it loads a page: only a worker's memory limit ends that (test_plan_files.py).
+        if plan.title != "nested forms"
     ],
 )
 def test_small_file_takes_little_time(plan: HostilePlan):

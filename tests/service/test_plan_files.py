@@ -18,6 +18,7 @@ import shapely
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
+from benchmarks.hostile_drawings import HOSTILE_PLANS
 from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
@@ -329,6 +330,11 @@ class TestHostileFiles:
         self.assert_rejected(strict, b'{"type": "FeatureCollection", "features": ' + b"[" * 1_000_000, "nested")
         rooms = {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0, 0]] * 290_000}]}
         self.assert_rejected(strict, json.dumps(rooms).encode(), "vertices")
+
+    @pytest.mark.slow
+    def test_nested_forms_of_a_pdf(self, strict: httpx.Client) -> None:
+        (plan,) = (each for each in HOSTILE_PLANS if each.title == "nested forms")
+        self.assert_rejected(strict, plan.make(20_000), "two attempts ended before the end of it")
 
     def test_endless_file(self, strict: httpx.Client) -> None:
         def endless() -> Iterator[bytes]:

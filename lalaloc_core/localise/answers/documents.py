@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -81,7 +81,7 @@ class ModelAnswer(Document):
     sha256: Annotated[str, Field(description="Digest over the model's files.")]
 
     @classmethod
-    def of(cls, bundle: Bundle) -> Self:
+    def of(cls, bundle: Bundle) -> ModelAnswer:
         """Return name, version and digest of a bundle."""
         return cls(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 

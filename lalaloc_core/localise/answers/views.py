@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 from pydantic import ConfigDict, Field
 
@@ -47,7 +47,7 @@ class AssumedAngle(Document):
     ]
 
     @classmethod
-    def of(cls, assumed: Assumed) -> Self:
+    def of(cls, assumed: Assumed) -> AssumedAngle:
         """Return an angle of a photograph."""
         return cls(value_deg=math.degrees(assumed.value), std_deg=math.degrees(assumed.sd), source=assumed.source)
 
