@@ -133,7 +133,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"'{path}' is no {path.suffix[1:].upper()}: {error}") from error
 
 
-def check_range(configuration: Any, least: float, *names: str) -> None:
+def check_range(configuration: Any, least: int, *names: str) -> None:
     """Check that values are at least `least`, or greater if it is 0 and they are no integers."""
     for name in names:
         value = getattr(configuration, name)

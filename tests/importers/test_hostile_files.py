@@ -324,7 +324,7 @@ _DRAWN, _LONG = {"picture", "pdf"}, ("mega", "noise", "a lattice of thick", "one
             marks=[pytest.mark.slow] if plan.format in _DRAWN or any(words in plan.title for words in _LONG) else [],
         )
         for plan in HOSTILE_PLANS
-        # PDFium expands nested forms while it loads a page: only a worker's memory limit ends that (test_plan_files.py).
+        # PDFium expands nested forms while it loads a page: only a worker's limit ends that (test_plan_files.py).
         if plan.title != "nested forms"
     ],
 )
