@@ -108,7 +108,7 @@ def summary(answers: Sequence[Found]) -> dict[str, float]:
     }
 
 
-def means(rows: Sequence[NamedTuple]) -> dict[str, float]:
-    """Return the number of rows of one kind, and the mean of each figure."""
+def means(rows: Sequence[Any]) -> dict[str, float]:
+    """Return the number of rows, named tuples of one kind, and the mean of each figure."""
     named = zip(rows[0]._fields, np.mean(rows, axis=0).tolist(), strict=True) if rows else ()
     return {"n": len(rows), **dict(named)}
