@@ -23,6 +23,7 @@ from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
+from service.pools import supervisor
 from service.query import lpo_pool
 from service.query.lpo_pool import LpoPool
 from service.settings import CONSTANTS, Settings
@@ -102,7 +103,12 @@ def test_worker_result_equals_the_refiner(pool: LpoPool, bundle: Bundle, by_prof
 
 
 @pytest.mark.slow
-def test_torch_is_loaded_with_the_first_job_by_latents(bundle: Bundle, job: RefinementJob) -> None:
+def test_torch_is_loaded_with_the_first_job_by_latents(
+    bundle: Bundle, job: RefinementJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The process that tests fork workers from has loaded torch.
+    monkeypatch.setattr(supervisor, "_START_METHOD", "spawn")
+
     def loaded() -> bool:
         (worker,) = set(_workers()) - others
         return any("libtorch" in entry.path for entry in psutil.Process(worker).memory_maps())
