@@ -49,7 +49,7 @@ define run_tests
 	exit $$status
 endef
 
-test: $(STAMP) ## run the tests (about 8 minutes on two cores)
+test: $(STAMP) ## run the tests (about 9 minutes on two cores)
 	$(call run_tests)
 
 # Shapes and types in the core's signatures are checked whenever tests call it.

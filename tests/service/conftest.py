@@ -215,7 +215,9 @@ def home(shipped: httpx.Client) -> str:
     return upload(shipped, HOME)
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+# A schema takes PostgreSQL longer than most tests, so those of both kinds run on it before a release; replicas,
+# backups and keys are tested on it always.
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.slow)])
 def url(request: pytest.FixtureRequest, tmp_path: Path, empty_database: Path) -> str:
     """Return the URL of an empty database of either kind."""
     if request.param == "sqlite":

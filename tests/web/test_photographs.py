@@ -144,6 +144,7 @@ def _phone_photographs(folder: Path, headings_deg: list[float]) -> list[Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
     page.locator("#photo-file").set_input_files(_phone_photographs(tmp_path, [0.0, 60.0, 120.0]))

@@ -285,6 +285,7 @@ def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, t
 
 
 @pytest.mark.one_replica
+@pytest.mark.slow
 def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True) as client:
         store = Store(database_of(tmp_path))
