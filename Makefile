@@ -49,7 +49,7 @@ define run_tests
 	exit $$status
 endef
 
-test: $(STAMP) ## run the tests (about 9 minutes on two cores)
+test: $(STAMP) ## run the tests (about 7 minutes on two cores)
 	$(call run_tests)
 
 # Shapes and types in the core's signatures are checked whenever tests call it.
@@ -81,7 +81,7 @@ openapi: $(STAMP) ## write openapi.yaml from the application
 docs: $(STAMP) ## write the generated parts of docs/
 	$(BIN)/python -m scripts.write_docs
 
-neighbours: $(STAMP) ## measure every route beside another tenant, write docs/reference/neighbours.md (about 10 minutes)
+neighbours: $(STAMP) ## measure every route beside another tenant, write docs/reference/neighbours.md (about 14 minutes)
 	-$(BIN)/python -m benchmarks.neighbours --json docs/neighbours.json
 	$(BIN)/python -m scripts.write_docs
 
