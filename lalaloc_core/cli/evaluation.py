@@ -42,7 +42,7 @@ class Evaluate:
     kind: Annotated[Literal["layout", "photograph"], "kind of query"] = "photograph"
     data: Annotated[Path | None, "data set (default: generated homes)"] = None
     dataset: Annotated[
-        Literal["structured3d", "zind", "own", "annotated"] | None,
+        Literal["structured3d", "zind", "own", "annotated", "posed"] | None,
         "format of the data set (default: detected from its files)",
     ] = None
     generator: Annotated[

@@ -15,6 +15,9 @@ from lalaloc_core.errors import ConfigError, InvalidInputError
 from lalaloc_core.files import default_bundle
 from lalaloc_core.learn.dataset_names import GALLERIES
 
+# Decimals of printed figures.
+_DECIMALS = 4
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
@@ -42,6 +45,18 @@ class Photographs:
     bundle: BundleFolder = field(default_factory=default_bundle)
     workers: Workers = None
     out: Annotated[Path, "folder of results"] = Path("photographs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Short:
+    """Measure walls and openings of a bundle, or of a run that is kept, on pictures by others."""
+
+    real: Annotated[Path, "folder with `annotated` and `rendered_house`"]
+    rooms: Annotated[Path, "folder of path-traced rooms"]
+    bundle: BundleFolder = field(default_factory=default_bundle)
+    run_: Annotated[Path | None, "run whose encoders replace those of the bundle; its weights are kept in `out`"] = None
+    out: Annotated[Path, "folder of kept weights and runs.csv"] = Path("models/training")
+    note: Annotated[dict[str, str], "note for the line in runs.csv as KEY=VALUE"] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +113,17 @@ def _photographs(arguments: Photographs) -> None:
     print(results.markdown())
 
 
+def _short(arguments: Short) -> None:
+    from lalaloc_core.bundle import Bundle
+    from lalaloc_core.evaluate.bench.short_table import keep_run, short_table
+
+    real, rooms, bundle = arguments.real, arguments.rooms, arguments.bundle
+    if arguments.run_ is None:
+        print_json(short_table(Bundle.open(bundle), real, rooms), _DECIMALS)
+    else:
+        print_json(keep_run(arguments.run_, bundle, real, rooms, arguments.out, arguments.note), _DECIMALS)
+
+
 def _reproduce(arguments: Reproduce) -> None:
     check_range(arguments, 1, "limit")
     check_range(arguments, 0, "workers")
@@ -139,5 +165,6 @@ def _reproduce(arguments: Reproduce) -> None:
 COMMANDS = {
     "bench": Command(Bench, _bench, "only"),
     "photographs": Command(Photographs, _photographs, "data"),
+    "short": Command(Short, _short, "bundle"),
     "reproduce": Command(Reproduce, _reproduce, "table"),
 }

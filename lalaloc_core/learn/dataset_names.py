@@ -12,6 +12,7 @@ DATASET_FORMATS = {
     "zind": "ZInD",
     "own": "own data",
     "annotated": "annotated photographs",
+    "posed": "posed spheres",
 }
 # Out-of-distribution homes.
 HELDOUT_HOMES = 60

@@ -18,12 +18,22 @@ class StructureFeatures:
         log_ceiling: (b) log of the ceiling's height above the camera (m).
         log_ceiling_scale: (b) log of the scale of the Laplace distribution of `log_ceiling`'s error.
         room_type_logits: (b, types) in the order of `conventions.ROOM_TYPES`.
+        edges: (b, w, 2) elevation (radians) of the lower and the upper edge of an opening at each azimuth.
+        edges_log_scale: (b, w, 2) log scale of the Laplace distributions of their errors.
+        wall_seen_logit: (b, w) log odds that the wall is seen at all, not hidden behind furniture.
     """
 
     opening_logits: Tensor
     log_ceiling: Tensor
     log_ceiling_scale: Tensor
     room_type_logits: Tensor
+    edges: Tensor
+    edges_log_scale: Tensor
+    wall_seen_logit: Tensor
+
+    def rows(self, rows: slice) -> StructureFeatures:
+        """Return the predictions for some pictures of a batch."""
+        return StructureFeatures(*(value[rows] for value in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -56,10 +66,9 @@ class ImageFeatures:
 
 def first_rows(features: ImageFeatures, count: int) -> ImageFeatures:
     """Return the predictions for the first `count` spheres of a batch."""
-    structure = features.structure
-    if structure is not None:
-        structure = StructureFeatures(**{name: value[:count] for name, value in vars(structure).items()})
-    return ImageFeatures(features.ring[:count], features.walls.rows(slice(count)), structure)
+    rows = slice(count)
+    structure = None if features.structure is None else features.structure.rows(rows)
+    return ImageFeatures(features.ring[rows], features.walls.rows(rows), structure)
 
 
 class HorizonAttention(nn.Module):

@@ -10,6 +10,7 @@ layouts in metres, takes the height as an input.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -28,6 +29,8 @@ _MIN_LOG_SCALE, _MAX_LOG_SCALE = -6.0, 2.0
 # Log distance, log scale and logit of the share of each mode when training begins, relative to the first one; if they
 # were alike, both modes would learn the same.
 _APART = ((0.0, 0.0, 0.0), (0.7, 0.0, -2.0))
+_EDGE_VALUES = 5
+_NEW_OUTPUTS = ("to_edges.", "to_objects.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +107,10 @@ class HorizonEncoder(nn.Module):
             with torch.no_grad():
                 self.to_profile.bias.unflatten(0, (columns_per_sector, config.modes, -1)).add_(torch.tensor(_APART))
         self.register_load_state_dict_pre_hook(_with_all_modes)
+        self.register_load_state_dict_pre_hook(_with_new_outputs)
         self.to_openings = nn.Linear(width, len(OPENING_CLASSES) * columns_per_sector)
+        # Elevations of both edges of an opening and their log scales, then the log odds that the wall is seen.
+        self.to_edges = nn.Linear(width, _EDGE_VALUES * columns_per_sector)
         self.to_ceiling = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, 2))
         self.to_room_type = nn.Sequential(nn.Linear(2 * width, width), nn.GELU(), nn.Linear(width, len(ROOM_TYPES)))
         # Class shares of the training data: the prior by which predicted probabilities are divided.
@@ -130,14 +136,11 @@ class HorizonEncoder(nn.Module):
                 share.lerp_(torch.bincount(known.long(), minlength=len(share)).to(share) / len(known), rate)
 
     def sector_features(
-        self,
-        pixels: Float[Tensor, "b 3 h w"],
-        styles: StyleMixing | None = None,
-        extra: Float[Tensor, "b s e"] | None = None,
+        self, taps: Sequence[Tensor], extra: Float[Tensor, "b s e"] | None = None
     ) -> Float[Tensor, "b s c"]:
-        """Return the sectors' features of normalised pixels; they do not depend on the camera height."""
+        """Return the sectors' features by the maps of the trunk; they do not depend on the camera height."""
         squeezed = []
-        for number, (tap, squeeze) in enumerate(zip(self.trunk(pixels, styles), self.squeezes, strict=True)):
+        for number, (tap, squeeze) in enumerate(zip(taps, self.squeezes, strict=True)):
             columns = squeeze(tap.flatten(1, 2).transpose(1, 2)).to(self.mean.dtype)
             squeezed.append(self.get_buffer(f"interpolation{number}") @ columns)
         if extra is not None:
@@ -157,6 +160,7 @@ class HorizonEncoder(nn.Module):
     def structure(self, mixed: Float[Tensor, "b s c"], log_height: Float[Tensor, "b"]) -> StructureFeatures:
         """Return openings, ceiling height and room type; `log_height` is the log of the camera height (m)."""
         openings = self.to_openings(mixed).unflatten(2, (self.columns_per_sector, len(OPENING_CLASSES))).flatten(1, 2)
+        edges = self.to_edges(mixed).unflatten(2, (self.columns_per_sector, _EDGE_VALUES)).flatten(1, 2)
         ceiling = self.to_ceiling(mixed).mean(dim=1)
         overall = torch.cat([mixed.mean(dim=1), mixed.amax(dim=1)], dim=1)
         return StructureFeatures(
@@ -164,6 +168,9 @@ class HorizonEncoder(nn.Module):
             log_ceiling=ceiling[:, 0] + log_height,
             log_ceiling_scale=ceiling[:, 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
             room_type_logits=self.to_room_type(overall),
+            edges=edges[..., :2],
+            edges_log_scale=edges[..., 2:4].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
+            wall_seen_logit=edges[..., 4],
         )
 
     def normalised(self, image: Tensor) -> Float[Tensor, "b 3 h w"]:
@@ -183,7 +190,7 @@ class TrunkImageEncoder(HorizonEncoder):
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
     ) -> ImageFeatures:
         """Encode spheres (b, h, w, 3) of values from 0 to 255; `styles` is for training only."""
-        mixed = self.sector_features(self.normalised(image), styles)
+        mixed = self.sector_features(self.trunk(self.normalised(image), styles))
         log_height = torch.log(camera_height_m)
         height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
         return ImageFeatures(
@@ -191,6 +198,13 @@ class TrunkImageEncoder(HorizonEncoder):
             walls=self.walls(mixed, log_height),
             structure=self.structure(mixed, log_height),
         )
+
+
+def _with_new_outputs(encoder: HorizonEncoder, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Let outputs that earlier weights lack begin untrained."""
+    for name, own in encoder.named_parameters():
+        if name.startswith(_NEW_OUTPUTS):
+            state.setdefault(prefix + name, own.detach().clone())
 
 
 def _values_per_mode(modes: int) -> int:

@@ -13,14 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional
 
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.conventions import ROOM_TYPES, TWO_PI
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.sphere_network import HorizonEncoder, TrunkEncoderConfig, TrunkImageEncoder
 from lalaloc_core.nets.trunk import TAP_STRIDES, StyleMixing
+
+# Least part of a patch, in cells of the last map, by which its features are divided.
+_LEAST_SHOWN = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +34,7 @@ class ViewEncoderConfig(TrunkEncoderConfig):
     Attributes:
         sectors: sectors that the patch covers, each as wide as the ring's.
         top_deg: elevation of the patch's upper border; pixels are as high as they are wide.
+        objects: number of household objects that are predicted, besides the types of rooms; 0 predicts neither.
     """
 
     image_height: int = 192
@@ -37,6 +42,7 @@ class ViewEncoderConfig(TrunkEncoderConfig):
     modes: int = 2
     sectors: int = 20
     top_deg: float = 39.375
+    objects: int = 0
 
     def width_rad(self, ring: RingConfig) -> float:
         """Return the azimuths (radians) that the patch spans."""
@@ -56,11 +62,17 @@ class ViewEncoderConfig(TrunkEncoderConfig):
 
 @dataclass(frozen=True)
 class ViewFeatures:
-    """Predictions for a batch of views; `seen` (b, w) is the share of each azimuth column that a photograph shows."""
+    """Predictions for a batch of views.
+
+    Attributes:
+        seen: (b, w) share of each azimuth column that a photograph shows.
+        objects: (b, n) logits of household objects, then of the types of rooms; None if they are not predicted.
+    """
 
     walls: WallModes
     seen: Tensor
     structure: StructureFeatures
+    objects: Tensor | None = None
 
 
 class ViewNetwork(HorizonEncoder):
@@ -76,6 +88,11 @@ class ViewNetwork(HorizonEncoder):
         self.register_buffer("pooling", _pooling(config.image_width, columns), persistent=False)
         self.pooling: Tensor
         self.row_elevations = config.row_elevations(ring)
+        self.to_objects: nn.Module | None = None
+        if config.objects:
+            width, inputs = config.mixer_width, 2 * config.trunk.widths[-1]
+            outputs = config.objects + len(ROOM_TYPES)
+            self.to_objects = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, outputs))
 
     @torch.no_grad()
     def start_from(self, sphere: TrunkImageEncoder) -> None:
@@ -113,9 +130,22 @@ class ViewNetwork(HorizonEncoder):
         pixels = self.normalised(image[..., :3]) * opacity[:, None]
         seen = opacity.mean(dim=1) @ self.pooling
         by_sector = seen.unflatten(1, (-1, self.columns_per_sector)).mean(dim=2)
-        mixed = self.sector_features(pixels, styles, by_sector[..., None])
+        taps = self.trunk(pixels, styles)
+        mixed = self.sector_features(taps, by_sector[..., None])
         log_height = torch.log(camera_height_m)
-        return ViewFeatures(walls=self.walls(mixed, log_height), seen=seen, structure=self.structure(mixed, log_height))
+        return ViewFeatures(
+            walls=self.walls(mixed, log_height),
+            seen=seen,
+            structure=self.structure(mixed, log_height),
+            objects=None if self.to_objects is None else self.to_objects(_pooled(taps[-1].detach(), opacity)),
+        )
+
+
+def _pooled(features: Float[Tensor, "b c h w"], opacity: Float[Tensor, "b h2 w2"]) -> Float[Tensor, "b 2*c"]:
+    """Return mean and maximum of features over the part that a photograph shows."""
+    shown = functional.avg_pool2d(opacity[:, None], TAP_STRIDES[-1])
+    mean = (features * shown).sum(dim=(2, 3)) / shown.sum(dim=(2, 3)).clamp_min(_LEAST_SHOWN)
+    return torch.cat([mean, (features * shown).amax(dim=(2, 3))], dim=1)
 
 
 def _pooling(width: int, columns: int) -> Float[Tensor, "w c"]:

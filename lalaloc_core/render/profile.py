@@ -190,11 +190,14 @@ class RenderedLayout:
         kind: (b, w) code in `conventions.OPENING_CLASSES` of that wall at eye height.
         behind_m: (b, w) distance along the same ray through a door or passage to the next wall of the room behind;
             equals `distance_m` where no room is visible behind.
+        sill_m, head_m: (b, w) heights of that opening above the floor, infinite where unknown; 0 for walls.
     """
 
     distance_m: Float[Array, "b w"]
     kind: Int[Array, "b w"]
     behind_m: Float[Array, "b w"]
+    sill_m: Float[Array, "b w"]
+    head_m: Float[Array, "b w"]
 
 
 def render_layout(
@@ -222,7 +225,10 @@ def render_layout(
     eye_m = xp.asarray(camera_height_m, **like_positions) + xp.zeros_like(heading)
     opening = _opening_met(position_m, azimuth, distance_m, wall, room_index, geometry, eye_m)
     behind_m = _look_through(position_m, azimuth, distance_m, opening, room_index, geometry)
-    return RenderedLayout(distance_m, _at_opening(geometry.opening_kind, room_index, opening), behind_m)
+    kind, sill_m, head_m = (
+        _at_opening(values, room_index, opening) for values in (geometry.opening_kind, geometry.sill_m, geometry.head_m)
+    )
+    return RenderedLayout(distance_m, kind, behind_m, sill_m, head_m)
 
 
 def _opening_met(

@@ -236,6 +236,15 @@ class TestEncoder:
         assert (two.log_profile[..., 1] > two.log_profile[..., 0]).all()
         assert (two.log_share[..., 1] < two.log_share[..., 0]).all()
 
+    def test_earlier_weights_leave_new_outputs_untrained(self, encoder: TrunkImageEncoder) -> None:
+        state = encoder.state_dict()
+        earlier = {name: 2.0 * value for name, value in state.items() if not name.startswith("to_edges.")}
+        fresh = TrunkImageEncoder(encoder.config, TINY.ring)
+        untrained = fresh.to_edges.weight.clone()
+        fresh.load_state_dict(earlier)
+        assert torch.equal(fresh.to_edges.weight, untrained)
+        assert torch.equal(fresh.to_openings.weight, 2.0 * state["to_openings.weight"])
+
     def test_sectors_align_with_their_pixels(self) -> None:
         """Check that interpolation maps the centre of a column's receptive field to its sector."""
         for stride in TAP_STRIDES:

@@ -21,7 +21,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.learn.export.run_export import export_into, export_run
 from lalaloc_core.learn.training import losses, run
-from lalaloc_core.learn.training.batch_streams import UNKNOWN, SphereBatches, opening_kinds
+from lalaloc_core.learn.training.batch_streams import UNKNOWN, SphereBatches, seen_openings
 from lalaloc_core.learn.training.batches import Photographs
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
@@ -57,7 +57,8 @@ def some_photographs() -> Photographs:
     width = TINY.image_size[1]
     log_distance = torch.rand(3, width, generator=generator)
     log_distance[:, : width // 2] = torch.nan
-    return Photographs(images, 0.3 * torch.rand(3, width, 3, generator=generator), log_distance)
+    openings, types = 0.3 * torch.rand(3, width, 3, generator=generator), torch.tensor([1, UNKNOWN, 3])
+    return Photographs(images, openings, log_distance, types, torch.ones(3))
 
 
 def stage_of(config: TrainConfig = TINY, photographs: Photographs | None = None) -> ImageStage:
@@ -100,15 +101,42 @@ def camera(camera_height_m: float) -> Camera:
 
 class TestLabels:
     def test_opening_kinds_match_the_plan(self) -> None:
-        kind = opening_kinds(plan(), camera(1.5), 0.0, 64)
+        kind, _ = seen_openings(plan(), camera(1.5), 0.0, 64)
         azimuth_deg = ((np.arange(64) + 0.5) / 64 - 0.5) * 360.0
         # The window reaches one metre to either side, two metres ahead.
         expected = np.where(np.abs(azimuth_deg) < np.degrees(np.arctan(0.5)), WINDOW, WALL)
         np.testing.assert_array_equal(kind, expected)
-        np.testing.assert_array_equal(opening_kinds(plan(), camera(0.8), 0.0, 64), WALL)
+        np.testing.assert_array_equal(seen_openings(plan(), camera(0.8), 0.0, 64)[0], WALL)
+
+    def test_edges_of_openings_match_the_plan(self) -> None:
+        kind, edges = seen_openings(plan(), camera(1.5), 0.0, 64)
+        assert np.array_equal(np.isfinite(edges).all(axis=0), kind == WINDOW)
+        # The window is two metres ahead, 0.6 m below the camera to 0.5 m above it.
+        np.testing.assert_allclose(edges[:, 32], np.arctan2([-0.6, 0.5], 2.0 / np.cos(np.pi / 64)), rtol=1e-5)
+
+    def test_renderings_tell_where_walls_are_seen(self) -> None:
+        source = GeneratedSource(TINY)
+        (sample, *_) = source.samples(0, 64, 128)
+        assert isinstance(sample.image, np.ndarray)
+        walls = sample.image[..., 3]
+        assert set(np.unique(walls)) == {0, 255}
+        # Neither the floor below nor the ceiling above the camera is a wall.
+        assert not walls[0].any()
+        assert not walls[-1].any()
+        assert 0.5 < np.mean(walls[31:33] > 0) <= 1.0
+
+    def test_hidden_walls_are_learnt_by_column(self) -> None:
+        walls = torch.zeros(1, 12, 8)
+        walls[0, 4:8, :4] = 1.0
+        seen = torch.ones(1, 4, dtype=torch.bool)
+        right, wrong = torch.tensor([[9.0, 9.0, -9.0, -9.0]]), torch.tensor([[-9.0, 9.0, -9.0, -9.0]])
+        assert float(losses.wall_seen(right, walls, seen)) < 0.01
+        assert float(losses.wall_seen(wrong, walls, seen)) > 2.0
+        seen[0, 0] = False
+        assert float(losses.wall_seen(wrong, walls, seen)) < 0.01
 
     def test_walls_are_unknown_in_plans_without_all_openings(self) -> None:
-        kind = opening_kinds(plan(opening_kinds=["window"]), camera(1.5), 0.0, 64)
+        kind, _ = seen_openings(plan(opening_kinds=["window"]), camera(1.5), 0.0, 64)
         assert set(kind) == {UNKNOWN, WINDOW}
 
     def test_batches_hold_openings_and_room_types(self, batch: dict[str, torch.Tensor]) -> None:
@@ -128,9 +156,9 @@ class TestLosses:
     def test_every_head_gets_a_gradient(self, batch: dict[str, torch.Tensor]) -> None:
         stage = stage_of(photographs=some_photographs())
         terms = stage.losses(batch)
-        assert set(terms) == {"ring", "profile", "l2", "opening", "ceiling", "room_type", "photographs"}
+        assert set(terms) == {"ring", "profile", "l2", "opening", "edges", "ceiling", "room_type", "photographs"}
         torch.stack(list(terms.values())).sum().backward()
-        heads = {"to_ring", "to_profile", "to_openings", "to_ceiling", "to_room_type"}
+        heads = {"to_ring", "to_profile", "to_openings", "to_edges", "to_ceiling", "to_room_type"}
         assert parts_with_gradient(stage) == heads | {"trunk", "squeezes", "join", "mixer", "norm"}
         assert all(p.grad is None for p in stage.teacher.parameters())
 
@@ -373,7 +401,7 @@ class TestWarmStart:
         start = load_warm_start(default_bundle(), "image", trunk)
         start.load_into({"image_encoder": encoder})
         trained = start.checkpoint.weights["image_encoder"]
-        loaded = {key: value for key, value in encoder.state_dict().items() if not key.startswith("to_profile.")}
+        loaded = {key: value for key, value in encoder.state_dict().items() if not key.startswith(("to_profile.", "to_edges."))}
         assert all(torch.equal(value, trained[key]) for key, value in loaded.items())
 
     @pytest.mark.slow

@@ -17,7 +17,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, is_annotation, read_annotation
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.data.drawn_rooms import DrawnOpening, DrawnRoom, plan_of_rooms
+from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, drawn_room, plan_of_rooms
 from lalaloc_core.learn.dataset_names import GALLERIES
 from lalaloc_core.learn.synth.homes.plans import generate_home
 
@@ -174,28 +174,11 @@ def _generated() -> tuple[tuple[DrawnRoom, ...], Float[np.ndarray, "n 2"]]:
     """Return rooms of generated homes with unique names, and their shapes."""
     homes = [generate_home(np.random.default_rng([_POOL, number])) for number in range(_POOL_HOMES)]
     rooms = tuple(
-        _drawn(f"{room.name}, home {number}", home.plan, index)
+        drawn_room(f"{room.name}, home {number}", home.plan, index)
         for number, home in enumerate(homes)
         for index, room in enumerate(home.plan.rooms)
     )
     return rooms, np.stack([_shape(room) for room in rooms])
-
-
-def _drawn(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
-    room = plan.rooms[index]
-    openings = []
-    for face in plan.opening_faces:
-        if face.room == index:
-            start, end = room.walls_m[face.wall].reshape(2, 2)
-            line_m = start + np.array([[face.start], [face.end]]) * (end - start)
-            openings.append(DrawnOpening(kind=plan.openings[face.opening].kind, line_m=line_m))
-    return DrawnRoom(
-        name=name,
-        polygon_m=room.polygon_m,
-        ceiling_height_m=room.ceiling_height_m,
-        openings=tuple(openings),
-        room_type=room.type,
-    )
 
 
 def _shape(room: DrawnRoom) -> Float[np.ndarray, "2"]:

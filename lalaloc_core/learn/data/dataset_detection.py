@@ -8,6 +8,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, annotation_files
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.data.folder import PLAN_FILE, OwnData
+from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres, room_names
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.zind import DATA_FILE, PARTITION_FILE, Zind
 from lalaloc_core.learn.dataset_names import DATASET_FORMATS
@@ -30,6 +31,8 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
         found["own data"] = OwnData(root)
     if annotation_files(root):
         found["annotated photographs"] = AnnotatedPhotographs(root)
+    if room_names(root) or (root / VIEWS_FILE).exists():
+        found["posed spheres"] = PosedSpheres(root)
     if dataset_format is not None:
         wanted = DATASET_FORMATS[dataset_format]
         if wanted not in found:
@@ -40,8 +43,9 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
     if not found:
         raise DatasetError(
             "no data set in this folder; looked for folders 'scene_00000' (Structured3D), "
-            f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), '*/{PLAN_FILE}' (own data), and "
-            "'*.json' with 'photograph' and 'polygon' (annotated photographs)",
+            f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), '*/{PLAN_FILE}' (own data), "
+            f"'*.json' with 'photograph' and 'polygon' (annotated photographs), and '{VIEWS_FILE}' or '<seed>.json' "
+            "(posed spheres)",
             path=root,
         )
     return next(iter(found.values()))

@@ -147,6 +147,24 @@ class DrawnRoom:
         return replace(self, polygon_m=self.polygon_m @ matrix.T, openings=openings)
 
 
+def drawn_room(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
+    """Return a room of a plan with its openings, without their heights."""
+    room = plan.rooms[index]
+    openings = []
+    for face in plan.opening_faces:
+        if face.room == index:
+            start, end = room.walls_m[face.wall].reshape(2, 2)
+            line_m = start + np.array([[face.start], [face.end]]) * (end - start)
+            openings.append(DrawnOpening(kind=plan.openings[face.opening].kind, line_m=line_m))
+    return DrawnRoom(
+        name=name,
+        polygon_m=room.polygon_m,
+        ceiling_height_m=room.ceiling_height_m,
+        openings=tuple(openings),
+        room_type=room.type,
+    )
+
+
 def plan_of_rooms(name: str, rooms: Sequence[DrawnRoom], camera_height_m: float) -> FloorPlan:
     """Build a floor plan of rooms at their drawn positions, complete with openings."""
     numbered = [(f"room-{number}", room) for number, room in enumerate(rooms)]

@@ -42,12 +42,13 @@ from lalaloc_core.bundle import (
 )
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
-from lalaloc_core.learn.export.object_table import OBJECTS, ObjectNetwork, shares_by_type
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork, paper_encoders, ring_image_encoder, trunk
+from lalaloc_core.nets.image_features import StructureFeatures
 from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
+from lalaloc_core.nets.object_network import OBJECTS, ObjectNetwork, shares_by_type
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import TAP_STRIDES
@@ -57,8 +58,9 @@ PARITY_TOLERANCE = 1e-4
 _PARITY_BATCH = 4
 # Smaller tensors (biases, normalisation statistics) keep single precision at negligible size.
 _HALF_FROM_ELEMENTS = 1024
-# Fields of `StructureFeatures`, in order.
-_STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
+# Fields of `StructureFeatures` by azimuth column.
+_BY_COLUMN = ("opening_logits", "edges", "edges_log_scale", "wall_seen_logit")
+_STRUCTURE_OUTPUTS = [field.name for field in dataclasses.fields(StructureFeatures)]
 
 
 def export_bundle(
@@ -109,6 +111,7 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
     image = torch.randint(0, 256, size, dtype=torch.uint8, generator=generator)
     heights = torch.empty(_PARITY_BATCH).uniform_(1.0, 1.9, generator=generator)
     outputs = ["log_profile", "log_scale", "log_share", "seen", *_STRUCTURE_OUTPUTS]
+    outputs += ["objects"] if config.view.objects else []
     with _new_files(bundle.folder) as work:
         _export(work / VIEW_ONNX, _ViewOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
     _save_weights(encoder, bundle.folder / VIEW_WEIGHTS, beside=bundle.folder / VIEW_ONNX)
@@ -127,7 +130,7 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
 
 def add_object_network(bundle: Bundle) -> Bundle:
     """Add the classifier of objects to a bundle, or replace it; no other network changes."""
-    network = ObjectNetwork([number for _, number, _ in OBJECTS])
+    network = ObjectNetwork()
     _freeze(network)
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (_PARITY_BATCH, 256, 320, 3), dtype=torch.uint8, generator=generator)
@@ -226,10 +229,14 @@ class _ViewOutputs(nn.Module):
 
     def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
         both = self.encoder(torch.cat([image, image.flip(2)]), torch.cat([camera_height_m, camera_height_m]))
-        openings, *others = vars(both.structure).values()
-        by_column = (*(_halves(value) for value in (*vars(both.walls).values(), both.seen, openings)),)
-        averaged = (*(0.5 * (own + mirrored.flip(1)) for own, mirrored in by_column),)
-        return (*averaged, *(0.5 * (own + mirrored) for own, mirrored in map(_halves, others)))
+        by_column = (*vars(both.walls).values(), both.seen)
+        averaged = (*(0.5 * (own + mirrored.flip(1)) for own, mirrored in map(_halves, by_column)),)
+        structure = tuple(
+            0.5 * (own + (mirrored.flip(1) if name in _BY_COLUMN else mirrored))
+            for name, (own, mirrored) in ((name, _halves(value)) for name, value in vars(both.structure).items())
+        )
+        objects = () if both.objects is None else (both.objects.unflatten(0, (2, -1)).mean(dim=0),)
+        return (*averaged, *structure, *objects)
 
 
 def _halves(values: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.errors import DatasetError
@@ -131,10 +131,11 @@ class SphereBatches(Stream):
     """Stage 2: stream of spheres with their layouts, rotated and mirrored together.
 
     Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) with the configured
-    error, and `ceiling_height_m` (b). Batches with neighbours hold `neighbour_profile_m` (b, n, columns) and
-    `neighbour_ceiling_height_m` (b, n), rotated and mirrored like their sphere. With architecture `trunk` there are
-    `opening_kind` (b, columns) and `room_type` (b): codes of `conventions`, or `UNKNOWN`. Sources with deferred
-    rendering yield `DeferredBatch` instead. Views, a part of the horizon, are mirrored only.
+    error, and `ceiling_height_m` (b); renderings have a fourth channel, 255 where a wall is seen. Batches with
+    neighbours hold `neighbour_profile_m` (b, n, columns) and `neighbour_ceiling_height_m` (b, n), rotated and mirrored
+    like their sphere. With architecture `trunk` there are `opening_kind` (b, columns) and `room_type` (b): codes of
+    `conventions`, or `UNKNOWN`, and `edges` (b, columns, 2), see `seen_openings`. Sources with deferred rendering yield
+    `DeferredBatch` instead. Views, a part of the horizon, are mirrored only.
     """
 
     config: TrainConfig
@@ -208,20 +209,27 @@ class SphereBatches(Stream):
 
     def _classes(self, sample: SphereSample, turn: Rotation) -> Row:
         room = sample.plan.rooms[sample.room_index]
-        kind = opening_kinds(sample.plan, sample, turn.heading, self.config.profile_columns)
+        kind, edges = seen_openings(sample.plan, sample, turn.heading, self.config.profile_columns)
         type_code = ROOM_TYPES.index(room.type)
         # Code 0 stands for rooms without a type in the plan.
-        return {"opening_kind": turn.profile(kind), "room_type": np.array(type_code or UNKNOWN)}
+        return {
+            "opening_kind": turn.profile(kind),
+            "edges": turn.profile(edges).T,
+            "room_type": np.array(type_code or UNKNOWN),
+        }
 
     def _height_error_m(self, rng: np.random.Generator) -> float:
         spread = self.config.image.camera_height_error_m
         return float(np.clip(rng.normal(0.0, spread), -3.0 * spread, 3.0 * spread)) if spread else 0.0
 
 
-def opening_kinds(
+def seen_openings(
     plan: FloorPlan, camera: Camera | Shot | SphereSample, heading: float, columns: int
-) -> Int[np.ndarray, "{columns}"]:
-    """Return the code seen at each azimuth at eye height; walls are `UNKNOWN` in a plan that may lack openings."""
+) -> tuple[Int[np.ndarray, "{columns}"], Float[np.ndarray, "2 {columns}"]]:
+    """Return the code seen at each azimuth at eye height, and the elevations (radians) of both edges of openings.
+
+    Walls are `UNKNOWN` in a plan that may lack openings; elevations are NaN at walls and where heights are unknown.
+    """
     view = render_layout(
         camera.position_m[None].astype(np.float32),
         np.array([heading], np.float32),
@@ -233,7 +241,10 @@ def opening_kinds(
     kind = view.kind[0].astype(np.int64)
     if not plan.opening_kinds.issuperset(OPENING_CLASSES[1:]):
         kind[kind == WALL_CODE] = UNKNOWN
-    return kind
+    height_m = np.stack([view.sill_m[0], view.head_m[0]])
+    is_known = np.isfinite(height_m) & (view.kind[0] != WALL_CODE)
+    edges = np.arctan2(np.where(is_known, height_m, np.nan) - camera.camera_height_m, view.distance_m[0])
+    return kind, edges.astype(np.float32)
 
 
 def _batches(

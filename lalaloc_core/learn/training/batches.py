@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
@@ -135,17 +135,20 @@ class Photographs:
     """Photographs with targets by column.
 
     `openings` are probabilities of door, window and passage; passages are NaN where the teacher cannot tell them from
-    walls. `log_distance` is that of the walls in camera heights; NaN where they are not visible.
+    walls. `log_distance` is that of the walls in camera heights; NaN where they are not visible. `room_type` has codes
+    of `conventions.ROOM_TYPES`, -1 where unknown, and `weight` shares in which photographs are drawn.
     """
 
     images: UInt8[Tensor, "n h w 3"]
     openings: Float[Tensor, "n c 3"]
     log_distance: Float[Tensor, "n c"]
+    room_type: Int[Tensor, "n"]
+    weight: Float[Tensor, "n"]
 
     def draw(self, count: int, columns: int, generator: torch.Generator) -> Photographs:
         """Draw photographs, each randomly rotated, stretched and mirrored, with targets of `columns` columns."""
         width = self.images.shape[2]
-        chosen = torch.randint(len(self.images), (count,), generator=generator)
+        chosen = torch.multinomial(self.weight, count, replacement=True, generator=generator)
         shifts = torch.randint(width, (count,), generator=generator)
         mirrored = torch.randint(2, (count,), generator=generator).bool()
         low, high = np.log(_MIN_STRETCH), np.log(_MAX_STRETCH)
@@ -163,4 +166,6 @@ class Photographs:
             images,
             openings.unflatten(1, (columns, -1)).mean(dim=2),
             log_distance.unflatten(1, (columns, -1)).nanmean(dim=2),
+            self.room_type[chosen],
+            self.weight[chosen],
         )

@@ -17,7 +17,14 @@ from lalaloc_core.render.sampling import TripletSampling
 Architecture = Literal["ring", "trunk", "paper"]
 Turns = Literal["any", "quarters", "none"]
 _MAX_RAYS = 8
-_TRUNK_ONLY = ("pretrained", "opening_weight", "ceiling_weight", "room_type_weight", "photograph_weight")
+_TRUNK_ONLY = (
+    "pretrained",
+    "opening_weight",
+    "edges_weight",
+    "ceiling_weight",
+    "room_type_weight",
+    "photograph_weight",
+)
 # Limit of the spread; errors are clipped at three times the spread, and cameras stand about 1 m high or more.
 _MAX_HEIGHT_ERROR_M = 0.2
 
@@ -122,11 +129,14 @@ class ImageStageConfig:
         opening_weight: weight of the cross entropy of the opening class at each azimuth (architecture `trunk`, like
             all following settings but the last two).
         opening_balance: 0 gives all azimuths the same weight in it, 1 all classes regardless of their share.
+        edges_weight: weight of the Laplace likelihood of the elevations of openings' edges, and of the cross entropy of
+            seeing the wall at each azimuth.
         ceiling_weight: weight of the Laplace likelihood of the ceiling height.
         room_type_weight: weight of the cross entropy of the room type.
         photograph_weight: weight of a teacher's openings on unlabelled photographs.
         photograph_profile_weight: weight of the teacher's walls on them.
         photographs_per_batch: photographs added to each batch.
+        photograph_shares: share of them from each folder; empty draws all photographs alike.
         style_mixing: share of a batch whose early features take on another picture's style, every other time that of a
             photograph; needs photographs.
         hidden_share: share of the pictures that show only a part of the horizon, 0.15 to 0.6 of the circle, so that
@@ -154,11 +164,13 @@ class ImageStageConfig:
     pretrained: bool = False
     opening_weight: float = 0.0
     opening_balance: float = 0.5
+    edges_weight: float = 0.0
     ceiling_weight: float = 0.0
     room_type_weight: float = 0.0
     photograph_weight: float = 0.0
     photograph_profile_weight: float = 0.0
     photographs_per_batch: int = 4
+    photograph_shares: tuple[float, ...] = ()
     style_mixing: float = 0.0
     hidden_share: float = 0.0
     ema_decay: float = 0.0

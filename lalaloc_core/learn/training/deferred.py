@@ -100,13 +100,13 @@ class DeferredRenderer:
         return len(self._images)
 
     def render_batches(self, batches: Iterable[DeferredBatch]) -> Iterator[Batch]:
-        """Yield each batch with `image` (b, h, w, 3) uint8 on the device."""
+        """Yield each batch with `image` (b, h, w, 4) uint8 on the device; the last channel tells walls."""
         for batch in batches:
             yield self._render(batch)
 
     def _render(self, batch: DeferredBatch) -> Batch:
         if batch.scenes:
-            images = self._renderer.render_scenes(list(batch.scenes.values()))
+            images = self._renderer.render_scenes(list(batch.scenes.values()), walls=True)
             self._images.update(zip(batch.scenes, images, strict=True))
         shown = torch.stack([self._images[number] for number in batch.number])
         for number in batch.evicted:
@@ -115,8 +115,8 @@ class DeferredRenderer:
 
 
 def rotate_images(
-    images: UInt8[Tensor, "b h w 3"], shift: Int[Tensor, "b"], mirrored: Bool[Tensor, "b"]
-) -> UInt8[Tensor, "b h w 3"]:
+    images: UInt8[Tensor, "b h w c"], shift: Int[Tensor, "b"], mirrored: Bool[Tensor, "b"]
+) -> UInt8[Tensor, "b h w c"]:
     """Roll each sphere by `shift` columns to the right, then mirror it if asked, like `Rotation.picture`."""
     width = images.shape[2]
     column = torch.arange(width, device=images.device)

@@ -19,6 +19,7 @@ from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
     TrainingStage,
     build_image_encoder,
+    edges_loss,
     photograph_loss,
     sample_styles,
     sphere_batches,
@@ -65,6 +66,9 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         """Return the weighted losses of a batch by name."""
         layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
         settings, terms = self.settings, {}
+        # Renderings have walls as a fourth channel.
+        walls = batch["image"][..., 3] if batch["image"].shape[3] == 4 else None
+        batch = batch | {"image": batch["image"][..., :3]}
         if isinstance(self.teacher, RingLayoutEncoder):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
@@ -77,6 +81,8 @@ class ImageStage(TrainingStage[ImageStageConfig]):
             known = seen.repeat_interleave(self.config.profile_columns // seen.shape[1], dim=1)
             if features.structure is not None:
                 terms |= self._structure_losses(features.structure, batch, known)
+                if settings.edges_weight:
+                    terms["edges"] = edges_loss(settings, features.structure, batch["edges"], walls, known)
             terms |= photograph_terms
             if settings.ring_weight:
                 terms["ring"] = settings.ring_weight * losses.ring_distillation(seen_ring, ring)

@@ -172,5 +172,5 @@ class EndToEndStage(TrainingStage[ImageStageConfig]):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name."""
         terms, latent = self.objective(anchors_with_neighbours(batch))
-        distance = losses.l2(self.encoder(batch["image"]).float(), latent[:, 0].detach())
+        distance = losses.l2(self.encoder(batch["image"][..., :3]).float(), latent[:, 0].detach())
         return {**terms, "l2": self.settings.l2_weight * distance}

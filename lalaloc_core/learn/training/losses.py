@@ -8,12 +8,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, WALL_CODE
-from lalaloc_core.nets.image_features import WallModes
+from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 
 # Keeps log and its gradient finite when two latents coincide.
 _MIN_DISTANCE = 1e-4
 # Limits the weight of very rare classes.
 _MIN_SHARE = 1e-3
+# Rows of a wall from which it is seen in a column.
+_MIN_WALL_ROWS = 3
 # Lower bound of the ceiling's height above the camera (m).
 _MIN_ABOVE_M = 0.05
 
@@ -109,9 +111,30 @@ def opening_prior(share: Float[Tensor, "c"], balance: float) -> Float[Tensor, "c
     return weighted / weighted.sum()
 
 
+def opening_edges(structure: StructureFeatures, edges: Float[Tensor, "b w 2"], seen: Bool[Tensor, "b w"]) -> Tensor:
+    """Return the negative log likelihood of the elevations of openings' edges, where known (not NaN) and seen."""
+    known = seen[..., None] & edges.isfinite()
+    error = (structure.edges - edges.nan_to_num()).abs()
+    loss = error * torch.exp(-structure.edges_log_scale) + structure.edges_log_scale
+    return (loss * known).sum() / known.sum().clamp_min(1)
+
+
+def wall_seen(logit: Float[Tensor, "b w"], walls: Float[Tensor, "b h v"], seen: Bool[Tensor, "b w"]) -> Tensor:
+    """Return the cross entropy of seeing the wall at each azimuth that is seen; `walls` is 1 at pixels of walls."""
+    is_seen = (walls.sum(dim=1) >= _MIN_WALL_ROWS).float()
+    target = functional.adaptive_max_pool1d(is_seen, logit.shape[1])
+    return functional.binary_cross_entropy_with_logits(logit[seen], target[seen])
+
+
 def room_type(logits: Float[Tensor, "b c"], kind: Int[Tensor, "b"]) -> Tensor:
     """Return the cross entropy of room types; negative kinds are unknown and ignored."""
     return _cross_entropy(logits, kind, None)
+
+
+def objects(logits: Float[Tensor, "b n"], taught: Float[Tensor, "b k"], kind: Int[Tensor, "b"]) -> Tensor:
+    """Return the cross entropies of household objects, to a teacher's, and of the types of rooms after them."""
+    count = taught.shape[1]
+    return functional.binary_cross_entropy_with_logits(logits[:, :count], taught) + room_type(logits[:, count:], kind)
 
 
 def _cross_entropy(logits: Float[Tensor, "n c"], kind: Int[Tensor, "n"], weight: Tensor | None) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lalaloc_core.bundle import MANIFEST_NAME, Bundle
-from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI
 from lalaloc_core.errors import ConfigError, DatasetError, InvalidPhotographError
 from lalaloc_core.learn.data.annotated import annotation_files
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
+from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated, room_names
+from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Photographs
 from lalaloc_core.learn.training.warm_start import bundle_weights
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
@@ -30,36 +32,49 @@ from lalaloc_core.photograph.spheres import read_sphere
 _TURNS = 8
 
 
-def load_photographs(folders: Sequence[Path], teachers: Sequence[Path], height: int, width: int) -> Photographs:
+def load_photographs(
+    folders: Sequence[Path], teachers: Sequence[Path], height: int, width: int, shares: Sequence[float] = ()
+) -> Photographs:
     """Read the spheres (`*.jpg`, `*.jpeg`, `*.png`) of folders with their targets.
 
-    Spheres with an annotation beside them use that; the others need teachers: a TensorFlow Lite segmenter, a bundle
-    whose encoder of spheres reads them, or both. With both the walls and passages are the encoder's, and doors and
-    windows the mean of the two.
+    Spheres with an annotation in one of the folders use that, and of path-traced rooms those that train; the others
+    need teachers: a TensorFlow Lite segmenter, a bundle whose encoder of spheres reads them, or both. With both the
+    walls and passages are the encoder's, and doors and windows the mean of the two. `shares` are those of each folder
+    in what is drawn; empty draws all alike.
     """
+    if shares and len(shares) != len(folders):
+        raise ConfigError(f"image.photograph_shares has {len(shares)} values for {len(folders)} folders of photographs")
+    exact = {folder: _annotated_in(folder) for folder in folders}
+    known = {photograph.photograph.path.name for photographs in exact.values() for photograph in photographs}
     parts = []
-    for folder in folders:
-        annotated = {
-            photograph.photograph.path.name: photograph for photograph in map(read_annotation, annotation_files(folder))
-        }
+    for number, (folder, photographs) in enumerate(exact.items()):
+        read = [_annotated(photographs, height, width)] if photographs else []
         paths = sorted(path for pattern in ("*.jpg", "*.jpeg", "*.png") for path in folder.glob(pattern))
         if not paths:
             raise DatasetError("no photographs (*.jpg, *.jpeg, *.png)", path=folder)
-        exact = [annotated[path.name] for path in paths if path.name in annotated]
-        if exact:
-            parts.append(_annotated(exact, folder, height, width))
-        if len(exact) < len(paths):
-            others = [path for path in paths if path.name not in annotated]
-            parts.append(_taught(others, teachers, height, width))
+        # A photograph that another folder annotates needs no teacher; rooms that validate have none.
+        others = [] if room_names(folder) else [path for path in paths if path.name not in known]
+        read += [_taught(others, teachers, height, width)] if others else []
+        share = shares[number] / sum(len(part.weight) for part in read) if shares else 1.0
+        parts += [replace(part, weight=part.weight * share) for part in read]
     return Photographs(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Photographs)))
 
 
-def _annotated(photographs: Sequence[AnnotatedPhotograph], folder: Path, height: int, width: int) -> Photographs:
-    images = _read([folder / photograph.photograph.path.name for photograph in photographs], height, width)
+def _annotated_in(folder: Path) -> list[AnnotatedPhotograph]:
+    if room_names(folder):
+        return annotated(PosedSpheres(folder), "train")
+    return [read_annotation(path) for path in annotation_files(folder)]
+
+
+def _annotated(photographs: Sequence[AnnotatedPhotograph], height: int, width: int) -> Photographs:
+    images = _read([photograph.photograph.path for photograph in photographs], height, width)
     kinds = torch.from_numpy(np.stack([photograph.classes(width) for photograph in photographs]))
     distance = np.stack([photograph.profile_m(0, width) for photograph in photographs]) / CAMERA_HEIGHT_M
     openings = torch.nn.functional.one_hot(kinds, len(OPENING_CLASSES))[..., 1:].float()
-    return Photographs(images, openings, torch.from_numpy(np.log(distance)).float())
+    # Code 0 stands for rooms without a type.
+    codes = [ROOM_TYPES.index(photograph.outlines[0].room_type) or UNKNOWN for photograph in photographs]
+    weight = torch.ones(len(images))
+    return Photographs(images, openings, torch.from_numpy(np.log(distance)).float(), torch.tensor(codes), weight)
 
 
 def _taught(paths: Sequence[Path], teachers: Sequence[Path], height: int, width: int) -> Photographs:
@@ -86,7 +101,8 @@ def _taught(paths: Sequence[Path], teachers: Sequence[Path], height: int, width:
     if len(targets) == 2:
         shared = 0.5 * (targets[0][0][..., :2] + openings[..., :2])
         openings = torch.cat([shared, openings[..., 2:]], dim=2)
-    return Photographs(_read(paths, height, width), openings, log_distance)
+    images, codes = _read(paths, height, width), torch.full((len(paths),), UNKNOWN)
+    return Photographs(images, openings, log_distance, codes, torch.ones(len(paths)))
 
 
 @torch.no_grad()

@@ -6,6 +6,7 @@ import dataclasses
 
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.nets.layout_network import RingConfig
+from lalaloc_core.nets.object_network import OBJECTS
 from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
 from lalaloc_core.nets.trunk import TrunkConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig
@@ -103,6 +104,7 @@ PRESETS: dict[str, TrainConfig] = {
         name="trunk",
         architecture="trunk",
         trunk=TrunkEncoderConfig(modes=2),
+        view=ViewEncoderConfig(objects=len(OBJECTS)),
         layout=_RING_LAYOUT,
         image=ImageStageConfig(
             photometric=1.0,
@@ -114,6 +116,7 @@ PRESETS: dict[str, TrainConfig] = {
             ring_weight=0.5,
             profile_weight=1.0,
             opening_weight=1.0,
+            edges_weight=0.3,
             ceiling_weight=0.2,
             room_type_weight=0.1,
             photograph_weight=0.3,
@@ -133,6 +136,7 @@ PRESETS: dict[str, TrainConfig] = {
             _TINY.image,
             optics=1.0,
             opening_weight=1.0,
+            edges_weight=0.3,
             ceiling_weight=0.2,
             room_type_weight=0.1,
             photograph_weight=0.3,

@@ -59,7 +59,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SphereSample:
-    """A sphere and its pose; `image` is (h, w, 3) RGB bytes, or a scene to be rendered later."""
+    """A sphere and its pose; `image` is (h, w, 3) RGB bytes, (h, w, 4) with walls, or a scene to be rendered later."""
 
     plan: FloorPlan
     position_m: Float[np.ndarray, "2"]
@@ -147,7 +147,7 @@ class GeneratedSource:
             images = [DeferredScene(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
         else:
             renderer = self._renderers.renderer(height, width, stage.supersample, self.window)
-            images = list(renderer.render_scenes(scenes).numpy())
+            images = list(renderer.render_scenes(scenes, walls=True).numpy())
         return [_sample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
 
     def renderer(self, device: torch.device, height: int, width: int) -> SphereRenderer:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 
 from lalaloc_core.errors import ConfigError
@@ -18,7 +18,7 @@ from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConf
 from lalaloc_core.learn.training.deferred import DeferredRenderer
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork
-from lalaloc_core.nets.image_features import WallModes
+from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
@@ -118,6 +118,20 @@ def photograph_loss(
     if settings.shape_weight:
         loss += settings.shape_weight * losses.wall_shape(walls, target, known)
     return loss
+
+
+def edges_loss(
+    settings: ImageStageConfig,
+    structure: StructureFeatures,
+    edges: Float[Tensor, "b w 2"],
+    walls: Shaped[Tensor, "b h v"] | None,
+    seen: Bool[Tensor, "b w"],
+) -> Tensor:
+    """Return the weighted loss of openings' edges, and of seeing walls where `walls` tells them (above 0)."""
+    loss = losses.opening_edges(structure, edges, seen)
+    if walls is not None:
+        loss = loss + losses.wall_seen(structure.wall_seen_logit, (walls > 0).float(), seen)
+    return settings.edges_weight * loss
 
 
 def sample_styles(

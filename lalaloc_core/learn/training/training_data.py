@@ -62,7 +62,8 @@ class TrainingData:
             raise ConfigError(
                 f"architecture '{config.architecture}' predicts no openings; --photographs needs architecture 'trunk'"
             )
-        return load_photographs(self.photographs, self.teachers, *(size or config.image_size))
+        size, shares = size or config.image_size, config.image.photograph_shares
+        return load_photographs(self.photographs, self.teachers, *size, shares)
 
     def validation(self, config: TrainConfig) -> list[Scene]:
         """Load the validation scenes; empty if the data set has none."""

@@ -23,7 +23,7 @@ from lalaloc_core.files import replacing
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.learn.metrics import Accuracy, count_classes, score_classes
 from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.batch_streams import opening_kinds
+from lalaloc_core.learn.training.batch_streams import seen_openings
 from lalaloc_core.learn.training.batches import Rotation, sample_rotation
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.nets.image_features import ImageFeatures
@@ -202,7 +202,7 @@ class ImageValidation:
         logits = features.structure.opening_logits
         prior = losses.opening_prior(encoder.opening_share, self.balance)
         predicted = (torch.log_softmax(logits, dim=2) - prior.log()).argmax(dim=2).cpu().numpy()
-        kinds = [opening_kinds(of.scene.plan, of.camera, of.turn.heading, self.columns) for of in queries]
+        kinds = [seen_openings(of.scene.plan, of.camera, of.turn.heading, self.columns)[0] for of in queries]
         return count_classes(np.stack(kinds), predicted, logits.shape[2])
 
 

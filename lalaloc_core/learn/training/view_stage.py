@@ -19,12 +19,13 @@ from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import Window
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
+from lalaloc_core.learn.training.batch_streams import UNKNOWN, seen_openings
 from lalaloc_core.learn.training.batches import Batch, Photographs
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, photograph_loss, sample_styles, sphere_batches
+from lalaloc_core.learn.training.stages import TrainingStage, edges_loss, photograph_loss, sample_styles, sphere_batches
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
+from lalaloc_core.nets.object_network import ObjectNetwork
 from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
 from lalaloc_core.render.sweep import profiles_at
 
@@ -51,6 +52,10 @@ class ViewStage(TrainingStage[ImageStageConfig]):
             for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
         )
         self._generator = torch.Generator()
+        # Teacher of household objects in photographs.
+        self._objects = None
+        if photographs is not None and config.view.objects:
+            self._objects = ObjectNetwork().eval().requires_grad_(False)
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield batches of level pictures of the patch's size."""
@@ -63,7 +68,8 @@ class ViewStage(TrainingStage[ImageStageConfig]):
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name; azimuths that are not seen do not count."""
-        settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
+        settings, height = self.settings, batch["camera_height_m"]
+        image, walls = batch["image"][..., :3], batch["image"][..., 3]
         count = settings.photographs_per_batch if self.photographs is not None else 0
         photographs, styles = None, None
         if self.photographs is not None:
@@ -71,10 +77,14 @@ class ViewStage(TrainingStage[ImageStageConfig]):
             styles = sample_styles(settings.style_mixing, len(image), count, torch.default_generator, image.device)
             cut = self._cut(photographs.images).to(image.device)
             image, height = torch.cat([image, cut]), torch.cat([height, height.new_ones(count)])
-        features = self.encoder(self._shown(image), height, styles)
+        shown = self._shown(image)
+        features = self.encoder(shown, height, styles)
         seen = features.seen >= MIN_SEEN
         rendered = slice(0, len(image) - count)
         terms = self._rendered_losses(features, seen, rendered, batch)
+        if settings.edges_weight:
+            edges, visible = batch["edges"][:, middle(self.config)], walls * (shown[rendered, ..., 3] > 0.0)
+            terms["edges"] = edges_loss(settings, features.structure.rows(rendered), edges, visible, seen[rendered])
         if photographs is not None:
             rows, part = slice(len(image) - count, None), middle(self.config)
             openings, log_distance = (
@@ -84,6 +94,10 @@ class ViewStage(TrainingStage[ImageStageConfig]):
             terms["photographs"] = photograph_loss(
                 settings, features.walls.rows(rows), logits, seen[rows], openings, log_distance
             )
+            if self._objects is not None and features.objects is not None:
+                taught, _ = self._objects.to(shown.device)(shown[rows, ..., :3])
+                codes = photographs.room_type.to(taught.device)
+                terms["objects"] = settings.room_type_weight * losses.objects(features.objects[rows], taught, codes)
         return terms
 
     def _rendered_losses(
@@ -162,7 +176,7 @@ class ViewValidation:
             for shot in shots:
                 pose = shot.position_m[None], np.array([shot.room_index]), np.array([shot.heading])
                 profiles.append(profiles_at(home.plan, *pose, config.profile_columns, np.float32)[0])
-                kinds.append(opening_kinds(home.plan, shot, shot.heading, config.profile_columns))
+                kinds.append(seen_openings(home.plan, shot, shot.heading, config.profile_columns)[0])
                 heights.append(shot.camera_height_m)
         part = middle(config)
         self._images = torch.cat(images)

@@ -116,6 +116,15 @@ def training_totals(checkpoint: Checkpoint) -> dict[str, float]:
     return totals
 
 
+def halved(checkpoint: Checkpoint) -> Checkpoint:
+    """Return a checkpoint with its inference weights alone, in half precision, to start other runs from."""
+    weights = {
+        module: {name: value.half() if value.is_floating_point() else value for name, value in state.items()}
+        for module, state in checkpoint.inference_weights.items()
+    }
+    return dataclasses.replace(checkpoint, weights=weights, averaged={}, optimiser={})
+
+
 def sphere_count(checkpoint: Checkpoint) -> int:
     """Return the number of distinct spheres used by a stage."""
     image = checkpoint.config.image

@@ -88,15 +88,24 @@ class SphereRenderer:
         return self.render_scenes([build_scene(shot, self._materials) for shot in shots])
 
     @torch.no_grad()
-    def render_scenes(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
-        """Photograph scenes that were built elsewhere with the same materials, such as in worker processes."""
-        step = self._batch_size
-        return torch.cat([self._render_batch(scenes[k : k + step]) for k in range(0, len(scenes), step)])
+    def render_scenes(self, scenes: Sequence[RenderScene], *, walls: bool = False) -> UInt8[Tensor, "b h w c"]:
+        """Photograph scenes that were built elsewhere with the same materials, such as in worker processes.
 
-    def _render_batch(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
+        With `walls` a fourth channel is 255 where a wall, or an opening in it, is seen and not furniture before it.
+        """
+        step = self._batch_size
+        return torch.cat([self._render_batch(scenes[k : k + step], walls) for k in range(0, len(scenes), step)])
+
+    def _render_batch(self, scenes: Sequence[RenderScene], walls: bool) -> UInt8[Tensor, "b h w c"]:
         batch = stack_scenes(scenes, self._device)
         direction = self._directions(batch)
-        return self._photograph(batch, trace(batch, direction, self._slope), direction)
+        hits = trace(batch, direction, self._slope)
+        picture = self._photograph(batch, hits, direction)
+        if not walls:
+            return picture
+        is_wall = (~hits.furniture & (hits.normal[..., 2] == 0.0)).float().transpose(1, 2)
+        seen = torch.nn.functional.avg_pool2d(is_wall[:, None], self._rays_per_pixel)[:, 0] >= 0.5
+        return torch.cat([picture, 255 * seen[..., None].to(torch.uint8)], dim=3)
 
     @torch.no_grad()
     def render_moods(

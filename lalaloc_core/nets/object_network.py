@@ -5,8 +5,6 @@ The shares are common knowledge, written down before any result was seen; none i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -21,9 +19,9 @@ _HEAD_CHANNELS, _NORM_EPSILON = 1280, 1e-3
 
 
 class ObjectNetwork(nn.Module):
-    """EfficientNet-Lite0 with its pretrained classifier, for some of the 1,000 ImageNet classes."""
+    """EfficientNet-Lite0 with its pretrained classifier, for those of the 1,000 ImageNet classes that are `OBJECTS`."""
 
-    def __init__(self, classes: Sequence[int]) -> None:
+    def __init__(self) -> None:
         super().__init__()
         self._trunk = Trunk(TrunkConfig(), circular=False)
         load_pretrained(self._trunk)
@@ -35,7 +33,7 @@ class ObjectNetwork(nn.Module):
         self._head.bias = nn.Parameter(weights["_bn1.bias"] - weights["_bn1.running_mean"] * scale)
         self._classifier = nn.Linear(_HEAD_CHANNELS, outputs)
         self._classifier.weight.data, self._classifier.bias.data = weights["_fc.weight"], weights["_fc.bias"]
-        self.register_buffer("_classes", torch.tensor(classes), persistent=False)
+        self.register_buffer("_classes", torch.tensor([number for _, number, _ in OBJECTS]), persistent=False)
         self._classes: Tensor
         self.register_buffer("_mean", 255.0 * torch.tensor(IMAGE_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("_std", 255.0 * torch.tensor(IMAGE_STD).view(3, 1, 1), persistent=False)
