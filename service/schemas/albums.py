@@ -133,7 +133,7 @@ class PinAnswer(ResponseModel):
 
 
 class PhotographFacts(CoreAnswer, ReadView, frozen=True):
-    """What is kept about a photograph beside its features. Positions and names in its metadata are not kept."""
+    """Facts about a photograph that are kept beside its features. Positions and names in its metadata are not kept."""
 
     taken_at: str | None = Field(description="Time by the camera's clock, without a time zone.")
     make: str | None = Field(description="Maker of the camera.")
@@ -201,7 +201,7 @@ class SharedCameraAnswer(ResponseModel):
 
 
 class AlbumSolution(ResponseModel):
-    """What all photographs of an album have in common."""
+    """Properties that all photographs of an album have in common."""
 
     pins: PinCounts
     cameras: list[SharedCameraAnswer]
