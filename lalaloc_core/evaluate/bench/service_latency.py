@@ -37,10 +37,15 @@ def bench_service(setting: Setting) -> dict[str, Any]:
     shots, images = spheres_of_home(_REQUESTS, (512, 1024), setting.textures)
     plan, pictures = shots[0].home.plan, [encode_jpeg(image) for image in images]
     heights = [{"camera_height_m": f"{plan.camera_height_m}"}] * _REQUESTS
-    known = [{**heights[0], "heading_deg": f"{np.degrees(shot.heading):.3f}"} for shot in shots]
+    # Stated, because a plain sphere of procedural materials can look like none.
+    spheres = [{**height, "projection": "equirectangular"} for height in heights]
+    known = [
+        {**sphere, "heading_deg": f"{np.degrees(shot.heading):.3f}"}
+        for sphere, shot in zip(spheres, shots, strict=True)
+    ]
     rows = {
         "known_heading": list(zip(pictures, known, strict=True)),
-        "unknown_heading": list(zip(pictures, heights, strict=True)),
+        "unknown_heading": list(zip(pictures, spheres, strict=True)),
     }
     rows["without_openings"] = rows["unknown_heading"]
     if setting.bundle.manifest.view is not None:
