@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import logging
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -85,6 +87,8 @@ def _without_failures(items: Iterable[Any]) -> Iterator[Any]:
 
 def _single_thread(_: int) -> None:
     torch.set_num_threads(1)
+    # Threads of libraries that are destroyed at the end of a process can abort it.
+    atexit.register(os._exit, 0)
 
 
 _QUARTER = TWO_PI / 4.0
