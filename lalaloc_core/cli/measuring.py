@@ -49,13 +49,13 @@ class Photographs:
 
 @dataclass(frozen=True, kw_only=True)
 class Short:
-    """Measure walls and openings of a bundle, or of a run that is kept, on pictures by others."""
+    """Measure walls and openings of a bundle, or of a run, on pictures by others."""
 
     real: Annotated[Path, "folder with `annotated` and `rendered_house`"]
     rooms: Annotated[Path, "folder of path-traced rooms"]
     bundle: BundleFolder = field(default_factory=default_bundle)
-    run_: Annotated[Path | None, "run whose encoders replace those of the bundle; its weights are kept in `out`"] = None
-    out: Annotated[Path, "folder of kept weights and runs.csv"] = Path("models/training")
+    run_: Annotated[Path | None, "run whose last weights replace those of the bundle"] = None
+    out: Annotated[Path | None, "folder to keep the run's weights in, with a line of figures in runs.csv"] = None
     note: Annotated[dict[str, str], "note for the line in runs.csv as KEY=VALUE"] = field(default_factory=dict)
 
 
@@ -114,14 +114,13 @@ def _photographs(arguments: Photographs) -> None:
 
 
 def _short(arguments: Short) -> None:
-    from lalaloc_core.bundle import Bundle
-    from lalaloc_core.evaluate.bench.short_table import keep_run, short_table
+    from lalaloc_core.evaluate.bench.short_table import keep_run, measure_run
 
-    real, rooms, bundle = arguments.real, arguments.rooms, arguments.bundle
-    if arguments.run_ is None:
-        print_json(short_table(Bundle.open(bundle), real, rooms), _DECIMALS)
-    else:
-        print_json(keep_run(arguments.run_, bundle, real, rooms, arguments.out, arguments.note), _DECIMALS)
+    run, bundle = arguments.run_, arguments.bundle
+    figures = measure_run(run, bundle, arguments.real, arguments.rooms)
+    if arguments.out is not None:
+        keep_run(run, bundle, figures, arguments.out, arguments.note)
+    print_json(figures, _DECIMALS)
 
 
 def _reproduce(arguments: Reproduce) -> None:

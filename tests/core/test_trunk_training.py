@@ -401,7 +401,11 @@ class TestWarmStart:
         start = load_warm_start(default_bundle(), "image", trunk)
         start.load_into({"image_encoder": encoder})
         trained = start.checkpoint.weights["image_encoder"]
-        loaded = {key: value for key, value in encoder.state_dict().items() if not key.startswith(("to_profile.", "to_edges."))}
+        loaded = {
+            key: value
+            for key, value in encoder.state_dict().items()
+            if not key.startswith(("to_profile.", "to_edges."))
+        }
         assert all(torch.equal(value, trained[key]) for key, value in loaded.items())
 
     @pytest.mark.slow

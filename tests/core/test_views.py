@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from lalaloc_core.bundle import Bundle, MatchingWeights
-from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.conventions import ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
@@ -23,6 +23,7 @@ from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, W
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
@@ -140,6 +141,19 @@ class TestEncoder:
         torch.testing.assert_close(first.walls.log_profile, second.walls.log_profile)
         columns = 4 * encoder.columns_per_sector
         torch.testing.assert_close(first.seen[0], (40 / 64 * columns - torch.arange(columns)).clamp(0, 1))
+
+    def test_objects_are_learnt_on_a_trunk_that_stays(self) -> None:
+        torch.manual_seed(0)
+        encoder = ViewNetwork(dataclasses.replace(TINY.view, objects=3), TINY.ring)
+        # Earlier weights have no objects.
+        encoder.load_state_dict(ViewNetwork(TINY.view, TINY.ring).state_dict())
+        image = torch.randint(0, 256, (2, 64, 64, 4), dtype=torch.uint8)
+        found = encoder(image, torch.ones(2)).objects
+        assert found is not None
+        assert found.shape == (2, 3 + len(ROOM_TYPES))
+        losses.objects(found, torch.tensor([[0.9, 0.1, 0.0]] * 2), torch.tensor([3, UNKNOWN])).backward()
+        parts = {name.split(".")[0] for name, p in encoder.named_parameters() if p.grad is not None and p.grad.any()}
+        assert parts == {"to_objects"}
 
     def test_it_starts_from_the_encoder_of_spheres(self) -> None:
         torch.manual_seed(0)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.runs.photograph_reading import read_photographs, read_views
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import AnnotatedPhotograph
@@ -72,39 +71,42 @@ def _rows(name: str, measured: AzimuthSummary) -> dict[str, float]:
     }
 
 
-def keep_run(run: Path, bundle: Path, real: Path, rooms: Path, out: Path, notes: Mapping[str, str]) -> dict[str, float]:
-    """Keep the weights of a run's last checkpoints, add a line to the table of runs, and return its figures.
-
-    `bundle` provides the networks that the run does not train.
-    """
-    checkpoints = [
-        Checkpoint.load(run / f"{stage}.pt") for stage in ("image", "view") if (run / f"{stage}.pt").exists()
-    ]
-    if not checkpoints:
-        raise InvalidInputError(f"'{run}' has no checkpoint of stage 'image' or 'view'")
+def measure_run(run: Path | None, bundle: Path, real: Path, rooms: Path) -> dict[str, float]:
+    """Return the short table of a bundle, with the last weights of a run in place of the encoders that it trains."""
+    if run is None:
+        return short_table(Bundle.open(bundle), real, rooms)
     with tempfile.TemporaryDirectory(prefix="lalaloc-short-") as scratch:
-        made = export_into(bundle, run, Path(scratch), version="0", last=True)
-        figures = short_table(made, real, rooms)
+        return short_table(export_into(bundle, run, Path(scratch), version="0", last=True), real, rooms)
+
+
+def keep_run(run: Path | None, bundle: Path, figures: Mapping[str, float], out: Path, notes: Mapping[str, str]) -> None:
+    """Keep the last weights of a run, and add a line to the table of runs; without a run the line is of the bundle."""
+    shown = {**notes, **{name: f"{value:.4f}" for name, value in figures.items()}}
+    if run is None:
+        return _append(out / RUNS_FILE, [{"run": f"bundle {Bundle.open(bundle).manifest.version}", **shown}])
     lines = []
-    for checkpoint in checkpoints:
-        halved(checkpoint).save(out / f"{checkpoint.stage}.pt")
-        totals = {
+    for path in filter(Path.exists, (run / f"{stage}.pt" for stage in ("image", "view"))):
+        checkpoint = Checkpoint.load(path)
+        halved(checkpoint).save(out / path.name)
+        spent = {
             "hours": round(checkpoint.seconds / 3600.0, 2),
             "steps": checkpoint.step,
             **training_totals(checkpoint),
         }
-        lines.append({"run": run.resolve().name, "stage": checkpoint.stage, **totals, **notes})
-    _append(out / RUNS_FILE, [line | {name: f"{value:.4f}" for name, value in figures.items()} for line in lines])
-    return figures
+        lines.append({"run": run.resolve().name, "stage": checkpoint.stage, **spent, **shown})
+    return _append(out / RUNS_FILE, lines)
 
 
 def _append(path: Path, lines: Sequence[Mapping[str, object]]) -> None:
-    """Add lines to a table; new columns come last."""
+    """Add lines to a table; figures come last."""
     before: list[dict[str, str]] = []
+    path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
         with path.open(newline="", encoding="utf-8") as file:
             before = list(csv.DictReader(file))
-    columns = list(dict.fromkeys(name for line in (*before, *lines) for name in line))
+    known = dict.fromkeys(("run", "stage", "hours", "steps", *(name for line in (*before, *lines) for name in line)))
+    # Figures are named "pictures: measure".
+    columns = sorted(known, key=lambda name: ": " in name)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
         writer.writeheader()
