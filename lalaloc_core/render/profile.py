@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from array_api_compat import array_namespace, device
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from lalaloc_core.conventions import DOOR_CODE, PASSAGE_CODE, Array, column_azimuths, row_elevations, unit_rays
 from lalaloc_core.floorplan import PlanGeometry
@@ -257,11 +257,13 @@ def _opening_met(
     return xp.max(xp.where(met, number, xp.full_like(number, -1)), axis=2)
 
 
-def _at_opening(values: Array, room_index: Int[Array, "b"], opening: Int[Array, "b w"]) -> Int[Array, "b w"]:
+def _at_opening(
+    values: Shaped[Array, "r m"], room_index: Int[Array, "b"], opening: Int[Array, "b w"]
+) -> Shaped[Array, "b w"]:
     """Return the value of the opening that each ray meets, 0 (wall) for none."""
     xp = array_namespace(opening)
     if values.shape[1] == 0:
-        return xp.zeros_like(opening)
+        return xp.zeros(opening.shape, dtype=values.dtype, device=device(values))
     found = values[room_index[:, None], xp.where(opening < 0, xp.zeros_like(opening), opening)]
     return xp.where(opening < 0, xp.zeros_like(found), found)
 

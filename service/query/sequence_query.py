@@ -28,8 +28,8 @@ class SequenceSearch:
         form, context, executor = query.form, query.context, self._parts.executor
         site = await self._parts.grounds.site(where, form)
         photographs, angles, film = await self._decode(query)
-        turn = self._turn(query, photographs, angles, film, site)
         await site.wait(context)
+        turn = self._turn(query, photographs, angles, film, site)
         spots, known = zip(*turn.spots, strict=True)
         queries = await self._parts.reader.encode(spots, known, [turn.height] * len(spots), context)
         ground = await site.ground(queries, context)

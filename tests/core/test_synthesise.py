@@ -472,7 +472,7 @@ def test_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, ending
     wait_until(lambda: not group_exists(process.pid))
     if ending == signal.SIGINT:
         assert process.returncode == 130
-        assert b"goes on where it stopped" in errors
+        assert b"run the same command again" in errors
         assert b"Traceback" not in errors
         assert list(tmp_path.glob("*.part")) == []
 

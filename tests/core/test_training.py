@@ -320,7 +320,7 @@ class TestStreams:
     def test_sphere_batch_holds_pictures_with_layouts(self) -> None:
         batch = next(sphere_batches())
         count, (height, width) = TINY.image.batch, TINY.image_size
-        assert batch["image"].shape == (count, height, width, 3)
+        assert batch["image"].shape == (count, height, width, 4)
         assert batch["image"].dtype == torch.uint8
         assert batch["profile_m"].shape == (count, TINY.profile_columns)
         assert batch["camera_height_m"].shape == batch["ceiling_height_m"].shape == (count,)
@@ -468,7 +468,7 @@ class TestStages:
         stage.encoder.eval()
         with torch.no_grad():
             terms = stage.losses(batch)
-            f = stage.encoder(batch["image"])
+            f = stage.encoder(batch["image"][..., :3])
         ratios, distilled = [], []
         for p in range(len(f)):
             profile = torch.cat([batch["profile_m"][p : p + 1], batch["neighbour_profile_m"][p]])

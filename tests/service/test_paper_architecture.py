@@ -59,10 +59,11 @@ def test_query_reaches_each_stage(
 
 
 @pytest.mark.slow
-def test_sequence_ends_at_retrieval(client: httpx.Client, sphere: bytes) -> None:
+def test_turn_is_refined_by_latents(client: httpx.Client, sphere: bytes) -> None:
     files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
     fields = {"floorplan_id": upload(client), "motion": "turn"}
     response = client.post("/localise/sequence", data=fields, files=files)
     assert response.status_code == 200, response.text
-    assert response.json()["stage"] == "retrieval"
+    # The pose on the grid is the answer until the worker has started.
+    assert response.json()["stage"] in ("lpo", "retrieval")
     assert len(response.json()["poses"]) == 2

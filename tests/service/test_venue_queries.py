@@ -89,9 +89,8 @@ def test_venue_of_one_plan_equals_the_plan(shipped: httpx.Client, home: str) -> 
     assert (alone["venue_id"], alone["level"], alone["plans"]) == (None, None, None)
 
 
-@pytest.mark.slow
 @pytest.mark.one_replica
-@pytest.mark.parametrize("most", [128, 2], ids=["all plans", "probable plans"])
+@pytest.mark.parametrize("most", [128, pytest.param(2, marks=pytest.mark.slow)], ids=["all plans", "probable plans"])
 def test_turn_is_found_in_a_venue(
     shipped: httpx.Client, home: str, others: list[str], monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:

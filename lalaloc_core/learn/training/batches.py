@@ -102,7 +102,7 @@ class Rotation:
     heading: float
     mirrored: bool
 
-    def picture(self, image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w 3"]:
+    def picture(self, image: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w c"]:
         """Rotate and mirror a sphere."""
         turned = np.roll(image, self.shift, axis=1)
         return turned[:, ::-1] if self.mirrored else turned
