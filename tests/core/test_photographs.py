@@ -137,7 +137,8 @@ class TestDrawing:
         mark = (127.0 + 100.0 * torch.sin(2.0 * torch.pi * torch.arange(width) / width)).to(torch.uint8)
         images = mark[None, None, :, None].expand(1, 8, width, 3).contiguous()
         target = (mark.float() / 256.0)[None]
-        photographs = Photographs(images, target[..., None].expand(1, width, 3).contiguous(), torch.zeros(1, width))
+        openings, one = target[..., None].expand(1, width, 3).contiguous(), torch.ones(1)
+        photographs = Photographs(images, openings, torch.zeros(1, width), one.long(), one)
         drawn = photographs.draw(32, columns, torch.Generator().manual_seed(0))
         expected = (drawn.images[:, 4, :, 0].float() / 256.0).unflatten(1, (columns, 2)).mean(dim=2)
         torch.testing.assert_close(drawn.openings, expected[..., None].expand(-1, -1, 3), atol=0.03, rtol=0.0)
