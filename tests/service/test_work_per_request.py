@@ -32,7 +32,7 @@ from tests.service.test_security import bearer, make_key
 pytestmark = pytest.mark.skipif(
     os.environ.get("TEST_DATABASE", "sqlite") != "sqlite", reason="counts steps of SQLite in this process"
 )
-# The first request warms up and does not count. Beyond 128 plans, venues are searched by an index, which a change builds.
+# The first request warms up and does not count. Beyond 128 plans venues are searched by an index, which changes build.
 _SIZES = (15, 30, 60, 120)
 _ACCEPTED = {200, 201, 204, 304}
 _COUNTED = tuple(str(Path(package.__file__ or "").parent) for package in (lalaloc_core, service))
