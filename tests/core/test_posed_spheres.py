@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError, DatasetError
@@ -109,8 +110,9 @@ class TestTargets:
         assert bool((found.openings[:, 32, DOOR - 1] == 1.0).all())
 
     def test_house_is_no_training_data(self, house: Path) -> None:
-        with pytest.raises(ConfigError, match="need one segmenter"):
-            load_photographs([house], [], 32, 64)
+        # Not even without labels, by a teacher.
+        with pytest.raises(DatasetError, match="its photographs only validate"):
+            load_photographs([house], [default_bundle()], 32, 64)
 
     def test_folders_have_their_shares(self, rooms: Path, tmp_path: Path) -> None:
         real = tmp_path / "real"

@@ -8,7 +8,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, annotation_files
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.data.folder import PLAN_FILE, OwnData
-from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres, room_names
+from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres, is_posed
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.zind import DATA_FILE, PARTITION_FILE, Zind
 from lalaloc_core.learn.dataset_names import DATASET_FORMATS
@@ -31,7 +31,7 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
         found["own data"] = OwnData(root)
     if annotation_files(root):
         found["annotated photographs"] = AnnotatedPhotographs(root)
-    if room_names(root) or (root / VIEWS_FILE).exists():
+    if is_posed(root):
         found["posed spheres"] = PosedSpheres(root)
     if dataset_format is not None:
         wanted = DATASET_FORMATS[dataset_format]

@@ -119,6 +119,11 @@ class PosedSpheres:
         )
 
 
+def is_posed(root: Path) -> bool:
+    """Return whether a folder has posed spheres."""
+    return bool(room_names(root)) or (root / VIEWS_FILE).exists()
+
+
 def room_names(root: Path) -> list[str]:
     """Return the names of the path-traced rooms in a folder, sorted."""
     return sorted(path.stem for path in root.glob("*.json") if path.stem.isdigit())

@@ -21,7 +21,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI
 from lalaloc_core.errors import ConfigError, DatasetError, InvalidPhotographError
 from lalaloc_core.learn.data.annotated import annotation_files
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
-from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated, room_names
+from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated, is_posed
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Photographs
 from lalaloc_core.learn.training.warm_start import bundle_weights
@@ -52,16 +52,18 @@ def load_photographs(
         paths = sorted(path for pattern in ("*.jpg", "*.jpeg", "*.png") for path in folder.glob(pattern))
         if not paths:
             raise DatasetError("no photographs (*.jpg, *.jpeg, *.png)", path=folder)
-        # A photograph that another folder annotates needs no teacher; rooms that validate have none.
-        others = [] if room_names(folder) else [path for path in paths if path.name not in known]
+        # A photograph that another folder annotates needs no teacher; posed spheres that validate must have none.
+        others = [] if is_posed(folder) else [path for path in paths if path.name not in known]
         read += [_taught(others, teachers, height, width)] if others else []
-        share = shares[number] / sum(len(part.weight) for part in read) if shares else 1.0
+        if is_posed(folder) and not read:
+            raise DatasetError("its photographs only validate; leave it out of --photographs", path=folder)
+        share = shares[number] / max(sum(len(part.weight) for part in read), 1) if shares else 1.0
         parts += [replace(part, weight=part.weight * share) for part in read]
     return Photographs(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Photographs)))
 
 
 def _annotated_in(folder: Path) -> list[AnnotatedPhotograph]:
-    if room_names(folder):
+    if is_posed(folder):
         return annotated(PosedSpheres(folder), "train")
     return [read_annotation(path) for path in annotation_files(folder)]
 
