@@ -173,19 +173,27 @@ class TestStructure:
         for passage in (0.0, 0.05):
             probability = torch.tensor([[[0.1 - passage, 0.8, 0.1, passage]]])
             logits = (probability + 1e-12).log().requires_grad_()
-            (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, target), logits)
+            (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, target, torch.ones(4)), logits)
             torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
         without_door = torch.tensor([[[0.8, 0.1, 0.1, 1e-6]]]).log().requires_grad_()
-        (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, target), without_door)
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, target, torch.ones(4)), without_door)
         assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
 
     def test_teacher_that_sees_passages_is_followed(self) -> None:
         probability = torch.tensor([[[0.2, 0.3, 0.1, 0.4]]])
         logits = probability.log().requires_grad_()
-        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, probability[..., 1:]), logits)
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, probability[..., 1:], torch.ones(4)), logits)
         torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
-        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, torch.tensor([[[0.3, 0.1, 0.6]]])), logits)
+        (gradient,) = torch.autograd.grad(
+            losses.teacher_openings(logits, torch.tensor([[[0.3, 0.1, 0.6]]]), torch.ones(4)), logits
+        )
         assert gradient[0, 0, 3] < 0.0 < gradient[0, 0, 0]
+
+    def test_weighted_teacher_is_followed_to_the_weighted_shares(self) -> None:
+        share, weight = torch.tensor([0.6, 0.2, 0.1, 0.1]), torch.tensor([0.5, 2.0, 1.0, 2.0])
+        logits = (share * weight).log()[None, None].requires_grad_()
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, share[None, None, 1:], weight), logits)
+        torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
 
     def test_shape_of_walls_ignores_their_scale(self) -> None:
         target, known = torch.randn(2, 9), torch.rand(2, 9) < 0.8

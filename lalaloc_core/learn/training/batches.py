@@ -8,6 +8,7 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -148,6 +149,12 @@ class Photographs:
     log_distance: Float[Tensor, "n c"]
     room_type: Int[Tensor, "n"]
     weight: Float[Tensor, "n"]
+
+    @cached_property
+    def opening_share(self) -> Float[Tensor, "4"]:
+        """Mean share of each opening class in what is drawn, at least 0.001; unknown passages count as walls."""
+        openings = self.weight @ self.openings.nan_to_num().mean(dim=1) / self.weight.sum()
+        return torch.cat([1.0 - openings.sum(dim=0, keepdim=True), openings]).clamp_min(1e-3)
 
     def draw(self, count: int, columns: int, generator: torch.Generator) -> Photographs:
         """Draw photographs, each randomly rotated, stretched and mirrored, with targets of `columns` columns."""

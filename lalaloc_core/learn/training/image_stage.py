@@ -20,6 +20,7 @@ from lalaloc_core.learn.training.stages import (
     TrainingStage,
     build_image_encoder,
     edges_loss,
+    opening_weight,
     photograph_loss,
     sample_styles,
     sphere_batches,
@@ -116,13 +117,15 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         )
         features = self.encoder(images, heights, styles)
         assert features.structure is not None
+        assert isinstance(self.encoder, TrunkImageEncoder)
         openings, log_distance = (
             target.to(image.device) for target in (photographs.openings, photographs.log_distance)
         )
         rows = slice(len(image), None)
         logits = features.structure.opening_logits[rows]
         known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
-        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, openings, log_distance)
+        weight = opening_weight(settings, self.encoder, self.photographs)
+        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, openings, log_distance, weight)
         return first_rows(features, len(image)), {"photographs": loss}
 
     def _structure_losses(

@@ -149,14 +149,21 @@ def ceiling(log_ceiling: Float[Tensor, "b"], log_scale: Float[Tensor, "b"], abov
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
-def teacher_openings(logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 3"]) -> Tensor:
-    """Return the cross entropy to a teacher's shares by column; without that of passages, the rest is either."""
+def teacher_openings(
+    logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 3"], weight: Float[Tensor, "c"]
+) -> Tensor:
+    """Return the cross entropy to a teacher's shares by column; without that of passages, the rest is either.
+
+    `weight` is that of each class. Weights `prior / share`, where `share` is a class's in the photographs, make the
+    network learn probabilities of that prior, as `opening` does.
+    """
     log_probability = torch.log_softmax(logits, dim=2)
     wall, passage = log_probability[..., WALL_CODE], log_probability[..., PASSAGE_CODE]
     log_other = torch.where(shares[..., 2].isnan(), torch.logaddexp(wall, passage), wall)
     known = shares.nan_to_num()
     other_share = (1.0 - known.sum(dim=2)).clamp_min(0.0)
-    return -((known * log_probability[..., WALL_CODE + 1 :]).sum(dim=2) + other_share * log_other).mean()
+    openings = (known * log_probability[..., WALL_CODE + 1 :]) @ weight[WALL_CODE + 1 :]
+    return -(openings + weight[WALL_CODE] * other_share * log_other).mean()
 
 
 def _safe_log(distance: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
+from lalaloc_core.nets.sphere_network import HorizonEncoder, TrunkImageEncoder
 from lalaloc_core.nets.trunk import StyleMixing, Trunk
 
 StageConfigT = TypeVar("StageConfigT", LayoutStageConfig, ImageStageConfig)
@@ -108,9 +108,10 @@ def photograph_loss(
     seen: Bool[Tensor, "n w"],
     openings: Float[Tensor, "n w 3"],
     log_distance: Float[Tensor, "n w"],
+    class_weight: Float[Tensor, "c"],
 ) -> Tensor:
     """Return the weighted loss of predictions for photographs, against their targets where seen."""
-    agreement = losses.teacher_openings(opening_logits[seen][None], openings[seen][None])
+    agreement = losses.teacher_openings(opening_logits[seen][None], openings[seen][None], class_weight)
     known = losses.visible_walls(torch.where(seen, log_distance, torch.nan), openings, opening_logits)
     target = log_distance.nan_to_num()
     distance = losses.laplace_mixture(walls, target, known)
@@ -118,6 +119,12 @@ def photograph_loss(
     if settings.shape_weight:
         loss += settings.shape_weight * losses.wall_shape(walls, target, known)
     return loss
+
+
+def opening_weight(settings: ImageStageConfig, encoder: HorizonEncoder, photographs: Photographs) -> Float[Tensor, "c"]:
+    """Return the weights of the opening classes in photographs, by which renderings and photographs share a prior."""
+    prior = losses.opening_prior(encoder.opening_share, settings.opening_balance)
+    return prior / photographs.opening_share.to(prior)
 
 
 def edges_loss(

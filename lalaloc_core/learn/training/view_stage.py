@@ -23,7 +23,14 @@ from lalaloc_core.learn.training.batch_streams import UNKNOWN, seen_openings
 from lalaloc_core.learn.training.batches import Batch, Photographs
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import TrainingStage, edges_loss, photograph_loss, sample_styles, sphere_batches
+from lalaloc_core.learn.training.stages import (
+    TrainingStage,
+    edges_loss,
+    opening_weight,
+    photograph_loss,
+    sample_styles,
+    sphere_batches,
+)
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.object_network import ObjectNetwork
 from lalaloc_core.nets.view_network import ViewFeatures, ViewNetwork
@@ -85,14 +92,15 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         if settings.edges_weight:
             edges, visible = batch["edges"][:, middle(self.config)], walls * (shown[rendered, ..., 3] > 0.0)
             terms["edges"] = edges_loss(settings, features.structure.rows(rendered), edges, visible, seen[rendered])
-        if photographs is not None:
+        if self.photographs is not None and photographs is not None:
             rows, part = slice(len(image) - count, None), middle(self.config)
             openings, log_distance = (
                 target[:, part].to(seen.device) for target in (photographs.openings, photographs.log_distance)
             )
             logits = features.structure.opening_logits[rows]
+            weight = opening_weight(settings, self.encoder, self.photographs)
             terms["photographs"] = photograph_loss(
-                settings, features.walls.rows(rows), logits, seen[rows], openings, log_distance
+                settings, features.walls.rows(rows), logits, seen[rows], openings, log_distance, weight
             )
             if self._objects is not None and features.objects is not None:
                 taught, _ = self._objects.to(shown.device)(shown[rows, ..., :3])
