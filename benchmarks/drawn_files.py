@@ -5,9 +5,11 @@ from __future__ import annotations
 import ctypes
 import io
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -28,52 +30,9 @@ FileFormat = Literal["png", "svg", "dxf", "pdf"]
 FILE_FORMATS: tuple[FileFormat, ...] = get_args(FileFormat)
 Layer = Literal["wall", "door", "window", "furniture", "room"]
 
-# Kinds of rooms, and by language the names of layers and of these rooms.
+# Kinds of rooms, and words by language.
 _KINDS = ("bedroom", "kitchen", "bathroom", "living room", "corridor", "closet", "storage", "study", "dining room")
-_WORDS = {
-    "English": (
-        "Wall,Door,Window,Furniture,Names",
-        "Bedroom,Kitchen,Bath,Living room,Corridor,Closet,Storage,Study,Dining room",
-    ),
-    "German": (
-        "Wände,Türen,Fenster,Möbel,Beschriftung",
-        "Schlafzimmer,Küche,Bad,Wohnzimmer,Flur,Ankleide,Abstellraum,Arbeitszimmer,Esszimmer",
-    ),
-    "French": (
-        "Murs,Portes,Fenêtres,Mobilier,Texte",
-        "Chambre,Cuisine,Salle de bain,Séjour,Couloir,Dressing,Cellier,Bureau,Salle à manger",
-    ),
-    "Italian": (
-        "Muri,Porte,Finestre,Arredi,Text",
-        "Camera,Cucina,Bagno,Soggiorno,Corridoio,Guardaroba,Ripostiglio,Ufficio,Sala da pranzo",
-    ),
-    "Spanish": (
-        "Muros,Puertas,Ventanas,Mobiliario,Text",
-        "Dormitorio,Cocina,Baño,Salón,Pasillo,Vestidor,Trastero,Despacho,Comedor",
-    ),
-    "Portuguese": (
-        "Paredes,Portas,Janelas,Mobiliario,Text",
-        "Quarto,Cozinha,Banheiro,Sala de estar,Corredor,Closet,Despensa,Escritório,Sala de jantar",
-    ),
-    "Dutch": (
-        "Muren,Deuren,Ramen,Meubels,Text",
-        "Slaapkamer,Keuken,Badkamer,Woonkamer,Gang,Garderobe,Berging,Werkkamer,Eetkamer",
-    ),
-    "Swedish": (
-        "Väggar,Dörrar,Fönster,Möbler,Text",
-        "Sovrum,Kök,Badrum,Vardagsrum,Hall,Klädkammare,Förråd,Arbetsrum,Matrum",
-    ),
-    "Danish": (
-        "Vægge,Døre,Vinduer,Inventar,Text",
-        "Soveværelse,Køkken,Badeværelse,Stue,Gang,Garderobe,Depotrum,Kontor,Spisestue",
-    ),
-    "Norwegian": ("Vegg,Dører,Vinduer,Møbler,Text", "Soverom,Kjøkken,Bad,Stue,Gang,Garderobe,Bod,Kontor,Spisestue"),
-    "Polish": (
-        "Ściany,Drzwi,Okna,Meble,Text",
-        "Sypialnia,Kuchnia,Łazienka,Salon,Korytarz,Garderoba,Spiżarnia,Gabinet,Jadalnia",
-    ),
-    "Japanese": ("壁,ドア,窓,家具,文字", "寝室,キッチン,浴室,リビング,廊下,クローゼット,納戸,書斎,ダイニング"),
-}
+_WORDS = tomllib.loads(Path(__file__).with_name("drawn_words.toml").read_text(encoding="utf-8"))
 LANGUAGES = tuple(_WORDS)
 _LAYERS: tuple[Layer, ...] = get_args(Layer)
 # Length on paper at 1:100, points per metre, resolution of pictures, and pens (m).
@@ -106,7 +65,7 @@ class HomeDrawing:
 
     def layer(self, layer: Layer) -> str:
         """Return the name of a layer in the drawing's language."""
-        return _WORDS[self.language][0].split(",")[_LAYERS.index(layer)]
+        return _WORDS[self.language]["layers"].split(",")[_LAYERS.index(layer)]
 
 
 def draw_file(
@@ -131,7 +90,7 @@ def draw_file(
 def draw_home(model: Model, style: FileStyle, language: str, rng: np.random.Generator) -> HomeDrawing:
     """Return the drawing of a home."""
     drawing = HomeDrawing(model.size_m, language)
-    words: dict[str, str] = dict(zip(_KINDS, _WORDS[language][1].split(","), strict=True))
+    words: dict[str, str] = dict(zip(_KINDS, _WORDS[language]["rooms"].split(","), strict=True))
     for room, name in zip(model.rooms, model.names, strict=True):
         kind = next((kind for kind in _KINDS if name.startswith(kind)), None)
         place = shapely.maximum_inscribed_circle(room, 0.05).coords[0]

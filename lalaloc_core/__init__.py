@@ -38,18 +38,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.12.1"
 __all__ = [
-    "Answer",
-    "FloorPlan",
-    "LaLaLoc",
-    "LaLaLocError",
-    "Odometry",
-    "PinnedAlbum",
-    "StatedCamera",
-    "Track",
-    "TrackedAnswer",
-    "TurnAnswer",
-    "read_plan",
-]
+    "Answer", "FloorPlan", "LaLaLoc", "LaLaLocError", "Odometry", "PinnedAlbum", "StatedCamera", "Track",
+    "TrackedAnswer", "TurnAnswer", "read_plan",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -33,23 +33,9 @@ FIXTURE_KINDS = (
 
 # Room types; the index is the code. docs/reference/plan-format.md describes each.
 ROOM_TYPES = (
-    "unknown",
-    "bedroom",
-    "living",
-    "kitchen",
-    "dining",
-    "bathroom",
-    "corridor",
-    "entrance",
-    "closet",
-    "storage",
-    "laundry",
-    "garage",
-    "stairs",
-    "balcony",
-    "office",
-    "meeting",
-)
+    "unknown", "bedroom", "living", "kitchen", "dining", "bathroom", "corridor", "entrance", "closet", "storage",
+    "laundry", "garage", "stairs", "balcony", "office", "meeting",
+)  # fmt: skip
 
 
 def column_azimuths(columns: int) -> Float[np.ndarray, "columns"]:

@@ -10,24 +10,13 @@ import argparse
 import ast
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import yaml
 
 from lalaloc_core.cli import entry_point
-from scripts.figures import (
-    accuracy_table,
-    annotated_films_table,
-    films_table,
-    localisability_table,
-    neighbours_table,
-    paper_tables,
-    speed_table,
-    table,
-    terms_table,
-    uninformative_table,
-    views_table,
-)
+from scripts.figures import measured_table, neighbours_table, paper_tables, table
 from service.cli import entry_point as service_cli
 from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.openapi import openapi_text
@@ -48,6 +37,7 @@ _OTHER_FOLDERS = {
         "test_boundaries.py",
     ),
 }
+_MEASURED = ("accuracy", "terms", "views", "films", "annotated_films", "localisability", "uninformative", "speed")
 _PART = re.compile(r"<!-- begin: (.+?) -->\n.*?<!-- end: \1 -->", re.DOTALL)
 
 
@@ -156,16 +146,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "routes": routes_table,
     "problems": problems_table,
     "cli": commands,
-    "accuracy": accuracy_table,
-    "terms": terms_table,
-    "views": views_table,
-    "films": films_table,
-    "annotated_films": annotated_films_table,
-    "localisability": localisability_table,
-    "uninformative": uninformative_table,
-    "speed": speed_table,
     "neighbours": neighbours_table,
     "paper": paper_tables,
+    **{name: partial(measured_table, name) for name in _MEASURED},
 }
 
 

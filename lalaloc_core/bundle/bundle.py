@@ -37,16 +37,9 @@ OBJECTS_ONNX = "objects.onnx"
 # Made by calibration, not by export.
 COHORT = "cohort.npz"
 BUNDLE_FILES = (
-    LAYOUT_ONNX,
-    IMAGE_ONNX,
-    HEAD_ONNX,
-    LAYOUT_WEIGHTS,
-    IMAGE_WEIGHTS,
-    DECODER_WEIGHTS,
-    VIEW_ONNX,
-    VIEW_WEIGHTS,
+    LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS, DECODER_WEIGHTS, VIEW_ONNX, VIEW_WEIGHTS,
     OBJECTS_ONNX,
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

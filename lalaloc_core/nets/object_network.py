@@ -1,9 +1,12 @@
 """Classifier of objects that tell the type of a room: its network, their classes, and the types that they suggest.
 
-The shares are common knowledge, written down before any result was seen; none is fitted.
+`objects.toml` has the classes with the types.
 """
 
 from __future__ import annotations
+
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -54,73 +57,11 @@ class ObjectNetwork(nn.Module):
         return probability.index_select(1, self._classes), by_column
 
 
+_TABLE = tomllib.loads(Path(__file__).with_name("objects.toml").read_text(encoding="utf-8"))
 # Name, ImageNet class, and the types of rooms that have such an object, with shares that sum to 1.
-_KITCHEN, _BATHROOM, _OFFICE = {"kitchen": 1.0}, {"bathroom": 1.0}, {"office": 0.7, "living": 0.15, "bedroom": 0.15}
-_SCREEN, _GARAGE = {"living": 0.8, "bedroom": 0.2}, {"garage": 1.0}
-OBJECTS: tuple[tuple[str, int, dict[str, float]], ...] = (
-    ("four-poster bed", 564, {"bedroom": 1.0}),
-    ("quilt", 750, {"bedroom": 1.0}),
-    ("pillows", 721, {"bedroom": 0.7, "living": 0.3}),
-    ("crib", 520, {"bedroom": 1.0}),
-    ("bassinet", 431, {"bedroom": 1.0}),
-    ("cradle", 516, {"bedroom": 1.0}),
-    ("wardrobe", 894, {"bedroom": 0.7, "closet": 0.1, "corridor": 0.1, "entrance": 0.1}),
-    ("couch", 831, {"living": 0.6, "bedroom": 0.4}),
-    ("television", 851, _SCREEN),
-    ("home cinema", 598, _SCREEN),
-    ("television cabinet", 548, _SCREEN),
-    ("fireplace screen", 556, {"living": 1.0}),
-    ("rocking chair", 765, {"living": 0.7, "bedroom": 0.3}),
-    ("bookcase", 453, {"living": 0.6, "office": 0.4}),
-    ("library", 624, {"living": 0.5, "office": 0.5}),
-    ("dining table", 532, {"dining": 0.7, "kitchen": 0.15, "living": 0.15}),
-    ("restaurant", 762, {"dining": 1.0}),
-    ("china cabinet", 495, {"dining": 0.5, "kitchen": 0.5}),
-    ("stove", 827, _KITCHEN),
-    ("microwave", 651, _KITCHEN),
-    ("refrigerator", 760, _KITCHEN),
-    ("dishwasher", 534, _KITCHEN),
-    ("espresso maker", 550, _KITCHEN),
-    ("coffee pot", 505, _KITCHEN),
-    ("plate rack", 729, _KITCHEN),
-    ("toaster", 859, _KITCHEN),
-    ("waffle iron", 891, _KITCHEN),
-    ("dutch oven", 544, _KITCHEN),
-    ("slow cooker", 521, _KITCHEN),
-    ("cauldron", 469, _KITCHEN),
-    ("wok", 909, _KITCHEN),
-    ("frying pan", 567, _KITCHEN),
-    ("rotisserie", 766, _KITCHEN),
-    ("spatula", 813, _KITCHEN),
-    ("mixing bowl", 659, _KITCHEN),
-    ("teapot", 849, _KITCHEN),
-    ("bathtub", 435, _BATHROOM),
-    ("tub", 876, _BATHROOM),
-    ("toilet seat", 861, _BATHROOM),
-    ("washbasin", 896, _BATHROOM),
-    ("shower curtain", 794, _BATHROOM),
-    ("medicine cabinet", 648, _BATHROOM),
-    ("soap dispenser", 804, _BATHROOM),
-    ("toilet paper", 999, _BATHROOM),
-    ("bath towel", 434, _BATHROOM),
-    ("shower cap", 793, _BATHROOM),
-    ("hair dryer", 589, _BATHROOM),
-    ("plunger", 731, _BATHROOM),
-    ("washing machine", 897, {"laundry": 0.5, "bathroom": 0.25, "kitchen": 0.25}),
-    ("iron", 606, {"laundry": 1.0}),
-    ("desk", 526, _OFFICE),
-    ("desktop computer", 527, _OFFICE),
-    ("monitor", 664, _OFFICE),
-    ("screen", 782, _OFFICE),
-    ("notebook", 681, _OFFICE),
-    ("printer", 742, _OFFICE),
-    ("filing cabinet", 553, {"office": 1.0}),
-    ("banister", 421, {"stairs": 0.7, "corridor": 0.3}),
-    ("doormat", 539, {"entrance": 0.7, "corridor": 0.3}),
-    ("patio", 706, {"balcony": 1.0}),
-    ("car wheel", 479, _GARAGE),
-    ("minivan", 656, _GARAGE),
-    ("sports car", 817, _GARAGE),
+OBJECTS: tuple[tuple[str, int, dict[str, float]], ...] = tuple(
+    (name, row["class"], {kind: share for kind, share in row.items() if kind != "class"})
+    for name, row in _TABLE.items()
 )
 # Rooms of a type (first) that are open to those of another, with the share of these whose objects they also show.
 _OPEN: tuple[tuple[str, str, float], ...] = (

@@ -33,23 +33,10 @@ _SERVERS = [
 ]
 # Models that only hand-written parts of the description use.
 _BY_HAND = (
-    AlbumDocument,
-    AlbumEvent,
-    PhotographChangeDocument,
-    EarthPoint,
-    FloorPlanDocument,
-    ImportLine,
-    KeyDocument,
-    PlanEvent,
-    PlanPoint,
-    Problem,
-    RotationDocument,
-    StatedIntrinsics,
-    SessionDocument,
-    TenantLimitsDocument,
-    VenueDocument,
-    VenueChangeDocument,
-)
+    AlbumDocument, AlbumEvent, PhotographChangeDocument, EarthPoint, FloorPlanDocument, ImportLine, KeyDocument,
+    PlanEvent, PlanPoint, Problem, RotationDocument, StatedIntrinsics, SessionDocument, TenantLimitsDocument,
+    VenueDocument, VenueChangeDocument,
+)  # fmt: skip
 
 
 def operation_id(route: APIRoute) -> str:

@@ -42,21 +42,11 @@ _COUNTED = 1000
 _NAMED = 5
 # Columns of a plan that a query needs, besides level and name.
 _SEARCH_COLUMNS = (
-    FLOORPLANS.c.id.label("plan_id"),
-    FLOORPLANS.c.revision_id,
-    FLOORPLANS.c.centre_x_m,
-    FLOORPLANS.c.centre_y_m,
-    FLOORPLANS.c.reach_m,
-    FLOORPLANS.c.latitude,
-    FLOORPLANS.c.longitude,
-    REVISIONS.c.area_m2,
-    REVISIONS.c.camera_height_m,
-    REVISIONS.c.camera_height_std_m,
-    REVISIONS.c.failure,
-    LATENT_GRIDS.c.id.label("grid_id"),
-    LATENT_GRIDS.c.sha256.label("grid_sha256"),
-    LATENT_GRIDS.c.poses,
-)
+    FLOORPLANS.c.id.label("plan_id"), FLOORPLANS.c.revision_id, FLOORPLANS.c.centre_x_m, FLOORPLANS.c.centre_y_m,
+    FLOORPLANS.c.reach_m, FLOORPLANS.c.latitude, FLOORPLANS.c.longitude, REVISIONS.c.area_m2,
+    REVISIONS.c.camera_height_m, REVISIONS.c.camera_height_std_m, REVISIONS.c.failure,
+    LATENT_GRIDS.c.id.label("grid_id"), LATENT_GRIDS.c.sha256.label("grid_sha256"), LATENT_GRIDS.c.poses,
+)  # fmt: skip
 
 
 class Venues:

@@ -26,9 +26,9 @@ from lalaloc_core.render.profile import (
     render_layout,
     wall_profile,
 )
-from lalaloc_core.render.reference import reference_view
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from lalaloc_core.render.sweep import SweptLayouts, profiles_at, sweep_layouts
+from tests.core.reference_views import reference_view
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, scene_of, seeds, spiral
 
 COLUMNS, EYE_M = 64, 1.5

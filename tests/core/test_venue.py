@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
@@ -121,6 +122,14 @@ def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
         ceiling=PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
         room_type=PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
     )
+
+
+def index_of(parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
+    """Assign the prototypes of each plan to cells and return their index."""
+    rows = joined(parts).rows.copy()
+    rows["cell"] = cells.assign(rows)
+    count = np.array([len(part) for part in parts])
+    return PlanIndex.build(rows, np.cumsum(count) - count, count, step_m=parts[0].step_m, cells=cells)
 
 
 @pytest.fixture(scope="module")
@@ -338,7 +347,7 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototype
     few, rng = prototype_sets[:4], np.random.default_rng(4)
     query = query_at(few[1], 3, rng, hypotheses=4)
     alignment = PrototypeAlignment(PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG))
-    index = PlanIndex.from_prototypes(few, shipped_cells())
+    index = index_of(few, shipped_cells())
     expected = []
     for part in few:
         offset = np.zeros(len(part), int)
@@ -352,7 +361,7 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototype
 
 @pytest.mark.slow
 def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) -> None:
-    index, rng = PlanIndex.from_prototypes(prototype_sets, shipped_cells()), np.random.default_rng(5)
+    index, rng = index_of(prototype_sets, shipped_cells()), np.random.default_rng(5)
     pairs = sum(map(len, prototype_sets)) * 16
     for number in range(len(prototype_sets)):
         query = query_at(prototype_sets[number], 5, rng, hypotheses=16)
@@ -375,14 +384,14 @@ def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> 
     # The camera stood at 1.95 m, not at 1.5 m, so predicted distances are too small.
     smaller = replace(present(query.profile), log_m=present(query.profile).log_m - np.log(1.3))
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
-    index = PlanIndex.from_prototypes(prototype_sets, shipped_cells())
+    index = index_of(prototype_sets, shipped_cells())
     assert index.whole.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
     assert index.whole.log_masses(unknown, WEIGHTS, CONFIG, SearchLimits(compared=2000)).argmax() == 7
 
 
 def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]) -> None:
     several = [*prototype_sets, prototype_sets[3], prototype_sets[3]]
-    index, rng = PlanIndex.from_prototypes(several, shipped_cells()), np.random.default_rng(7)
+    index, rng = index_of(several, shipped_cells()), np.random.default_rng(7)
     for compared, scanned in ((50, 2000), (50, 10**9), (50, 1000), (10**9, 1)):
         query = query_at(prototype_sets[3], 1, rng, hypotheses=8)
         masses = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=compared, scanned=scanned))
@@ -441,9 +450,9 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
 
 def test_divided_index_equals_an_undivided_one(prototype_sets: list[Prototypes]) -> None:
     rng, cells = np.random.default_rng(15), shipped_cells()
-    index, order = PlanIndex.from_prototypes(prototype_sets, cells), rng.permutation(len(prototype_sets))
+    index, order = index_of(prototype_sets, cells), rng.permutation(len(prototype_sets))
     shards = [
-        (PlanIndex.from_prototypes([prototype_sets[number] for number in numbers], cells), numbers)
+        (index_of([prototype_sets[number] for number in numbers], cells), numbers)
         for numbers in np.split(order, [3, 4, 13])
     ]
     divided = DividedIndex(shards=shards, step_m=STEP_M, cells=cells)
@@ -497,7 +506,7 @@ def test_plans_with_and_without_openings_are_found() -> None:
     # Family 0 has no openings, family 3 has doors and windows.
     assert np.unique(rows["cell"] // (len(cells) // FAMILIES)).tolist() == [0, 3]
     assert np.unique(family_of(rows["claims"])).tolist() == [0, 3]
-    index = PlanIndex.from_prototypes(prototype_sets, cells)
+    index = index_of(prototype_sets, cells)
     for number in range(12):
         query = query_at(whole[number], 2, rng, hypotheses=8)
         masses = index.whole.log_masses(query, WEIGHTS, CONFIG, SearchLimits(compared=3000))

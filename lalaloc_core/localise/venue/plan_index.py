@@ -25,7 +25,7 @@ merged so that each has at least twice as many plans as the next (the logarithmi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -45,7 +45,6 @@ from lalaloc_core.localise.venue.index_search import (
 from lalaloc_core.localise.venue.index_segment import Segment, lookup_tables
 from lalaloc_core.localise.venue.prototype_cells import Cells, claims_of
 from lalaloc_core.localise.venue.prototype_costs import PrototypeAlignment
-from lalaloc_core.localise.venue.prototypes import Prototypes, joined
 
 # Pairs compared at a time, to bound memory.
 _BATCH_SIZE = 65_536
@@ -157,14 +156,6 @@ class PlanIndex:
         """
         part = _part(rows, begin, count, np.arange(len(count)), cells)
         return cls(step_m=step_m, cells=cells, plan_count=len(count), parts=(part,))
-
-    @classmethod
-    def from_prototypes(cls, parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
-        """Assign the prototypes of each plan to cells and return their index."""
-        rows = joined(parts).rows.copy()
-        rows["cell"] = cells.assign(rows)
-        count = np.array([len(part) for part in parts])
-        return cls.build(rows, np.cumsum(count) - count, count, step_m=parts[0].step_m, cells=cells)
 
     def updated(self, place: Int[np.ndarray, "p"], added: Int[np.ndarray, "a"], locate: Locate) -> PlanIndex:
         """Return the index of other plans, of which most are in this one.
