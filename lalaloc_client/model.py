@@ -39,6 +39,7 @@ class Room:
     vertices: int
     id: str | None = None
     type: str | None = None
+    types: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

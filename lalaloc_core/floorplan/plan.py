@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, heading_from_degrees, heading_to_degrees
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, Anchor, anchor_document, read_anchor
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
@@ -42,8 +42,11 @@ from lalaloc_core.floorplan.plan_document import (
     read_opening_trust,
     read_openings,
     read_rooms,
+    state_types,
     trust_warnings,
+    with_types_of_fixtures,
 )
+from lalaloc_core.floorplan.room_types import type_fields
 from lalaloc_core.floorplan.rooms import Room, check_size, frozen, overlap_warnings
 
 # Plans with more rooms use a spatial index to find the room of a position.
@@ -51,19 +54,9 @@ _FEW_ROOMS = 32
 # Directions of walls, one for each degree of a quarter turn.
 _DIRECTIONS = 90
 _PLAN_KEYS = {
-    "name",
-    "rooms",
-    "ceiling_height_m",
-    "camera_height_m",
-    "camera_height_std_m",
-    "north_deg",
-    "anchor",
-    "openings",
-    "opening_kinds",
-    "opening_trust",
-    "opening_tolerance_m",
-    "fixtures",
-}
+    "name", "rooms", "ceiling_height_m", "camera_height_m", "camera_height_std_m", "north_deg", "anchor", "openings",
+    "opening_kinds", "opening_trust", "opening_tolerance_m", "fixtures",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +148,14 @@ class FloorPlan:
         anchor = read_anchor(document.get("anchor"), north_deg, rooms)
         if anchor is not None:
             north = heading_from_degrees(anchor.north_deg)
+        fixtures = read_fixtures(document.get("fixtures"), limits)
         if warnings is None:
             off_wall = [f"{label(openings[k], k)} is not on a wall" for k in unplaced]
             ceilings = ceiling_warnings(rooms, default_ceiling_m)
             warnings = (*ceilings, *overlap_warnings(rooms, limits), *off_wall, *trust_warnings(document))
         return cls(
             name=name,
-            rooms=rooms,
+            rooms=with_types_of_fixtures(rooms, fixtures, document["rooms"]),
             camera_height_m=read_camera_height(document.get("camera_height_m"), rooms, limits),
             warnings=tuple(warnings),
             north=north,
@@ -174,7 +168,7 @@ class FloorPlan:
             ),
             states_camera_height=document.get("camera_height_m") is not None,
             anchor=anchor,
-            fixtures=read_fixtures(document.get("fixtures"), limits),
+            fixtures=fixtures,
             ceiling_height_m=default_ceiling_m,
         )
 
@@ -208,6 +202,7 @@ class FloorPlan:
         if self.ceiling_height_m is not None:
             document["ceiling_height_m"] = self.ceiling_height_m
         document["rooms"] = [_room_document(room) for room in self.rooms]
+        state_types(document["rooms"], self.rooms, self.fixtures)
         if self.openings:
             document["openings"] = [_opening_document(opening) for opening in self.openings]
         if self.fixtures:
@@ -306,6 +301,15 @@ class FloorPlan:
         return places
 
     @cached_property
+    def type_shares(self) -> Float[np.ndarray, "r t"]:
+        """Share of each of `conventions.ROOM_TYPES` in every room, alike for a room's types."""
+        share = np.zeros((len(self.rooms), len(ROOM_TYPES)))
+        for row, room in zip(share, self.rooms, strict=True):
+            types = room.types or ROOM_TYPES[:1]
+            row[[ROOM_TYPES.index(kind) for kind in types]] = 1.0 / len(types)
+        return share
+
+    @cached_property
     def _room_tree(self) -> shapely.STRtree:
         return shapely.STRtree([room.shape for room in self.rooms])
 
@@ -325,8 +329,7 @@ class FloorPlan:
 
 def _room_document(room: Room) -> dict[str, Any]:
     document: dict[str, Any] = {"id": room.id, "name": room.name}
-    if room.type != "unknown":
-        document["type"] = room.type
+    document |= type_fields(room.types)
     document["polygon"] = room.polygon_m.tolist()
     if room.holes_m:
         document["holes"] = [hole.tolist() for hole in room.holes_m]

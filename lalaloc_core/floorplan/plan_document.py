@@ -28,11 +28,12 @@ from lalaloc_core.floorplan.json_values import (
     read_segment,
 )
 from lalaloc_core.floorplan.openings import Opening
+from lalaloc_core.floorplan.room_types import room_types_from_name, types_by_fixtures
 from lalaloc_core.floorplan.rooms import Room, frozen
 
 DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M = 1.5, 2.5
 MAX_CAMERA_HEIGHT_STD_M = 2.0
-_ROOM_KEYS = {"id", "name", "type", "polygon", "holes", "walls", "ceiling_height_m"}
+_ROOM_KEYS = {"id", "name", "type", "types", "polygon", "holes", "walls", "ceiling_height_m"}
 # Free-standing walls can reach this far outside the floor: drawings let a stub begin on the axis of another wall.
 _WALL_OVERSHOOT_M = 0.01
 _KINDS = OPENING_CLASSES[1:]
@@ -86,7 +87,7 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     name = read_name(raw.get("name", fallback_name), limits, label=f"the name of {fallback_name}")
     check_keys(raw, _ROOM_KEYS, room=name)
     key = read_name(raw["id"], limits, "the id", room=name) if raw.get("id") is not None else ""
-    kind = read_choice(raw.get("type", ROOM_TYPES[0]), ROOM_TYPES, "the type", room=name)
+    types = _read_types(raw, name)
     ceiling = raw.get("ceiling_height_m")
     usual_m = DEFAULT_CEILING_HEIGHT_M if default_ceiling_m is None else default_ceiling_m
     height_m = usual_m if ceiling is None else read_ceiling(ceiling, name, limits)
@@ -109,11 +110,25 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
         polygon_m=outline_m,
         ceiling_height_m=height_m,
         id=key,
-        type=kind,
+        types=types,
         holes_m=holes_m,
         inner_walls_m=_read_walls(raw.get("walls"), shape, name, limits),
         states_ceiling=ceiling is not None,
     )
+
+
+def _read_types(raw: Mapping[str, Any], room: str) -> tuple[str, ...]:
+    """Read the types of a room; the name gives them if neither `type` nor `types` does."""
+    first = read_choice(raw.get("type", ROOM_TYPES[0]), ROOM_TYPES, "the type", room=room)
+    if raw.get("types") is None:
+        return room_types_from_name(room) if first == ROOM_TYPES[0] else (first,)
+    entries = read_list(raw["types"], "types", len(ROOM_TYPES) - 1, "one of each", room)
+    types = tuple(dict.fromkeys(read_choice(kind, ROOM_TYPES[1:], "an entry of types", room=room) for kind in entries))
+    if first == ROOM_TYPES[0]:
+        return types
+    if first not in types:
+        raise InvalidFloorPlanError(f"the type is '{first}', which types does not list; remove one of them", room=room)
+    return tuple(dict.fromkeys((first, *types)))
 
 
 def _read_ring(raw: Any, field: str, room: str, limits: PlanLimits, *, is_hole: bool = False) -> np.ndarray:
@@ -317,6 +332,35 @@ def read_fixtures(raw: Any, limits: PlanLimits) -> tuple[Fixture, ...]:
                 "simplify their outlines"
             )
     return tuple(fixtures)
+
+
+def with_types_of_fixtures(
+    rooms: Sequence[Room], fixtures: Sequence[Fixture], raw_rooms: Sequence[Mapping[str, Any]]
+) -> tuple[Room, ...]:
+    """Return the rooms with the types that their fixtures add, unless the document lists a room's `types`."""
+    if not fixtures:
+        return tuple(rooms)
+    shapes = [shapely.Polygon(fixture.outline_m) for fixture in fixtures]
+    tree = shapely.STRtree([room.shape for room in rooms])
+    inside: dict[int, list[tuple[str, float]]] = {}
+    for number, room in tree.query(shapely.centroid(shapes), predicate="within").T.tolist():
+        inside.setdefault(room, []).append((fixtures[number].kind, shapes[number].area))
+    typed = list(rooms)
+    for number, sizes in inside.items():
+        if raw_rooms[number].get("types") is not None:
+            continue
+        types = types_by_fixtures(rooms[number].types, sizes, rooms[number].area_m2)
+        typed[number] = replace(rooms[number], types=types)
+    return tuple(typed)
+
+
+def state_types(documents: Sequence[dict[str, Any]], rooms: Sequence[Room], fixtures: Sequence[Fixture]) -> None:
+    """Add `types` to the documents of rooms to which names or fixtures would give others when they are read."""
+    named = [replace(room, types=_read_types(raw, room.name)) for raw, room in zip(documents, rooms, strict=True)]
+    read = with_types_of_fixtures(named, fixtures, documents)
+    for raw, room, again in zip(documents, rooms, read, strict=True):
+        if again.types != room.types:
+            raw["types"] = list(room.types)
 
 
 def _read_fixture(raw: Any, where: str, limits: PlanLimits) -> Fixture:

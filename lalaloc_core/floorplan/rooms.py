@@ -1,8 +1,7 @@
-"""Rooms: outline, holes, walls, free floor, and types by labels; checks of the size and overlaps of all rooms."""
+"""Rooms: outline, holes, walls and free floor; checks of the size and overlaps of all rooms."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,26 +21,6 @@ _WALL_CORE_M = 1e-3
 # of the largest inscribed circle, takes seconds for a spiral of two hundred vertices.
 _LATTICE, _FINER_LATTICE, _ROUNDS = 20, 7, 5
 
-# Further words for each room type, besides its name.
-_SYNONYMS = {
-    "bathroom": ("bath", "shower", "toilet", "wc", "restroom", "washroom"),
-    "corridor": ("hall", "hallway", "passage", "landing"),
-    "entrance": ("foyer", "entry", "vestibule", "lobby"),
-    "living": ("lounge", "family"),
-    "office": ("den", "study", "workspace"),
-    "closet": ("wardrobe",),
-    "storage": ("pantry", "store", "basement", "attic"),
-    "laundry": ("utility",),
-    "stairs": ("staircase", "stairwell", "stair"),
-    "balcony": ("terrace", "patio", "porch", "deck", "garden", "outdoor"),
-    "meeting": ("conference", "auditorium", "classroom"),
-    "dining": ("breakfast",),
-    "kitchen": ("kitchenette",),
-    "bedroom": ("nursery",),
-}
-_TYPES = {word: kind for kind, words in _SYNONYMS.items() for word in words} | {name: name for name in ROOM_TYPES}
-# Words that tell a room's type.
-ROOM_WORDS = tuple(word for word in _TYPES if word != ROOM_TYPES[0])
 # The search for overlaps ends after this many found or pairs tested; the number of pairs is quadratic in the rooms.
 _MAX_OVERLAPS, _MAX_PAIRS = 20, 5000
 # Two combs of two hundred vertices can cross ten thousand times, so the number of wall pairs that can cross is limited
@@ -67,7 +46,7 @@ class Room:
         name: name for users; names may repeat.
         polygon_m: (n, 2) outline, counter-clockwise, not closed (the last vertex joins the first).
         id: unique within its plan.
-        type: one of `conventions.ROOM_TYPES`.
+        types: uses of the room, of `conventions.ROOM_TYPES` without "unknown"; empty if unknown.
         holes_m: areas inside the outline that are no floor, such as columns and shafts: each (k, 2), clockwise, not
             closed.
         inner_walls_m: (k, 4) free-standing walls up to the ceiling, segments (x0, y0, x1, y1).
@@ -78,10 +57,15 @@ class Room:
     polygon_m: Float[np.ndarray, "n 2"]
     ceiling_height_m: float
     id: str = ""
-    type: str = ROOM_TYPES[0]
+    types: tuple[str, ...] = ()
     holes_m: tuple[Float[np.ndarray, "_ 2"], ...] = ()
     inner_walls_m: Float[np.ndarray, "k 4"] = field(default_factory=_no_walls)
     states_ceiling: bool = True
+
+    @property
+    def type(self) -> str:
+        """The first type, "unknown" without any."""
+        return self.types[0] if self.types else ROOM_TYPES[0]
 
     @cached_property
     def shape(self) -> shapely.Polygon:
@@ -161,15 +145,6 @@ def _farthest(
     distance_m = np.asarray(shapely.distance(shapely.points(points), floor.boundary))
     chosen = int(distance_m.argmax())
     return points[chosen], float(distance_m[chosen])
-
-
-def room_type_from_label(label: str) -> str:
-    """Return the room type of a label ("Living room 2": living), `unknown` if it has no known word.
-
-    The first known word decides.
-    """
-    words = re.findall(r"[a-z]+", label.casefold())
-    return next((_TYPES[word] for word in words if word in _TYPES), ROOM_TYPES[0])
 
 
 def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:

@@ -148,6 +148,7 @@ def describe_content(plan: FloorPlan, report_text: str | None, step_m: float) ->
                 id=room.id,
                 name=room.name,
                 type=room.type,
+                types=list(room.types),
                 area_m2=room.area_m2,
                 ceiling_height_m=room.ceiling_height_m,
                 vertices=len(room.polygon_m),

@@ -12,6 +12,7 @@ Point = Annotated[list[float], Field(min_length=2, max_length=2)]
 Segment = Annotated[list[Point], Field(min_length=2, max_length=2)]
 Ring = Annotated[list[Point], Field(min_length=3)]
 RoomType = Annotated[str, WithJsonSchema({"type": "string", "enum": [*ROOM_TYPES]})]
+KnownRoomType = Annotated[str, WithJsonSchema({"type": "string", "enum": [*ROOM_TYPES[1:]]})]
 OpeningKind = Annotated[str, WithJsonSchema({"type": "string", "enum": [*OPENING_CLASSES[1:]]})]
 
 
@@ -20,7 +21,13 @@ class RoomDocument(BaseModel):
 
     id: str | None = Field(None, description="Unique id. Default: made from the name.")
     name: str = Field("", description="Name of the room. Default: its number.")
-    type: RoomType = Field("unknown", description="Use of the room.")
+    type: RoomType = Field("unknown", description="Use of the room. Default: by its name and fixtures.")
+    types: list[KnownRoomType] | None = Field(
+        None,
+        max_length=len(ROOM_TYPES) - 1,
+        description="Uses of a room with several, such as an open kitchen; [] for none. Default: by type, name and "
+        "fixtures.",
+    )
     polygon: Ring = Field(
         description="Corners [x, y] in metres, clockwise or counterclockwise; x points right and y up on the drawing."
     )

@@ -9,7 +9,7 @@ from pydantic import Field, WithJsonSchema
 
 from lalaloc_core.answer_numbers import Metres, Share, SquareMetres
 from service.schemas.fields import ResponseModel
-from service.schemas.native_plan import OpeningKind, Ring, RoomType
+from service.schemas.native_plan import KnownRoomType, OpeningKind, Ring, RoomType
 from service.schemas.plan_import import ImportReport
 
 PlanStatus = Literal["preparing", "ready", "failed"]
@@ -20,7 +20,8 @@ class RoomAnswer(ResponseModel):
 
     id: str = Field(description="Unique id of the room.")
     name: str
-    type: RoomType = Field(description="Use of the room.")
+    type: RoomType = Field(description="Use of the room, the first of several.")
+    types: list[KnownRoomType] = Field([], description="All uses; empty if unknown.")
     area_m2: SquareMetres = Field(description="Floor area, without holes.")
     ceiling_height_m: float = Field(description="Height of the ceiling over the floor.")
     vertices: int = Field(description="Corners of the polygon.")

@@ -196,6 +196,8 @@ def test_manifest_states_objects_and_types() -> None:
 def furnished(*fixtures: tuple[str, float, float]) -> FloorPlan:
     """Return a plan of four equal rooms without types, 5 m apart, with fixtures of 0.6 m (kind, x, y)."""
     document = plan("unknown", "unknown", "unknown", "unknown").to_dict()
+    for room in document["rooms"]:
+        room["types"] = []
     for kind, x, y in fixtures:
         outline = [[x, y], [x + 0.6, y], [x + 0.6, y + 0.6], [x, y + 0.6]]
         document.setdefault("fixtures", []).append({"kind": kind, "outline": outline})

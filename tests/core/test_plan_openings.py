@@ -282,6 +282,46 @@ def test_room_type_from_label() -> None:
     assert {label: room_type_from_label(label) for label in expected} == expected
 
 
+@pytest.mark.parametrize(
+    ("name", "types"),
+    [
+        ("Küche", "kitchen"), ("Chambre 2", "bedroom"), ("LivingRoom", "living"), ("Bad/WC", "bathroom"), ("X17", ""),
+        ("Soveværelser", "bedroom"), ("Łazienka", "bathroom"), ("En-suite bathroom", "bathroom"), ("ET", "entrance"),
+        ("洗面脱衣室", "bathroom"), ("Wohnküche", "living kitchen"), ("Wohn-/Essbereich", "living dining"),
+        ("K/F", "kitchen living"), ("LDK 15.2", "living dining kitchen"), ("Kitchen & Dining Room", "kitchen dining"),
+        ("Sala de jantar / cozinha", "dining kitchen"), ("Salon salle à manger", "living dining"),
+        ("リビング・ダイニング", "living dining"), ("Bath / laundry", "bathroom laundry"), ("W/C", "bathroom"),
+        ("Bedroom closet", "bedroom"), ("Salon z aneksem", "living kitchen"), ("Bedroom and office", "bedroom office"),
+    ],
+)  # fmt: skip
+def test_name_of_a_room_gives_its_types(name: str, types: str) -> None:
+    room = with_room(name=name).rooms[0]
+    assert room.types == tuple(types.split())
+    assert room.type == (types.split() or ["unknown"])[0]
+
+
+def test_stated_types_replace_those_of_the_name() -> None:
+    assert with_room(name="Kitchen", type="office").rooms[0].types == ("office",)
+    several = with_room(name="Kitchen", types=["dining", "living", "dining"])
+    assert several.rooms[0].types == ("dining", "living")
+    assert FloorPlan.from_dict(several.to_dict()).rooms[0].types == ("dining", "living")
+    assert with_room(name="Kitchen", types=[]).rooms[0].types == ()
+    with pytest.raises(InvalidFloorPlanError, match="'bedroom', which types does not list"):
+        with_room(type="bedroom", types=["kitchen"])
+    with pytest.raises(InvalidFloorPlanError, match="unknown"):
+        with_room(types=["unknown"])
+
+
+def test_fixtures_add_types() -> None:
+    stove = {"kind": "stove", "outline": rectangle(0.6, 0.6, corner=(1, 1))}
+    document = ROOMS | {"fixtures": [stove]}
+    document["rooms"] = [ROOMS["rooms"][0] | {"name": "Lounge"}, *ROOMS["rooms"][1:]]
+    plan = FloorPlan.from_dict(document)
+    assert plan.rooms[0].types == ("living", "kitchen")
+    assert plan.type_shares[0].sum() == pytest.approx(1.0)
+    assert FloorPlan.from_dict(plan.to_dict()).rooms[0].types == ("living", "kitchen")
+
+
 def test_all_plan_fields_round_trip() -> None:
     document = ROOMS | {"openings": [DOOR | {"name": "front", "sill_m": 0.0, "head_m": 2.0, "rooms": ["room-1"]}]}
     document["rooms"][0] |= {
@@ -335,3 +375,14 @@ class TestJson:
     )
     def test_messages_use_json_types(self, value: Any, word: str) -> None:
         assert f"a plan must be an object, not {word}" in refused(FloorPlan.from_dict, value)
+
+
+@pytest.mark.parametrize("types", [[], ["living"], ["living", "office"], None])
+def test_types_survive_writing_beside_names_and_fixtures(types: list[str] | None) -> None:
+    room = {"name": "Kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]}
+    stove = {"kind": "stove", "outline": [[1, 1], [1.6, 1], [1.6, 1.6], [1, 1.6]]}
+    bed = {"kind": "bed", "outline": [[2, 1], [3, 1], [3, 2], [2, 2]]}
+    document = {"rooms": [room if types is None else room | {"types": types}], "fixtures": [stove, bed]}
+    plan = FloorPlan.from_dict(document)
+    assert plan.rooms[0].types == (("kitchen", "bedroom") if types is None else tuple(types))
+    assert FloorPlan.from_dict(plan.to_dict()).rooms[0].types == plan.rooms[0].types

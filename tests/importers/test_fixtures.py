@@ -68,9 +68,10 @@ def test_blocks_of_a_dxf_become_fixtures_and_type_their_rooms() -> None:
     ]  # fmt: skip
 
 
-def test_contradicting_fixtures_give_no_type() -> None:
+def test_fixtures_of_several_uses_give_several_types() -> None:
     content = two_rooms_dxf(("Stove", "F", (0.6, 0.6), (0.2, 0.2)), ("Bed", "F", (1.6, 2.0), (2.0, 0.5)))
-    assert kinds_and_types(import_plan(content).document) == (["bed", "stove"], [None, None])
+    rooms = import_plan(content).document["rooms"]
+    assert [room["types"] for room in rooms if "types" in room] == [["bedroom", "kitchen"]]
 
 
 def test_fixtures_of_unusual_size_are_left_out_with_a_note() -> None:

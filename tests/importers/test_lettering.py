@@ -197,7 +197,7 @@ def test_scale_that_contradicts_the_texts_gives_warnings():
     assert plan.report.metres_per_unit == 0.02
     written, areas = plan.report.warnings
     assert "dimensions written in the drawing give 0.0142" in written or "give 0.0143" in written
-    assert "the areas written in 3 rooms are 0.5" in areas
+    assert "the areas and sides written in 3 rooms are 0.5" in areas
     assert "multiplied by 0.7" in areas
 
 

@@ -17,6 +17,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
@@ -35,7 +36,7 @@ from lalaloc_core.importers.common.sketch import (
     SketchedOpening,
     SketchedRoom,
 )
-from lalaloc_core.importers.common.vocabulary import Role, role_from_name, room_type_from_name
+from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 
 _FEATURE_TYPES: Mapping[str, Role] = {
     "unit": "room", "room": "room", "corridor": "room", "area": "room", "opening": "door", "door": "door",
@@ -58,6 +59,8 @@ _USUAL_WIDTH_M: Mapping[OpeningKind, float] = {"door": 0.9, "window": 1.2, "pass
 _LENGTH = re.compile(r"(\d{1,9}(?:[.,]\d{1,99})?)\s*(mm|cm|m|ft|in|'|\"|)(?:\s*(\d{1,9}(?:\.\d{1,99})?)\s*(?:in|\"))?")
 _RANGE = re.compile(r"(-?\d{1,3})\s*-\s*(-?\d{1,3})")
 _MAX_LEVELS = 200
+# Types of a feature, and characters of them, that are read.
+_MAX_TYPES, _MAX_TEXT = 10, 200
 # Further levels of all features together: shafts and stairs are on all levels.
 _REPEATS, _REPEATS_PER_FEATURE = 1000, 5
 # Properties of outdoor features in OpenStreetMap, and properties of features inside buildings.
@@ -104,7 +107,9 @@ def import_features(
     if not features:
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
     _refuse_map(features, format)
-    project, anchor, metres_per_unit, source = projection([feature.shape for feature in features], crs, options)
+    project, anchor, metres_per_unit, source, warnings = projection(
+        [feature.shape for feature in features], crs, options
+    )
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
     on_any_level: list[Feature] = []
@@ -128,7 +133,7 @@ def import_features(
     by_level = _levels_with_rooms(by_level, is_indoor)
 
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
-        builder = ReportBuilder(format, metres_per_unit, source)
+        builder = ReportBuilder(format, metres_per_unit, source, warnings=list(warnings))
         sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
         if anchor is not None:
             sketch.north_deg = anchor.north_deg
@@ -272,13 +277,13 @@ class _Drawer:
             builder.use(layer, "free-standing walls", max(len(pieces), 1))
             sketch.inner_walls += pieces
         else:
-            builder.use(layer, "ignored")
+            builder.leave_out(layer, role)
 
     def _add_rooms(self, feature: Feature, shape: BaseGeometry, layer: str) -> None:
         properties, parts = feature.properties, polygons_from_geometry(shape)
         self._builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
         name = _name(properties)
-        kind = _room_type(properties, name)
+        types = _room_types(properties, name)
         ceiling_m = _number(properties, "ceiling_height_m", "ceiling_height", "height")
         lowest_m, highest_m = ROOM_HEIGHT_M
         if ceiling_m is not None and not lowest_m <= ceiling_m <= highest_m:
@@ -288,7 +293,7 @@ class _Drawer:
             )
             ceiling_m = None
         room_id = feature.id if len(parts) == 1 else None
-        self._sketch.rooms += [SketchedRoom(part, name, kind, ceiling_m, room_id) for part in parts]
+        self._sketch.rooms += [SketchedRoom(part, name, types, ceiling_m, room_id) for part in parts]
 
     def _add_opening(self, feature: Feature, kind: OpeningKind, shape: BaseGeometry, layer: str) -> None:
         properties, name = feature.properties, _name(feature.properties)
@@ -355,10 +360,12 @@ def in_english(value: Any) -> Any:
     return value.get("en") or next(iter(value.values()), None) if isinstance(value, Mapping) else value
 
 
-def _room_type(properties: Mapping[str, Any], name: str | None) -> str | None:
-    words = [properties.get(key) for key in ("type", "room", "category", "indoor")]
-    found = [room_type_from_name(str(word)) for word in words if isinstance(word, str)]
-    return next((kind for kind in found if kind is not None), None) or room_type_from_name(name)
+def _room_types(properties: Mapping[str, Any], name: str | None) -> tuple[str, ...]:
+    several = properties.get("types")
+    words = [" / ".join(map(str, several[:_MAX_TYPES])) if isinstance(several, list) else several]
+    words += [properties.get(key) for key in ("type", "room", "category", "indoor")]
+    found = [room_types_from_name(word[:_MAX_TEXT]) for word in words if isinstance(word, str)]
+    return next(filter(None, found), None) or room_types_from_name(name)
 
 
 def _number(properties: Mapping[str, Any], *keys: str) -> float | None:

@@ -119,6 +119,11 @@ def room_type_losses(predicted: PredictedRoomType, floor: float) -> Float[np.nda
     return np.maximum(loss, 0.0)
 
 
+def losses_of_rooms(loss: Float[np.ndarray, "t"], type_shares: Float[np.ndarray, "r t"]) -> Float[np.ndarray, "r"]:
+    """Return the cost of every room's types: a photograph of a room with several shows any of them."""
+    return -np.log(type_shares @ np.exp(-loss))
+
+
 def class_losses(
     probability: Float[np.ndarray, "*n c"],
     prior: Float[np.ndarray, "c"],

@@ -22,7 +22,7 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
   do not exist as it misses: m(k | c) = t_c [k = c] + (1 - t_c) m(k), with m(k) ∝ π(k) (1 - t_k) where no opening is
   drawn. Merged plans keep their trusts: constants make the expected losses at the right pose equal (`opening_losses`).
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
-* **Room type.** As openings, once per room.
+* **Room type.** As openings, once per room. A room with several types has the mean likelihood of these.
 * **Objects.** As the room type, by the objects that a classifier of photographs recognises. It replaces the room type,
   because encoders that learnt from renderings do not recognise real rooms, and is an unweighted log likelihood.
 
@@ -39,12 +39,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import MatchingWeights
-from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI
+from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match.cost_terms import (
     SeenWalls,
     WallMode,
     ceiling_costs,
+    losses_of_rooms,
     mean_log,
     median_distance_m,
     opening_losses,
@@ -389,8 +390,7 @@ class MatchingCost:
     def _by_room(self, predicted: PredictedRoomType | None) -> Float[np.ndarray, "r"]:
         if predicted is None or not self._config.use_room_type:
             return np.zeros(len(self._plan.rooms))
-        losses = room_type_losses(predicted, self._config.floor)
-        return losses[[ROOM_TYPES.index(room.type) for room in self._plan.rooms]]
+        return losses_of_rooms(room_type_losses(predicted, self._config.floor), self._plan.type_shares)
 
     def _ceilings(self, offset: Float[np.ndarray, "j"]) -> Float[np.ndarray, "j r"]:
         """Return the cost of every room's ceiling at each δ."""

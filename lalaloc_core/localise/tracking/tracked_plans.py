@@ -123,7 +123,7 @@ def _passed_on(mass: Float[np.ndarray, "a"], leads_to: Bool[np.ndarray, "a a"]) 
 def _shafts(plan: FloorPlan) -> list[tuple[int, bool]]:
     """Return the number of each room that is stairs or a lift, and whether it is a lift."""
     found = [(number, _is_lift(room)) for number, room in enumerate(plan.rooms)]
-    return [(number, lift) for number, lift in found if lift or plan.rooms[number].type == "stairs"]
+    return [(number, lift) for number, lift in found if lift or "stairs" in plan.rooms[number].types]
 
 
 def _is_lift(room: Room) -> bool:

@@ -84,7 +84,9 @@ def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
     rows["openings"] = packed_openings(kind[:, columns])
     rows["log_area"] = np.log(floor_m2[room] / np.bincount(room)[room])
     rows["ceiling_m"] = plan.ceiling_heights_m[room]
-    rows["room_type"] = np.array([ROOM_TYPES.index(plan_room.type) for plan_room in plan.rooms], np.uint8)[room]
+    # Rooms with several types count as unknown: the index only chooses the plans to search.
+    kinds = [each.type if len(each.types) == 1 else ROOM_TYPES[0] for each in plan.rooms]
+    rows["room_type"] = np.array([ROOM_TYPES.index(kind) for kind in kinds], np.uint8)[room]
     rows["claims"] = claims_of_trust(plan.opening_trust)
     return Prototypes(rows, grid.step_m)
 

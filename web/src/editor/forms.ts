@@ -123,8 +123,12 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: FormActio
   const set = (values: Partial<RoomDocument>): void => edit(change.changeRoom(current, index, values));
   return [
     h("h3", {}, "Room"),
-    text("room-form-name", "Name", room.name ?? "", (name) => set({ name })),
-    choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) => set({ type })),
+    text("room-form-name", "Name", room.name ?? "", (name) =>
+      set({ name, types: room.types?.length ? room.types : undefined }),
+    ),
+    choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) =>
+      set({ type, types: type === "unknown" ? [] : undefined }),
+    ),
     number(
       "room-form-ceiling",
       "Ceiling, m",
