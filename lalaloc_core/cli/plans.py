@@ -124,7 +124,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"--picture draws one plan and the file has {len(imports)} levels; add --level")
     for imported in imports:
         plan = imported.plan()
-        warnings = [*imported.report.warnings, *imported.report.unsure, *plan.warnings]
+        report = imported.report
+        warnings = list(dict.fromkeys([*report.warnings, *report.unsure, *plan.warnings]))
         messages += warnings
         summary = {"rooms": len(plan.rooms), "area_m2": round(plan.area_m2, 2), "openings": len(plan.openings)}
         plans.append({"name": plan.name, **summary, "warnings": warnings})

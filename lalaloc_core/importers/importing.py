@@ -134,6 +134,8 @@ _FORMATS = (
     _format("osm", "OpenStreetMap (XML, Overpass JSON)", _OSM, "osm", "level layers", magic=_xml("osm"),
             keys=frozenset({"elements"})),
     _format("roomplan", "RoomPlan", "application/json", "json", "level", keys=frozenset({"walls", "doors", "windows"})),
+    _format("valetudo", "Valetudo map (JSON or PNG)", "application/json", "json", "",
+            keys=frozenset({"pixelSize", "layers"})),
     _format("imdf", "IMDF", "application/zip", "imdf.zip", "level layers", magic=re.compile(rb"PK\x03\x04")),
     _format("ros", "ROS map (zip archive of YAML and PGM)", "application/zip", "map.zip", "metres_per_pixel",
             magic=re.compile(_ROS)),
@@ -300,7 +302,8 @@ def detect_media_type(content: bytes, format: str) -> str:
         return "application/zip"
     if content.startswith(b"\xff\xd8\xff"):
         return "image/jpeg"
-    return FORMATS[format].media_type
+    # A picture can have a map of another format as a text.
+    return FORMATS["picture" if content.startswith(b"\x89PNG") else format].media_type
 
 
 def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
@@ -309,6 +312,11 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
         document = read_json(content, limits.max_depth, limits.max_json_values)
         return _json_format(document), document
     format = _format_by_magic(content)
+    if format.name == "picture":
+        from lalaloc_core.importers.formats.valetudo import map_in_picture
+
+        found = map_in_picture(content, limits)
+        return (format, content) if found is None else (_json_format(found), found)
     if format.name != "imdf":
         return format, content
     from lalaloc_core.importers.formats.ros import YAML_SUFFIXES
@@ -349,7 +357,8 @@ def _json_format(document: Any) -> Format:
         members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
         raise InvalidFloorPlanError(
             f"the JSON has the members {members}, of no known format; the native format has 'rooms' or 'plans', "
-            "GeoJSON 'type', OpenStreetMap 'elements', and RoomPlan 'walls', 'doors' and 'windows'"
+            "GeoJSON 'type', OpenStreetMap 'elements', RoomPlan 'walls', 'doors' and 'windows', and Valetudo "
+            "'pixelSize' and 'layers'"
         )
     found = "a list" if isinstance(document, list) else "a single value"
     raise InvalidFloorPlanError(

@@ -39,28 +39,18 @@ _FILE = "file"
 _MAX_LEVEL = 1000.0
 # Media types that clients send; the actual format is detected from the content.
 _FILES = (
-    JSON,
-    "application/geo+json",
-    "application/zip",
-    "application/pdf",
-    "application/xml",
-    "image/svg+xml",
-    "image/png",
-    "image/jpeg",
-    "image/vnd.dxf",
-    "application/dxf",
-    "application/x-step",
-    "application/octet-stream",
-)
+    JSON, "application/geo+json", "application/zip", "application/pdf", "application/xml", "image/svg+xml",
+    "image/png", "image/jpeg", "image/vnd.dxf", "application/dxf", "application/x-step", "application/octet-stream",
+)  # fmt: skip
 _BYTES = {"schema": BINARY}
 
 
 def _form_schema(form: type[BaseModel]) -> dict[str, Any]:
     schema = form.model_json_schema()
     schema["properties"][_FILE] = BINARY | {
-        "description": "GeoJSON, an IMDF archive, OpenStreetMap (XML or Overpass JSON), a RoomPlan scan, SVG, DXF, IFC "
-        "(also zipped), PDF, PNG, JPEG, or JSON in the native format (FloorPlanDocument). The format is detected from "
-        "the content."
+        "description": "GeoJSON, an IMDF archive, OpenStreetMap (XML or Overpass JSON), a RoomPlan scan, a Valetudo "
+        "map, SVG, DXF, IFC (also zipped), PDF, PNG, JPEG, or JSON in the native format (FloorPlanDocument). The "
+        "format is detected from the content."
     }
     schema["required"] = [_FILE]
     return schema

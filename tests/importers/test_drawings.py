@@ -14,7 +14,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.vocabulary import role_from_name, room_type_from_name, room_type_from_reading
+from lalaloc_core.importers.common.vocabulary import role_from_name, room_types_from_reading
 from lalaloc_core.importers.drawing.drawing_scale import scale_by_dimensions
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import dxf_file, lines, shapes
@@ -291,14 +291,6 @@ def test_role_of_a_layer(layer: str, role: str | None):
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [("Küche", "kitchen"), ("Chambre 2", "bedroom"), ("LivingRoom", "living"), ("Bad/WC", "bathroom"), ("X17", None)],
-)
-def test_type_of_a_room(name: str, kind: str | None):
-    assert room_type_from_name(name) == kind
-
-
-@pytest.mark.parametrize(
     ("text", "kind"),
     [
         ("lving room", "living"),
@@ -313,7 +305,7 @@ def test_type_of_a_room(name: str, kind: str | None):
     ],
 )
 def test_misread_name_of_a_room_is_one(text: str, kind: str | None):
-    assert room_type_from_reading(text) == kind
+    assert room_types_from_reading(text) == (() if kind is None else (kind,))
 
 
 def _dimensioned_svg(unit: float, texts: tuple[str, ...]) -> bytes:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import import_plan
+from lalaloc_core.importers import import_plan, import_plans
 from tests.importers.conftest import shapes, zip_file
 
 FOLDER = Path(__file__).parent / "faults"
@@ -26,19 +26,30 @@ class _Expected:
 
 
 _DOOR_AND_WINDOW = {"door": 1, "window": 1}
+_THREE = frozenset({"kitchen", "bedroom", "bathroom"})
 _FLAT_OF_FOUR = (30.1, 20.9, 13.4, 1.6)
 EXPECTED = {
+    "centred_origin.dxf": _Expected((18.9, 14.7, 12.6), types=_THREE),
     "door_curtain.ifc": _Expected((19.2, 16.0), _DOOR_AND_WINDOW),
     "door_ok.ifc": _Expected((19.2, 16.0), _DOOR_AND_WINDOW),
     "door_space.ifc": _Expected((19.2, 16.0), _DOOR_AND_WINDOW),
     "door_wall.ifc": _Expected((19.2, 16.0), _DOOR_AND_WINDOW),
+    "half_size_a3.pdf": _Expected((38.9, 32.1), {"door": 1}, said="for A1, 2 times the page"),
+    "illustrator.svg": _Expected((24.1, 16.9), types=frozenset({"kitchen", "bedroom"})),
+    "lat_lon.geojson": _Expected((24.2, 21.0, 19.8), said="latitude and longitude"),
     "low_attic.ifc": _Expected((19.2, 16.0), said="room 'Eaves' (34.2 m², 100 % of the floor) is 1.20 m high"),
     "low_cell.gml": _Expected((20.0,), said="room 'Store' (3.6 m², 15 % of the floor) is 1.25 m high"),
     "low_cupboard.ifc": _Expected((19.2, 16.0), said="'Understairs' (2.4 m², 6 % of the floor) is 1.30 m high"),
+    "mline_walls.dxf": _Expected((25.1, 18.2), {"door": 1}),
     "painted_doors_leaf60.pdf": _Expected((13.6,) * 6, {"door": 4}),
     "painted_openings.pdf": _Expected((13.6,) * 6, {"door": 5, "window": 6}),
     "pillars.dxf": _Expected((34.8, 34.8), {"passage": 1}),
     "pillars_off.dxf": _Expected((35.0, 35.0), {"passage": 1}),
+    "renovation.dxf": _Expected((33.6, 20.4), {"door": 1}, said="'A-WALL-DEMO' shows what is to be demolished"),
+    "revit_areas.ifc": _Expected((30.8, 10.4, 8.5), said="'Gross Building Area' (60.0 m²) covers 3 rooms"),
+    "right_a1.pdf": _Expected((38.9, 32.1), {"door": 1}),
+    "right_aligned.dxf": _Expected((18.9, 14.7, 12.6), types=_THREE),
+    "right_order.geojson": _Expected((24.2, 21.0, 19.8)),
     "rooms_by_use.dxf": _Expected(
         (20.0, 18.2, 15.2, 15.2, 11.2, 10.6), types=frozenset({"meeting", "office", "bathroom", "storage"})
     ),
@@ -51,11 +62,18 @@ EXPECTED = {
     "stepped_hall.ifc": _Expected((54.0, 12.0)),
     "thick_closed_outer.svg": _Expected(_FLAT_OF_FOUR, {"passage": 3}),
     "thick_closed_outer_control.svg": _Expected(_FLAT_OF_FOUR, {"passage": 3}),
+    "valetudo.json": _Expected((26.9, 19.3), {"passage": 1}, frozenset({"living", "bedroom"})),
     "wall_body_grey.svg": _Expected((23.5, 23.5)),
     "wall_body_pier.svg": _Expected((23.5, 22.5)),
     "wall_body_thin.svg": _Expected((23.5, 23.5)),
+    "wide_walls.dxf": _Expected((23.9, 17.2), {"door": 1}),
 }
-REFUSED = {"no_spaces.ifc": "export it with rooms"}
+REFUSED = {
+    "ha_floorplan.svg": "if the plan is a picture, send that PNG or JPEG",
+    "levels_by_layer.dxf": "EG.*OG",
+    "no_spaces.ifc": "export it with rooms",
+    "xref_only.dxf": "attaches '.*ground-floor.dwg', which is not in the file: bind it",
+}
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -69,13 +87,24 @@ def test_file_is_read_right(name: str):
         assert Counter(opening["kind"] for opening in plan.document.get("openings", ())) == expected.openings
     assert expected.types <= {room.get("type") for room in plan.document["rooms"]}
     report = plan.report
-    assert any(expected.said in line for line in (*report.notes, *report.warnings, *report.unsure, ""))
+    lines = (*report.notes, *report.warnings, *report.unsure, report.scale_source, "")
+    assert any(expected.said in line for line in lines)
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_file_is_refused_with_a_remedy(name: str):
     with pytest.raises(InvalidFloorPlanError, match=REFUSED[name]):
         import_plan(_content(name))
+
+
+def test_storeys_on_layers_of_their_own_are_plans():
+    plans = import_plans(_content("levels_by_layer.dxf"))
+    assert [plan.level and plan.level.name for plan in plans] == ["EG", "OG"]
+    assert [round(sum(room.area for room in shapes(plan.document)), 1) for plan in plans] == [79.9, 79.9]
+
+
+def test_picture_of_a_robots_map_has_the_map():
+    assert import_plan(_content("valetudo.png")).document == import_plan(_content("valetudo.json")).document
 
 
 def test_every_file_is_expected():

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import math
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from ezdxf.enums import TextEntityAlignment
 from ezdxf.filemanagement import new as new_dxf
 from scipy import ndimage
 
-from lalaloc_core.importers import ImportedPlan, import_plan
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers import ImportedPlan, import_plan, import_plans
 from lalaloc_core.importers.common.geometry import find_floor
+from lalaloc_core.importers.drawing.drawing_scale import _AT_SHEET
 from tests.importers.conftest import dxf_file, lines, shapes, zip_file
 from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import SETTINGS, _picture
@@ -219,3 +224,97 @@ def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple
     plan = import_plan(zip_file({"map.yaml": yaml.safe_dump(SETTINGS), "map.pgm": _picture(turned)}))
     assert len(shapes(plan.document)) == 2
     assert any("never seen" in line for line in plan.report.unsure)
+
+
+def _storeys(*layers: str) -> dict[str, list[float]]:
+    """Return the areas of the storeys of a drawing with a wall of 8 x 6 m, and a partition, on each layer."""
+    document: Any = new_dxf("R2010", units=6)
+    for number, layer in enumerate(layers):
+        for inner in (0.0, 0.3):
+            ring = [(inner, inner), (8.0 - inner, inner), (8.0 - inner, 6.0 - inner), (inner, 6.0 - inner)]
+            document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
+        for x in (3.0 + number, 3.2 + number):
+            document.modelspace().add_line((x, 0.3), (x, 5.7), dxfattribs={"layer": layer})
+    plans = import_plans(dxf_file(document))
+    return {plan.level.name if plan.level else "": _areas(plan) for plan in plans}
+
+
+def test_words_for_storeys_count_before_numbers_of_layers():
+    assert _storeys("01_EG_Wand", "04_OG_Wand") == {"EG": [24.3, 14.6], "OG": [20.0, 18.9]}
+
+
+@pytest.mark.parametrize("layers", [("WALL-RC", "WALL-PB"), ("A_²", "WALL")])
+def test_layers_of_one_storey_are_one_plan(layers: tuple[str, str]):
+    assert list(_storeys(*layers)) == [""]
+
+
+@pytest.mark.parametrize("layers", [("WALL_0", "EG-Wand", "OG-Wand"), ("EG-Wand", "WALL_0", "OG-Wand")])
+def test_a_word_names_a_storey_whose_number_another_layer_has(layers: tuple[str, ...]):
+    assert list(_storeys(*layers)) == ["EG", "OG"]
+
+
+def _robot_map(*segments: list[list[int]], walls: list[list[int]]) -> bytes:
+    """Return a map with cells of 5 cm; segments and walls are boxes (x, y, width, height) in cells."""
+
+    def runs(boxes: list[list[int]]) -> list[int]:
+        return [value for x, y, width, height in boxes for row in range(y, y + height) for value in (x, row, width)]
+
+    layers = [{"type": "segment", "compressedPixels": runs(boxes)} for boxes in segments]
+    layers.append({"type": "wall", "compressedPixels": runs(walls)})
+    return json.dumps({"pixelSize": 5, "layers": layers}).encode()
+
+
+def test_walls_of_a_robots_map_with_a_jog_have_no_passage():
+    # The wall between the rooms has a jog of a cell, and the second room stops a cell before it.
+    first, second = [[0, 0, 80, 10], [0, 10, 79, 70]], [[83, 0, 60, 80]]
+    walls = [[80, 0, 2, 10], [79, 10, 2, 70]]
+    assert "openings" not in import_plan(_robot_map(first, second, walls=walls)).document
+    door = [[80, 0, 2, 10], [79, 10, 2, 30], [79, 58, 2, 22]]
+    (opening,) = import_plan(_robot_map(first, second, walls=door)).document["openings"]
+    assert math.dist(*opening["line"]) == pytest.approx(0.9, abs=0.11)
+
+
+@pytest.mark.parametrize("run", [[0, 0, 0], [0, 0, -5], [0, 0, 1.5], [0, 0]])
+def test_cells_of_a_robots_map_are_whole_numbers(run: list[float]):
+    document = {"pixelSize": 5, "layers": [{"type": "segment", "compressedPixels": run}]}
+    with pytest.raises(InvalidFloorPlanError, match="the cells of layer 0 of the map must be"):
+        import_plan(json.dumps(document).encode())
+
+
+def test_fixtures_belong_to_the_storey_of_their_layer():
+    document: Any = new_dxf("R2010", units=6)
+    stove = document.blocks.new("Herd")
+    stove.add_lwpolyline([(0.0, 0.0), (0.6, 0.0), (0.6, 0.6), (0.0, 0.6)], close=True)
+    for layer in ("EG-Wand", "OG-Wand"):
+        for inner in (0.0, 0.3):
+            ring = [(inner, inner), (5.0 - inner, inner), (5.0 - inner, 4.0 - inner), (inner, 4.0 - inner)]
+            document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
+    document.modelspace().add_blockref("Herd", (1.0, 1.0), dxfattribs={"layer": "EG-Möbel"})
+    ground, upper = import_plans(dxf_file(document))
+    assert [room.get("type") for room in ground.document["rooms"]] == ["kitchen"]
+    assert [room.get("type") for room in upper.document["rooms"]] == [None]
+
+
+def test_text_without_a_place_is_skipped_and_that_between_points_is_in_their_middle():
+    document: Any = new_dxf("R2010", units=6)
+    space = document.modelspace()
+    for x in (0.0, 4.2):
+        space.add_lwpolyline(
+            [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0)], close=True, dxfattribs={"layer": "Rooms"}
+        )
+    space.add_text("Küche").set_placement((4.4, 1.0), (8.0, 1.0), align=TextEntityAlignment.FIT)
+    space.add_text("Bad").dxf.discard("insert")
+    names = {
+        round(room["polygon"][0][0]): room.get("name") for room in import_plan(dxf_file(document)).document["rooms"]
+    }
+    assert sorted(filter(None, names.values())) == ["Küche"]
+
+
+def test_room_with_an_area_drawn_twice_in_it_stays():
+    square = '<path class="room" d="M{0} {0}H{1}V{1}H{0}Z"/>'
+    assert max(_areas(_svg(square.format(0, 600), square.format(50, 330), square.format(50, 330)))) > 27.0
+
+
+def test_sheet_number_after_a_scale_is_no_paper():
+    assert _AT_SHEET.search("1:100  A1.01") is None
+    assert _AT_SHEET.search("1:100 (A1)")

@@ -51,6 +51,26 @@ def test_nested_xml_entities():
     _assert_rejected(NESTED_ENTITIES, "declares entities")
 
 
+def test_references_to_many_entities_are_not_searched_one_by_one():
+    names = [f"e{number:04d}" for number in range(2000)]
+    subset = "".join(f'<!ENTITY {name} "x">' for name in names)
+    _assert_rejected(f"<!DOCTYPE svg [{subset}]>{SVG.format('&e0000;')}".encode(), "declares entities")
+
+
+def test_rooms_within_rooms_are_counted_before_they_are_compared(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shapely, "union_all", lambda shapes: pytest.fail("compared"))
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"indoor": "room"},
+            "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [size, 0], [size, size], [0, size], [0, 0]]]},
+        }
+        for size in np.linspace(10.0, 100.0, 600).tolist()
+    ]
+    document = {"type": "FeatureCollection", "units": "m", "features": features}
+    _assert_rejected(json.dumps(document).encode(), "600 rooms lie over one another")
+
+
 def test_external_xml_entities():
     _assert_rejected(EXTERNAL_ENTITY, "entities")
 

@@ -17,8 +17,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
+from lalaloc_core.floorplan.room_types import room_types_from_name, type_fields
 from lalaloc_core.importers.common.fixtures_by_name import place_fixtures, type_rooms
-from lalaloc_core.importers.common.geometry import check_network, distinct, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, check_overlaps, distinct, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
@@ -33,7 +34,7 @@ from lalaloc_core.importers.common.sketch import (
     T,
     choose_levels,
 )
-from lalaloc_core.importers.common.vocabulary import is_roof, room_type_from_name
+from lalaloc_core.importers.common.vocabulary import is_roof
 
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
@@ -42,6 +43,8 @@ _SIMPLER_M = (0.005, 0.01, 0.02)
 _FAR_M = 10_000.0
 # Up to this distance from an anchor, lengths and directions are accurate to a few centimetres.
 _MAX_ANCHOR_SHIFT_M = 20_000.0
+# Share of a room that lies in a larger one, and of the larger one that such rooms cover.
+_INSIDE, _COVERED = 0.95, 0.5
 # Resolution of coordinates: a tenth of a millimetre.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED, _MAX_USES = 5, 12
@@ -93,9 +96,10 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
         raise NoRoomError(
             f"no room was found in the {builder.format} file, which has {_contents(builder)}"
             + (f" (tried: {'; '.join(builder.notes[:_MAX_NAMED])})" if builder.notes else "")
-            + "; check layers, level and the scale"
+            + "; "
+            + "; ".join([*list(dict.fromkeys(builder.warnings))[:_MAX_NAMED], "check layers, level and the scale"])
         )
-    rooms = _without_low_rooms(rooms, builder)
+    rooms = _without_areas(_without_low_rooms(rooms, builder), builder)
     rooms, shift = _near_origin(rooms, builder)
     openings = [_shift_opening(opening, shift) for opening in sketch.openings]
     placed = place_openings(openings, [room.shape for room in rooms])
@@ -130,8 +134,9 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     # Coordinates on Earth have no unit that could be mistaken.
     builder.warnings.extend(check_document(document, is_scale_certain=sketch.anchor is not None))
     # Validate now, while the error can still refer to the file.
-    checked = (limits, FloorPlan.from_dict(document, limits))
-    return ImportedPlan(document, builder.build(), sketch.level, anchor, checked)
+    plan = FloorPlan.from_dict(document, limits)
+    builder.warnings += [warning for warning in plan.warnings if " overlap" in warning]
+    return ImportedPlan(document, builder.build(), sketch.level, anchor, (limits, plan))
 
 
 def _add_trust(document: dict[str, Any], sketch: Sketch, builder: ReportBuilder) -> None:
@@ -233,9 +238,31 @@ def _clean(
         holes = [ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2]
         shape = shapely.Polygon(floor.exterior, holes)
         name = clean_name(room.name)
-        kind = room.type or room_type_from_name(name)
-        cleaned.append(SketchedRoom(shape, name, kind, room.ceiling_height_m, room.id))
+        types = room.types or room_types_from_name(name)
+        cleaned.append(SketchedRoom(shape, name, types, room.ceiling_height_m, room.id))
     return cleaned
+
+
+def _without_areas(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:
+    """Leave out the areas that several other rooms lie in, such as the gross area of a storey, and say so."""
+    check_overlaps([room.shape for room in rooms], what="rooms")
+    tree, kept = shapely.STRtree([room.shape for room in rooms]), []
+    for index, room in enumerate(rooms):
+        inside = [
+            rooms[k]
+            for k in tree.query(room.shape, predicate="intersects").tolist()
+            if k != index
+            and rooms[k].shape.area < room.shape.area
+            and room.shape.intersection(rooms[k].shape).area >= _INSIDE * rooms[k].shape.area
+        ]
+        if len(inside) > 1 and shapely.union_all([part.shape for part in inside]).area > _COVERED * room.shape.area:
+            builder.warnings.append(
+                f"{_label(room)} ({room.shape.area:.1f} m²) covers {len(inside)} rooms, such as {_label(inside[0])}, "
+                "and was left out as an area; remove these if it is one room"
+            )
+        else:
+            kept.append(room)
+    return kept
 
 
 def _without_low_rooms(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:
@@ -354,8 +381,7 @@ def _room(room: SketchedRoom, ceiling_m: float | None, sketch: Sketch, shift: tu
     entry: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
     if room.name:
         entry = {"name": room.name} | entry
-    if room.type:
-        entry["type"] = room.type
+    entry |= type_fields(room.types)
     if room.shape.interiors:
         entry["holes"] = [_ring(ring) for ring in room.shape.interiors]
     walls = [affinity.translate(wall, *shift) for wall in sketch.inner_walls]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zipfile
 import zlib
@@ -15,6 +16,12 @@ from defusedxml import ElementTree as SafeElementTree
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
 
+# Declarations before the root, within so many bytes, and an entity of plain text; bytes that entities may add, and most
+# entities.
+_HEAD, _MAX_GROWN, _MAX_ENTITIES = 2**16, 2**20, 100
+_SUBSET = re.compile(rb"<!DOCTYPE[^\[>]*\[(.*?)\]\s*>", re.DOTALL)
+_ENTITY = re.compile(rb"""<!ENTITY\s+([\w.-]+)\s+(?:"([^"&%<]{0,1000})"|'([^'&%<]{0,1000})')\s*>""")
+_REFERENCE = re.compile(rb"&([\w.-]{1,100});")
 # Archives carry no time, so that equal plans give equal bytes.
 _EPOCH = (2000, 1, 1, 0, 0, 0)
 # Errors of the library for damaged archives; a name in an archive can be no text.
@@ -90,13 +97,42 @@ def local_name(element: Element) -> str:
     return str(element.tag).rpartition("}")[2]
 
 
+def _with_entities(content: bytes) -> bytes:
+    """Return XML with the entities that it declares in place of their names, unless they are long or refer to others.
+
+    Drawing programs write names of name spaces so.
+    """
+    subset = _SUBSET.search(content[:_HEAD])
+    if subset is None:
+        return content
+    values = {name: first or second for name, first, second in _ENTITY.findall(subset[1])}
+    if not 0 < len(values) <= _MAX_ENTITIES or b"<!ENTITY" in _ENTITY.sub(b"", subset[1]):
+        return content
+    quoted = {name: value.replace(b'"', b"&quot;").replace(b"'", b"&apos;") for name, value in values.items()}
+    grown = 0
+
+    def value_of(found: re.Match[bytes]) -> bytes:
+        nonlocal grown
+        value = quoted.get(found[1])
+        grown += 0 if value is None else len(value)
+        return found[0] if value is None or grown > _MAX_GROWN else value
+
+    body = _REFERENCE.sub(value_of, content[subset.end() :])
+    if grown > _MAX_GROWN:
+        return content
+    return content[: subset.start(1)] + _ENTITY.sub(b"", subset[1]) + content[subset.end(1) : subset.end()] + body
+
+
 def read_xml(content: bytes, budget: Budget) -> Element:
-    """Parse XML without entities and external references, and return its root."""
+    """Parse XML without external references, with short entities that refer to nothing, and return its root."""
     try:
-        root = SafeElementTree.fromstring(content, forbid_dtd=False, forbid_entities=True, forbid_external=True)
+        root = SafeElementTree.fromstring(
+            _with_entities(content), forbid_dtd=False, forbid_entities=True, forbid_external=True
+        )
     except defusedxml.EntitiesForbidden as error:
         raise InvalidFloorPlanError(
-            "the XML declares entities, which are not supported; save the file without them (a drawing as plain SVG)"
+            "the XML declares entities that are long or refer to others, which are not supported; save it without them "
+            "(Illustrator: presentation attributes, without editing capabilities; Inkscape: plain SVG)"
         ) from error
     except defusedxml.DefusedXmlException as error:
         raise InvalidFloorPlanError(

@@ -11,6 +11,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.importers.common.plausibility import OpeningTrust
+from lalaloc_core.importers.common.vocabulary import Role
 
 TracePart = Literal["line", "wall line", "door", "window", "passage", "other", "wall", "gap", "room", "no room"]
 # Corners of an area in metres.
@@ -116,6 +117,14 @@ class ReportBuilder:
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
         self.uses[layer or "(none)", used_as] += entities
+
+    def leave_out(self, layer: str, role: Role | None) -> None:
+        """Count an entity that is left out, and warn of what is to be demolished."""
+        self.use(layer, "ignored")
+        if role == "demolished":
+            self.warnings.append(
+                f"layer '{layer[:50]}' shows what is to be demolished and was left out; rename it if it stays"
+            )
 
     def build(self) -> ImportReport:
         """Return the finished report."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -13,14 +13,28 @@ from pyproj.exceptions import ProjError
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import LocalFrame, to_wgs84
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 
 _MAX_REACH_M = 5000.0
+# Latitudes beyond this are longitudes. Shares of square corners from which coordinates are in the right order and up to
+# which they are not, and cosines of corners that are square, and of those that count.
+_MAX_LATITUDE, _SQUARE, _OBLIQUE = 85.0, 0.9, 0.5
+_SQUARE_COSINE, _STRAIGHT = 0.05, 0.9
 
 
-def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportOptions) -> Any:
-    """Return the function from file coordinates to metres, the anchor, metres per unit, and the source of the scale.
+class Projection(NamedTuple):
+    """Conversion of file coordinates to metres, with the anchor, metres per unit, their source, and warnings."""
+
+    project: Callable[[BaseGeometry], BaseGeometry]
+    anchor: Anchor | None
+    metres_per_unit: float
+    source: str
+    warnings: tuple[str, ...] = ()
+
+
+def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportOptions) -> Projection:
+    """Return the conversion for the shapes of a file.
 
     `crs` is the code of the coordinate reference system, None for WGS84.
     """
@@ -28,7 +42,7 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
     low, high = points.min(axis=0), points.max(axis=0)
     if options.units is not None:
         factor = METRES_PER_UNIT[options.units]
-        return _scaling(factor, options), None, factor, "option units"
+        return Projection(_scaling(factor, options), None, factor, "option units")
     if crs is not None:
         try:
             convert = _refuse_infinite(lambda points: to_wgs84(crs, points))
@@ -52,13 +66,46 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
     def project(shape: BaseGeometry) -> BaseGeometry:
         return shapely.transform(shape, lambda points: frame.to_local(convert(points)))
 
+    if crs is None and np.abs([low, high]).max() <= _MAX_LATITUDE:
+        swapped = LocalFrame(frame.latitude, frame.longitude)
+        as_stated, exchanged = (
+            _square_share([shapely.transform(shape, change) for shape in shapes])
+            for change in (frame.to_local, lambda points: swapped.to_local(points[:, ::-1]))
+        )
+        if as_stated < _OBLIQUE and exchanged > _SQUARE:
+            found = projection([_flipped(shape) for shape in shapes], crs, options)
+            warning = (
+                "the positions are latitude and longitude, and were read so: in the order of GeoJSON, longitude first, "
+                "the rooms would not be square; exchange the two"
+            )
+            return found._replace(project=lambda shape: found.project(_flipped(shape)), warnings=(warning,))
     reach_m = float(np.abs(frame.to_local(convert(points))).max())
     if not reach_m <= _MAX_REACH_M:
         raise InvalidFloorPlanError(
             f"the features span {2.0 * reach_m:.0f} m; the limit for a plan is {2 * _MAX_REACH_M:g} m; "
             "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
-    return project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs
+    return Projection(project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs)
+
+
+def _flipped(shape: BaseGeometry) -> BaseGeometry:
+    return shapely.transform(shape, lambda points: points[:, ::-1])
+
+
+def _square_share(shapes: Sequence[BaseGeometry]) -> float:
+    """Return the share of the corners of polygons that are square, weighted by their sides; NaN without polygons."""
+    square = total = 0.0
+    for part in shapely.get_parts(shapes):
+        if isinstance(part, shapely.Polygon):
+            along = np.diff(np.asarray(part.exterior.coords), axis=0)
+            length = np.linalg.norm(along, axis=1)
+            before, before_length = np.roll(along, 1, axis=0), np.roll(length, 1)
+            weight = np.minimum(length, before_length)
+            cosine = (along * before).sum(axis=1) / np.maximum(length * before_length, 1e-12)
+            turns = np.abs(cosine) < _STRAIGHT
+            square += float(weight[turns & (np.abs(cosine) < _SQUARE_COSINE)].sum())
+            total += float(weight[turns].sum())
+    return square / total if total > 0.0 else math.nan
 
 
 def _middle(lon_lat: Float[np.ndarray, "n 2"]) -> tuple[float, float]:

@@ -40,7 +40,7 @@ class SketchedRoom:
 
     shape: shapely.Polygon
     name: str | None = None
-    type: str | None = None
+    types: tuple[str, ...] = ()
     ceiling_height_m: float | None = None
     id: str | None = None
 
@@ -68,6 +68,7 @@ class SketchedFixture:
 
     kind: str
     shape: shapely.Polygon
+    layer: str = ""
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,29 @@ import numpy as np
 import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.geometry import side_lengths
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
 _WRITTEN = re.compile(r"(?<![\d.,:])1\s?[:/]\s?(\d{1,4})(?![\d.,:])")
+# Longer sides of sheets (m), and a scale that is for one of them: "1:50 @ A1", "1:100 (A3)".
+_SHEETS_M = {"A0": 1.189, "A1": 0.841, "A2": 0.594, "A3": 0.42, "A4": 0.297, "ARCH D": 0.914, "ARCH E": 1.219,
+             "ARCH C": 0.61, "ANSI B": 0.432, "ANSI C": 0.559, "ANSI D": 0.864, "ANSI E": 1.118}  # fmt: skip
+_AT_SHEET = re.compile(
+    rf"1\s?[:/]\s?\d{{1,4}}\W{{0,3}}(?:at|on|auf|sur|en|su|in|op)?\W{{0,3}}({'|'.join(_SHEETS_M)})(?!\w|[.-]\w)",
+    re.IGNORECASE,
+)
 # Common scales of building drawings.
 _USUAL = {10, 20, 25, 33, 48, 50, 64, 75, 96, 100, 125, 150, 192, 200, 250, 300, 400, 500, 1000}
 # "4.20", "4,205 m", "420", "4200 mm".
 _METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{2,5})\s*(m|cm|mm|)")
-_IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″])?")
+_IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″]?)?")
+# Sides of a room: "11'5\" x 12'9\"", "9 ft 6 in x 13 ft", "4.84m x 5.52m", "5,0x3,6".
+_FEET = r"(\d{1,2})\s*(?:['′’`]|ft\.?|feet)\s*-?,?\s*(?:(\d{1,2})\s*½?\s*(?:[\"″”]|''|in\b\.?)?)?"
+_METRES = r"(\d{1,2}[.,]\d{1,3})\s*m?()"
+_SIDES = [re.compile(rf"{side}\s*(?:[x×*]|by)\s*{side}", re.IGNORECASE) for side in (_FEET, _METRES)]
 # Whole numbers without a unit are millimetres from here on, and centimetres or millimetres below it.
 _SURELY_MM = 1000
 _LENGTH_M = (0.2, 200.0)
@@ -40,6 +52,11 @@ _AGREE, _MIN_AGREEING, _MIN_LENGTHS, _MARGIN = 0.01, 3, 2, 2
 # Area written in a room, and its range (m²). Lengths and areas that differ by larger shares are reported.
 _AREA = re.compile(r"(\d{1,4}(?:[.,]\d{1,2})?)\s*(m²|m2|qm|sqm|sq\.? ?m|sq\.? ?ft|sf)(?![a-z])", re.IGNORECASE)
 _SQUARE_FOOT_M2, _AREA_M2 = 0.3048**2, (0.5, 2000.0)
+# Range of sides of rooms (m), and the difference of the logs of ratios of sides that are of one shape; inches of a
+# foot.
+_SIDE_M, _SAME_RATIO, _INCHES = (0.6, 40.0), 0.15, 12.0
+# Rooms whose areas or sides must be written for a warning.
+_MIN_AREAS = 2
 _TOLERANCE, _AREA_TOLERANCE = 0.05, 0.25
 # Usual size of a drawing (m).
 _EXTENT_M = (3.0, 300.0)
@@ -57,17 +74,18 @@ def drawing_scale(
     check_time: Callable[[], None] = lambda: None,
     *,
     paper_m_per_unit: float | None = None,
+    paper_m: float | None = None,
     own: tuple[float, str] | None = None,
     guess: Callable[[], tuple[float, str] | None] = lambda: None,
 ) -> tuple[float, str]:
     """Return metres per unit of a drawing, and the source of that value.
 
     The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
-    a unit has a length on paper, then the dimensions of the first drawing that has them, then the `guess`. `subject`
-    names the file in the error message, and `check_time` raises an exception to stop. The option `multiply` multiplies
-    any of them.
+    a unit has a length on paper (also "1:50 @ A1", on a page whose longer side is `paper_m`), then the dimensions of
+    the first drawing that has them, then the `guess`. `subject` names the file in the error message, and `check_time`
+    raises an exception to stop. The option `multiply` multiplies any of them.
     """
-    factor, source = _given_scale(options, subject, drawings, check_time, paper_m_per_unit, own, guess)
+    factor, source = _given_scale(options, subject, drawings, check_time, paper_m_per_unit, paper_m, own, guess)
     if options.multiply is None:
         return factor, source
     return _checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)", subject)
@@ -79,6 +97,7 @@ def _given_scale(
     drawings: Sequence[Drawing],
     check_time: Callable[[], None],
     paper_m_per_unit: float | None,
+    paper_m: float | None,
     own: tuple[float, str] | None,
     guess: Callable[[], tuple[float, str] | None],
 ) -> tuple[float, str]:
@@ -98,9 +117,13 @@ def _given_scale(
         return METRES_PER_UNIT[options.units], "option units"
     if own is not None:
         return _checked(*own, subject)
-    written = _written_scale(lettering.text for drawing in drawings for lettering in drawing.letterings)
+    texts = [lettering.text for drawing in drawings for lettering in drawing.letterings]
+    written = _written_scale(texts)
     if written is not None and paper_m_per_unit is not None:
-        return _checked(written * paper_m_per_unit, f"1:{written:g}, written in the drawing", subject)
+        sheet, larger = _sheet(texts, paper_m)
+        source = f"1:{written:g}, written in the drawing"
+        source += f" for {sheet}, {larger:.3g} times the page" if sheet else ""
+        return _checked(written * larger * paper_m_per_unit, source, subject)
     if measured := next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None):
         return _checked(*measured, subject)
     if guessed := guess():
@@ -127,6 +150,17 @@ def _written_scale(texts: Iterable[str]) -> int | None:
     """Return the denominator of the only scale written on a drawing, None if there is none or several."""
     found = {int(match) for text in texts for match in _WRITTEN.findall(text)} & _USUAL
     return found.pop() if len(found) == 1 else None
+
+
+def _sheet(texts: Iterable[str], paper_m: float | None) -> tuple[str, float]:
+    """Return the sheet that a written scale is for, and its longer side over that of the page; "" and 1 if alike."""
+    for text in texts if paper_m else ():
+        found = _AT_SHEET.search(text)
+        if found is not None and paper_m:
+            name = " ".join(found[1].upper().split())
+            larger = _SHEETS_M[name] / paper_m
+            return ("", 1.0) if abs(larger - 1.0) <= _TOLERANCE else (name, larger)
+    return "", 1.0
 
 
 def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:
@@ -187,21 +221,20 @@ def check_areas(rooms: Sequence[SketchedRoom], texts: Sequence[Sequence[str]], b
     """Compare the areas (m²) of rooms with those written in them, `texts` of every room."""
     areas = _written_areas([room.shape for room in rooms], texts)
     shares = {index: area_m2 / written_m2 for index, (written_m2, area_m2) in areas.items()}
-    usual = float(np.median(list(shares.values()))) if shares else 1.0
+    middle = float(np.median(list(shares.values()))) if shares else 1.0
     builder.rejected_texts += [
         f"{areas[index][0]:.4g} m² was read as the area of a room of {areas[index][1]:.1f} m²"
         + (f" ('{rooms[index].name}')" if rooms[index].name else "")
         for index, share in shares.items()
-        if abs(share / usual - 1.0) > _AREA_TOLERANCE or (len(shares) < _MIN_AGREEING and abs(share - 1.0) > 0.1)
+        if abs(share / middle - 1.0) > _AREA_TOLERANCE or (len(shares) < _MIN_AREAS and abs(share - 1.0) > 0.1)
     ]
-    if len(shares) < _MIN_AGREEING:
+    if sum(abs(share / middle - 1.0) <= _AREA_TOLERANCE for share in shares.values()) < _MIN_AREAS:
         return
-    middle = float(np.median(list(shares.values())))
     length = math.sqrt(middle)
     if abs(length - 1.0) > _TOLERANCE:
         builder.scale_factor = 1.0 / length
         builder.warnings.append(
-            f"the areas written in {len(shares)} rooms are {1.0 / middle:.2f} times those of the plan; if they are "
+            f"the areas and sides written in {len(shares)} rooms are {1.0 / middle:.2f} times the plan's; if they are "
             f"right, all lengths have to be multiplied by {1.0 / length:.3f}: check the scale, or set "
             f"multiply={1.0 / length:.3f}"
         )
@@ -233,7 +266,27 @@ def areas_of_rooms(
 def _written_areas(shapes: Sequence[shapely.Polygon], texts: Sequence[Sequence[str]]) -> dict[int, tuple[float, float]]:
     areas = [[area for text in written for area in _areas_m2(text)] for written in texts]
     # A room with two areas is two rooms, or one of them is the area of the flat.
-    return {index: (found[0], shapes[index].area) for index, found in enumerate(areas) if len(found) == 1}
+    found = {index: (area[0], shapes[index].area) for index, area in enumerate(areas) if len(area) == 1}
+    sides = {index: [pair for text in written if (pair := sides_m(text))] for index, written in enumerate(texts)}
+    for index, pairs in sides.items():
+        # Sides are those of the box around a room, of about its shape.
+        box = side_lengths(shapes[index])
+        if len(pairs) == 1 and index not in found and box[0] > 0.0:
+            ratio = max(pairs[0]) / min(pairs[0]) / (box[1] / box[0])
+            if abs(math.log(ratio)) <= _SAME_RATIO:
+                found[index] = pairs[0][0] * pairs[0][1], box[0] * box[1]
+    return found
+
+
+def sides_m(text: str) -> tuple[float, float] | None:
+    """Return the two sides (m) of a room that a text states, such as 11'5" x 12'9", or "4.84m x 5.52m"."""
+    for pattern, unit in zip(_SIDES, ("ft", "m"), strict=True):
+        match = pattern.search(text)
+        if match is not None:
+            whole = [float(match[k].replace(",", ".")) + float(match[k + 1] or 0.0) / _INCHES for k in (1, 3)]
+            sides = whole[0] * METRES_PER_UNIT[unit], whole[1] * METRES_PER_UNIT[unit]
+            return sides if _SIDE_M[0] <= min(sides) and max(sides) <= _SIDE_M[1] else None
+    return None
 
 
 def _areas_m2(text: str) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import (
     check_network,
     check_overlaps,
@@ -25,10 +26,10 @@ from lalaloc_core.importers.common.geometry import (
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
+from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.drawn_openings import cut_painted, drawn_panes
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose, explained_size
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Swing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing
 
 _MAX_SEGMENTS = 60_000
 _MAX_NAMED = 8
@@ -137,7 +138,7 @@ def _count_doors_and_names(reading: Reading, drawing: Drawing, leaves: Sequence[
     """Return a reading with its doors and names counted."""
     finder = GapFinder(reading.gaps, reading.bounds)
     closed = {index for leaf in leaves if (index := finder.closed_by(leaf)) is not None}
-    names = [t.position for t in drawing.letterings if room_type_from_name(t.text) is not None]
+    names = [t.position for t in drawing.letterings if room_types_from_name(t.text)]
     named: set[int] = set()
     if names and reading.rooms:
         tree = shapely.STRtree([room.shape for room in reading.rooms])
@@ -166,7 +167,7 @@ def marked_rooms(drawing: Drawing, builder: ReportBuilder, bounds: RoomBounds) -
 
 def _use(area: Area) -> str | None:
     """Return the words that name the use of a closed outline, None if nothing does."""
-    return next((text for text in (area.kind, area.name, area.layer) if room_type_from_name(text) is not None), None)
+    return next((text for text in (area.kind, area.name, area.layer) if room_types_from_name(text)), None)
 
 
 def _is_room_like(area: Area, bounds: RoomBounds) -> bool:
@@ -220,13 +221,14 @@ def _covers(outer: shapely.Polygon, inner: shapely.Polygon) -> bool:
 
 def _by_named_walls(drawing: Drawing, budget: Budget) -> Enclosed | None:
     """Return the areas that walls on layers named after walls enclose, None without such walls."""
-    areas = [area for area in drawing.areas if area.role == "wall"]
-    lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall"]
-    if not areas and not lines:
-        return None
     bounds = budget.limits.rooms
+    thick = [part for part, _ in _drawn_thick(drawing, "wall", bounds)]
+    areas = [area for area in drawing.areas if area.role == "wall" and not _is_thick(area, bounds)]
+    lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall" and not _is_thick(stroke, bounds)]
+    if not areas and not lines and not thick:
+        return None
     outlines = [ring for area in areas if _is_outline(area, bounds) for ring in _rings(area.shape)]
-    bodies = [area.shape for area in areas if not _is_outline(area, bounds)]
+    bodies = [*thick, *(area.shape for area in areas if not _is_outline(area, bounds))]
     return _enclose(bodies, split_lines([*lines, *outlines]), _closers(drawing, bounds), budget)
 
 
@@ -235,12 +237,7 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     bounds = budget.limits.rooms
     drawn = [(area.shape, area.order) for area in drawing.areas if area.is_dark and area.role is None]
     drawn = [(shape, order) for shape, order in drawn if not _is_stroke_of_letter(shape, bounds)]
-    pens = [(stroke.line, stroke.width, stroke.order) for stroke in drawing.strokes if stroke.role is None]
-    pens += [(area.shape.boundary, area.width, area.order) for area in drawing.areas if area.role is None]
-    for line, width, order in pens:
-        if bounds.thick_m[0] <= width <= bounds.thick_m[1]:
-            body = line.buffer(0.5 * width, cap_style="square", join_style="mitre")
-            drawn += [(part, order) for part in polygons_from_geometry(body)]
+    drawn += _drawn_thick(drawing, None, bounds)
     painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
     bodies = [shape for shape in painted.bodies if not _is_outline(Area(shape, "", is_dark=True), bounds)]
     if not bodies:
@@ -249,6 +246,24 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     painted_over = [gap.shape.buffer(bounds.seam_m, join_style="mitre") for gap in gaps]
     found = _enclose(bodies, [], [*_closers(drawing, bounds), *painted_over], budget)
     return replace(found, gaps=[*gaps, *found.gaps])
+
+
+def _drawn_thick(drawing: Drawing, role: Role | None, bounds: RoomBounds) -> list[tuple[shapely.Polygon, int]]:
+    """Return what lines of a thick pen cover, of one role, with their places in the order of painting."""
+    drawn = [item for item in (*drawing.strokes, *drawing.areas) if item.role == role and _is_thick(item, bounds)]
+    return [(part, item.order) for item in drawn for part in polygons_from_geometry(_covered(item, bounds))]
+
+
+def _covered(item: Stroke | Area, bounds: RoomBounds) -> BaseGeometry:
+    """Return what a line of a thick pen covers, of the outline of a wall or pillar with its body."""
+    line = item.line if isinstance(item, Stroke) else item.shape.boundary
+    covered = line.buffer(0.5 * item.width, cap_style="square", join_style="mitre")
+    return covered if isinstance(item, Stroke) or _is_outline(item, bounds) else covered.union(item.shape)
+
+
+def _is_thick(drawn: Stroke | Area, bounds: RoomBounds) -> bool:
+    """Return whether the pen of a line is as wide as walls are thick."""
+    return bounds.thick_m[0] <= drawn.width <= bounds.thick_m[1]
 
 
 def _by_all_lines(drawing: Drawing, budget: Budget) -> Enclosed | None:

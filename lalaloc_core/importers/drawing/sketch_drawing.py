@@ -18,12 +18,13 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name
+from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
     drawn_leaves,
@@ -84,7 +85,7 @@ def split_named_rooms(
     Returns:
         The rooms in the order given, parts beside each other, and the gaps that divide them.
     """
-    places = [shapely.Point(text.position) for text in letterings if text.room_type is not None]
+    places = [shapely.Point(text.position) for text in letterings if text.room_types]
     names = shapely.STRtree(places)
     if all(len(names.query(room, predicate="contains")) < 2 for room in rooms):
         return list(rooms), []
@@ -260,18 +261,18 @@ def name_rooms(
             texts.setdefault(int(smallest), []).append(lettering)
         elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
             lost.append(lettering)
-    if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_type)):
+    if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_types)):
         builder.warnings.append(
             f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
         )
     rooms = []
     for index, area in enumerate(shapes):
         words = _names(texts.get(index, []))
-        types = {found.text: kind for found in words if (kind := found.room_type) is not None}
-        known = list(types)
-        name = area.name or next(iter(known or [found.text for found in words]), None)
-        kind = room_type_from_name(area.kind) or types.get(name or "") or room_type_from_name(name)
-        rooms.append(SketchedRoom(area.shape, name, kind))
+        known = {found.text: types for found in words if (types := found.room_types)}
+        name = area.name or next(iter([*known, *(found.text for found in words)]), None)
+        written = [kind for types in known.values() for kind in types]
+        types = dict.fromkeys([*known.get(name or "", room_types_from_name(name)), *written])
+        rooms.append(SketchedRoom(area.shape, name, room_types_from_name(area.kind) or tuple(types)))
         if others := [text for text in known if text != name]:
             names = " and ".join(f"'{text}'" for text in (name, *others[:_MAX_OTHERS]))
             builder.warnings.append(

@@ -6,6 +6,7 @@ The readers of SVG, PDF and DXF produce a `Drawing`; `sketch_drawing` finds room
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,9 +14,10 @@ import shapely
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import point_xy
 from lalaloc_core.importers.common.sketch import SketchedFixture
-from lalaloc_core.importers.common.vocabulary import Role, room_type_from_name, room_type_from_reading
+from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
 # Fills of lower luminance (of 255) can be walls.
 _DARK = 110.0
@@ -100,9 +102,9 @@ class Lettering:
     is_ocr: bool = False
 
     @property
-    def room_type(self) -> str | None:
-        """Type of room that the text names; None if it names none."""
-        return (room_type_from_reading if self.is_ocr else room_type_from_name)(self.text)
+    def room_types(self) -> tuple[str, ...]:
+        """Types of the room that the text names; empty if it names none."""
+        return (room_types_from_reading if self.is_ocr else room_types_from_name)(self.text)
 
 
 @dataclass
@@ -131,6 +133,17 @@ class Drawing:
         """Longer side of the box around areas and lines; NaN without any."""
         x0, y0, x1, y1 = shapely.total_bounds(self.shapes)
         return float(max(x1 - x0, y1 - y0))
+
+    def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
+        """Return what is on some layers; patches, which have none, stay."""
+        return Drawing(
+            [area for area in self.areas if is_wanted(area.layer)],
+            [stroke for stroke in self.strokes if is_wanted(stroke.layer)],
+            [swing for swing in self.swings if is_wanted(swing.layer)],
+            [lettering for lettering in self.letterings if is_wanted(lettering.layer)],
+            self.patches,
+            [fixture for fixture in self.fixtures if is_wanted(fixture.layer)],
+        )
 
     def cropped(self, box: tuple[float, float, float, float]) -> Drawing:
         """Return the part of the drawing in a box; lines are cut, other shapes belong to it by their middles."""

@@ -24,28 +24,39 @@ from ezdxf.entities.dxfentity import DXFEntity
 from ezdxf.entities.dxfgfx import DXFGraphic
 from ezdxf.entities.insert import Insert
 from ezdxf.entities.lwpolyline import LWPolyline
+from ezdxf.entities.mline import MLine
+from ezdxf.entities.polyline import Polyline
+from ezdxf.entities.text import Text
 from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
+from ezdxf.math import Vec3
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import SketchedFixture, name_storeys
+from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
-from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.storeys_by_layer import by_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
+# Alignments of texts that reach from one point to another.
+_BETWEEN = (3, 5)
+# Roles that blocks have by their own names.
+_OF_BLOCKS = {"door", "window", "passage", "obstacle", "ignored", "demolished"}
+# Entities that draw no part of a building.
+_NO_LINES = {"POINT", "DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER", "TOLERANCE",
+             "VIEWPORT", "WIPEOUT", "RAY", "XLINE", "ATTDEF", "LIGHT", "ACAD_TABLE", "OLE2FRAME", "IMAGE"}  # fmt: skip
 _MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
 _BYTES_PER_SHAPE = 10
@@ -83,9 +94,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
-    drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis == "down")
-    sketch = name_storeys(sketch_drawing(drawing, builder, budget), builder, flip_y=options.y_axis == "down")
-    return (assemble(sketch, builder, options, budget.limits.plan),)
+    return by_storey(drawing, builder, options, budget, flip_y=options.y_axis == "down")
 
 
 @contextmanager
@@ -193,6 +202,8 @@ def _weight(entity: DXFEntity) -> int:
         return 1 + len(entity) // 2  # type: ignore[arg-type]
     if kind == "SPLINE":
         return 1 + entity.control_point_count()  # type: ignore[attr-defined]
+    if isinstance(entity, MLine):
+        return 1 + len(entity.vertices) * max((len(vertex.line_params) for vertex in entity.vertices), default=1)
     return 1
 
 
@@ -200,13 +211,14 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     drawing = Drawing()
     hidden = {layer.dxf.name.casefold() for layer in document.layers if layer.is_off() or layer.is_frozen()}
     sag = _sag(document)
+    _name_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
             builder.use(context.layer, "ignored (layer is off)")
         elif context.fixture is not None and options.includes_layer(context.layer):
             _add_fixture(entity, context, drawing, builder, sag, budget)
-        elif context.role == "ignored" or not options.includes_layer(context.layer):
-            builder.use(context.layer, "ignored")
+        elif context.role in ("ignored", "demolished") or not options.includes_layer(context.layer):
+            builder.leave_out(context.layer, context.role)
         else:
             _add(entity, context, drawing, builder, sag, budget)
     if options.layers and not drawing.areas and not drawing.strokes:
@@ -216,6 +228,21 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
             f"layers of the drawing: {', '.join(repr(layer) for layer in available) or 'none'}"
         )
     return drawing
+
+
+def _name_missing(document: DxfDocument, builder: ReportBuilder) -> None:
+    """Warn of attached drawings and pictures, which are not in the file."""
+    for insert in document.modelspace().query("INSERT"):
+        block = document.blocks.get(insert.dxf.name)
+        if block is not None and block.block is not None and not len(block) and block.block.dxf.get("xref_path"):
+            builder.warnings.append(
+                f"the drawing attaches '{block.block.dxf.xref_path[:100]}', which is not in the file: bind it (XREF, "
+                "Bind), or send that drawing"
+            )
+    for picture in document.modelspace().query("IMAGE"):
+        definition = picture.image_def  # type: ignore[attr-defined]
+        name = "" if definition is None else definition.dxf.get("filename", "")
+        builder.warnings.append(f"the drawing attaches the picture '{name[:100]}', which is not read: send the picture")
 
 
 def _walk(
@@ -237,7 +264,7 @@ def _walk(
             role = block.role
         if isinstance(entity, Insert):
             block_role = role_from_name(entity.dxf.name)
-            role = block_role if block_role in ("door", "window", "passage", "obstacle", "ignored") else role
+            role = block_role if block_role in _OF_BLOCKS else role
             for attribute in entity.attribs:
                 yield attribute, _Context(layer, "text")
             for copy in entity.multi_insert() if entity.mcount > 1 else (entity,):
@@ -250,6 +277,10 @@ def _walk(
                     yield copy, context
                 else:
                     yield from _walk(copy.virtual_entities(), context, depth + 1, budget)
+        elif isinstance(entity, MLine):
+            for part in entity.virtual_entities():
+                budget.check_time()
+                yield part, _Context(layer, role)
         else:
             yield entity, _Context(layer, role)
 
@@ -260,9 +291,8 @@ def _add(
     kind, role = entity.dxftype(), context.role
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
-        point = entity.dxf.get("insert")
-        if point is not None and text.strip() and in_range(np.array([point[0], point[1]])):
-            position = (float(point[0]), float(point[1]))
+        position = _anchor(entity)
+        if position is not None and text.strip() and in_range(np.array(position)):
             drawing.letterings += [Lettering(line[:200], position, context.layer) for line in text.splitlines()[:20]]
             builder.use(context.layer, "texts")
         return
@@ -283,8 +313,29 @@ def _add(
             parts = entity.virtual_entities()
         for part in parts:
             _add_line(part, context, drawing, builder, sag)
+    elif kind == "3DFACE":
+        corners = np.array([(corner.x, corner.y) for corner in entity.wcs_vertices()])  # type: ignore[attr-defined]
+        faces = polygons_from_geometry(shapely.Polygon(corners)) if in_range(corners) else []
+        drawing.areas += [Area(face, context.layer, role) for face in faces]
+        builder.use(context.layer, f"faces: {role or 'possible walls'}" if faces else "ignored")
     else:
         builder.use(context.layer, f"ignored ({kind})")
+        if kind not in _NO_LINES:
+            place = f"{kind} on layer '{context.layer[:50]}'"
+            builder.warnings.append(f"{place} is not read: explode it into lines (EXPLODE)")
+
+
+def _anchor(entity: DXFGraphic) -> tuple[float, float] | None:
+    """Return the place of a text, in world coordinates: that of justified texts is another point than the insert."""
+    point = entity.dxf.get("insert")
+    if isinstance(entity, Text) and point is not None:
+        halign, other = entity.dxf.get("halign", 0), entity.dxf.get("align_point")
+        if other is not None and halign in _BETWEEN:
+            point = 0.5 * (Vec3(point) + Vec3(other))
+        elif other is not None and (halign or entity.dxf.get("valign", 0)):
+            point = other
+        point = entity.ocs().to_wcs(Vec3(point))
+    return None if point is None else (float(point[0]), float(point[1]))
 
 
 def _add_block(
@@ -310,7 +361,7 @@ def _add_fixture(
     box = _box(entity, _Context(context.layer, "obstacle"), sag, budget)
     if isinstance(box, shapely.Polygon):
         builder.use(context.layer, f"fixtures: {context.fixture}")
-        drawing.fixtures.append(SketchedFixture(context.fixture, box))
+        drawing.fixtures.append(SketchedFixture(context.fixture, box, context.layer))
     else:
         builder.use(context.layer, "ignored (block without area)")
 
@@ -330,7 +381,7 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
     if len(points) < 2:
         builder.use(context.layer, "ignored (no length, or coordinates out of range)")
         return
-    role = context.role
+    role, width = context.role, _width(entity)
     if entity.dxftype() == "ARC" and role in (None, "door"):
         swing = fit_swing(points, context.layer)
         if swing is not None:
@@ -339,11 +390,23 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
             return
     if len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
         shapes = polygons_from_geometry(shapely.Polygon(points))
-        drawing.areas += [Area(shape, context.layer, role) for shape in shapes]
+        drawing.areas += [Area(shape, context.layer, role, width=width) for shape in shapes]
         builder.use(context.layer, f"closed lines: {role or 'possible walls or rooms'}", max(len(shapes), 1))
     elif shapely.LineString(points).length > 0.0:
-        drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, role))
+        drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, role, width))
         builder.use(context.layer, f"lines: {role or 'possible walls'}")
+
+
+def _width(entity: DXFGraphic) -> float:
+    """Return the width of a polyline, the mean over its parts; 0 for other lines."""
+    if isinstance(entity, LWPolyline):
+        widths = [width for point in entity.get_points("se") for width in point]
+        return float(entity.dxf.get("const_width", 0.0) or np.mean(widths or [0.0]))
+    if isinstance(entity, Polyline) and entity.is_2d_polyline:
+        usual = [entity.dxf.get(name, 0.0) for name in ("default_start_width", "default_end_width")]
+        widths = [vertex.dxf.get(name, 0.0) for vertex in entity.vertices for name in ("start_width", "end_width")]
+        return float(np.mean(widths) if any(widths) else np.mean(usual))
+    return 0.0
 
 
 def _ends_meet(points: np.ndarray) -> bool:

@@ -157,7 +157,8 @@ def plan_features(document: Mapping[str, Any], projector: Projector) -> list[dic
     found: list[dict[str, Any]] = []
     for number, room in enumerate(document["rooms"]):
         properties = {"feature_type": "unit", "name": room.get("name", f"room {number + 1}")}
-        properties |= {key: room[key] for key in ("type", "ceiling_height_m") if key in room and room[key] != "unknown"}
+        keys = ("type", "types", "ceiling_height_m")
+        properties |= {key: room[key] for key in keys if key in room and room[key] != "unknown"}
         if (ceiling_m := document.get("ceiling_height_m")) is not None:
             properties.setdefault("ceiling_height_m", ceiling_m)
         rings = projector.polygon([room["polygon"], *room.get("holes", ())])

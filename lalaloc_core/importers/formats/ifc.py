@@ -175,7 +175,7 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, m
             )
         if floor is not None:
             report_floor(f"space '{name}'", floor, builder)
-        sketch.rooms += [SketchedRoom(part, name or None, None, ceiling) for part in parts]
+        sketch.rooms += [SketchedRoom(part, name or None, (), ceiling) for part in parts]
         floors.append(low)
         builder.use("IfcSpace", "rooms")
     return float(np.median(floors)) if floors else 0.0

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.geometry import (
@@ -32,7 +33,6 @@ from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, Import
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.opening_placement import WallLines
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, Level, Point, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
 
 # Kinds of cells: of the core, and of the module for navigation. Doors can be cells as well.
 _CELLS = {"CellSpace", "NavigableSpace", "GeneralSpace", "TransferSpace", "TransitionSpace"}
@@ -103,7 +103,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             is_usual = cell.height is not None and ROOM_HEIGHT_M[0] <= cell.height <= ROOM_HEIGHT_M[1]
             height_m = cell.height if is_usual else None
             sketch.rooms += [
-                SketchedRoom(part, cell.name, room_type_from_name(cell.name), height_m, cell.key)
+                SketchedRoom(part, cell.name, room_types_from_name(cell.name), height_m, cell.key)
                 for part in cell.floor.parts
             ]
             report_floor(f"cell '{cell.name or cell.key}'", cell.floor, builder)

@@ -15,12 +15,12 @@ import shapely
 from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Box, Sketch, choose_storey
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
 from lalaloc_core.importers.drawing.scale_guess import (
     Measures,
@@ -79,6 +79,7 @@ def _read_plan(
         drawings,
         budget.check_time,
         paper_m_per_unit=_METRES_PER_POINT,
+        paper_m=max(found.size_pt) * _METRES_PER_POINT,
         guess=lambda: assume_scale(_guess(page, found, scan, options.crop, budget), assumed),
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
@@ -176,7 +177,7 @@ def _read_scan(
     """Return the texts of a scanned page, in points; letters that are drawn as lines join the texts of the page."""
     is_scan, own = found.picture_share > _MOSTLY, list(found.drawing.letterings)
     # A page can have a title block as text, and rooms with drawn letters.
-    if not is_scan and any(room_type_from_name(lettering.text) is not None for lettering in own):
+    if not is_scan and any(room_types_from_name(lettering.text) for lettering in own):
         return PictureTexts()
     width, height = found.size_pt
     scale = min(READ_PX / max(width, height, 1.0), _COARSEST_PT)

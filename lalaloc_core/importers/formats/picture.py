@@ -32,6 +32,11 @@ from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 _MIN_SIDE_PX = 64
+# Opacity of pixels that count, the least share of others on a transparent ground, tones that are light (of 255), and
+# the least share of dark lines.
+_CLEAR, _LEAST_CLEAR, _LIGHT, _LEAST_DARK = 128, 0.2, 150.0, 0.02
+# Tones (of 16) that are dark, and the share of the picture that has the ground's.
+_DARK_TONES, _MOSTLY = 7, 0.5
 # A larger picture has a wrong scale.
 _MAX_EXTENT_M = 1000.0
 
@@ -40,6 +45,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """Read the plan in a picture, as a draft."""
     gray, warmth, paper_m_per_pixel = _open(content, budget)
     builder = ReportBuilder("picture", is_draft=True)
+    if _has_dark_ground(gray):
+        gray, warmth = 255 - gray, None
+        builder.notes.append("the picture shows light lines on a dark ground and was inverted")
     tones = Tones.of(gray)
     if tones is not None and tones.is_photograph:
         raise InvalidFloorPlanError(
@@ -131,8 +139,9 @@ def _open(
                     )
                 dpi = picture.info.get("dpi")
                 upright = ImageOps.exif_transpose(picture)
-                flat = Image.new("RGBA", upright.size, "white")
-                flat.alpha_composite(upright.convert("RGBA"))
+                drawn = upright.convert("RGBA")
+                flat = Image.new("RGBA", upright.size, "black" if _is_light(drawn) else "white")
+                flat.alpha_composite(drawn)
                 gray = np.asarray(flat.convert("L"))
                 grey_modes = ("1", "L", "LA", "I", "I;16", "F")
                 warmth = None if upright.mode in grey_modes else _warmth(flat)
@@ -145,6 +154,21 @@ def _open(
     except (OSError, ValueError, SyntaxError, EOFError, TypeError, ZeroDivisionError) as error:
         raise InvalidFloorPlanError("the picture is damaged and cannot be read; save it again as PNG") from error
     return gray, warmth, _paper(dpi)
+
+
+def _is_light(picture: Image.Image) -> bool:
+    """Return whether all that is drawn on a transparent ground is light, as for dark pages."""
+    alpha = np.asarray(picture.getchannel("A"))
+    if (alpha < _CLEAR).mean() < _LEAST_CLEAR or not (alpha >= _CLEAR).any():
+        return False
+    return float(np.quantile(np.asarray(picture.convert("L"))[alpha >= _CLEAR], _LEAST_DARK)) > _LIGHT
+
+
+def _has_dark_ground(gray: UInt8[np.ndarray, "h w"]) -> bool:
+    """Return whether the most frequent tone is dark, and most of the picture has about this tone."""
+    share = np.bincount(gray.ravel() >> 4, minlength=16) / gray.size
+    ground = int(share.argmax())
+    return ground < _DARK_TONES and float(share[max(ground - 1, 0) : ground + 2].sum()) > _MOSTLY
 
 
 def _warmth(picture: Image.Image) -> UInt8[np.ndarray, "h w"]:

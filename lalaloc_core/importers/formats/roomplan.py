@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates, point_xy, polygons_from_geometry
@@ -33,7 +34,6 @@ from lalaloc_core.importers.common.sketch import (
     SketchedOpening,
     SketchedRoom,
 )
-from lalaloc_core.importers.common.vocabulary import room_type_from_name
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 
 _OPENINGS: Mapping[str, OpeningKind] = {"doors": "door", "windows": "window", "openings": "passage"}
@@ -96,7 +96,7 @@ def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: Report
         name = labels.get(index)
         around = [walls[k] for k in middles.query(room, predicate="dwithin", distance=_BESIDE_M)]
         height_m = float(np.median([wall.high_m - floor_m for wall in around])) if around else None
-        sketch.rooms.append(SketchedRoom(room, name, room_type_from_name(name), height_m))
+        sketch.rooms.append(SketchedRoom(room, name, room_types_from_name(name), height_m))
     for index, raw in enumerate(surfaces["objects"]):
         _add_object(raw, f"object {index}", sketch, builder)
     for key, kind in _OPENINGS.items():

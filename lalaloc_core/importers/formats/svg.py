@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
@@ -17,20 +18,21 @@ import numpy as np
 import shapely
 import svgelements
 
-from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import SketchedFixture, name_storeys
+from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
-from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, sketch_drawing
+from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
+from lalaloc_core.importers.drawing.storeys_by_layer import by_storey
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     Area,
@@ -97,11 +99,34 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     root = read_xml(content, budget)
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
+    pictures = sum(local_name(element) == "image" for element in root.iter())
     _drop_ignored(root)
     check_work(root, budget)
     _name_by_titles(root)
+    with _naming_pictures(pictures):
+        return _read_plan(root, pictures, options, budget)
+
+
+@contextmanager
+def _naming_pictures(pictures: int) -> Iterator[None]:
+    """Say in errors that a drawing has embedded pictures, which can be the plan."""
+    try:
+        yield
+    except InvalidFloorPlanError as error:
+        if not pictures or isinstance(error, SeveralLevelsError | NoRoomError):
+            raise
+        raise InvalidFloorPlanError(f"{_picture_text(pictures)} ({error})") from error
+
+
+def _picture_text(pictures: int) -> str:
+    subject = "an embedded picture" if pictures == 1 else f"{pictures} embedded pictures"
+    return f"the SVG has {subject}, not read: if the plan is a picture, send that PNG or JPEG itself"
+
+
+def _read_plan(root: Element, pictures: int, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read the plan, without embedded pictures."""
     paper_m, own = _size_on_paper(root), _own_scale(root)
-    builder = ReportBuilder("svg")
+    builder = ReportBuilder("svg", warnings=[_picture_text(pictures)] if pictures else [])
     drawing = _read_drawing(root, options, builder, budget)
     if options.crop is not None:
         drawing = drawing.cropped(options.crop)
@@ -116,9 +141,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
-    drawing = drawing.scaled(builder.metres_per_unit, flip_y=options.y_axis != "up")
-    sketch = name_storeys(sketch_drawing(drawing, builder, budget), builder, flip_y=options.y_axis != "up")
-    return (assemble(sketch, builder, options, budget.limits.plan),)
+    return by_storey(drawing, builder, options, budget, flip_y=options.y_axis != "up")
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
@@ -211,8 +234,8 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
             continue
         if context.is_fixture and options.includes_layer(*context.labels):
             _add_fixture(element, context, drawing, builder, budget)
-        elif context.role == "ignored" or not options.includes_layer(*context.labels):
-            builder.use(context.layer, "ignored")
+        elif context.role in ("ignored", "demolished") or not options.includes_layer(*context.labels):
+            builder.leave_out(context.layer, context.role)
         elif isinstance(element, svgelements.Text):
             _add_text(element, context, drawing)
         elif isinstance(element, svgelements.Shape):
@@ -244,7 +267,7 @@ def _add_fixture(fixture: Any, context: _Context, drawing: Drawing, builder: Rep
     box = shapely.minimum_rotated_rectangle(shapely.MultiPoint(np.concatenate(points))) if points else None
     if context.kind is not None and isinstance(box, shapely.Polygon):
         builder.use(context.layer, f"fixtures: {context.kind}")
-        drawing.fixtures.append(SketchedFixture(context.kind, box))
+        drawing.fixtures.append(SketchedFixture(context.kind, box, context.layer))
     else:
         builder.use(context.layer, "ignored")
 

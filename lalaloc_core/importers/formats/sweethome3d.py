@@ -121,13 +121,13 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
     for area in found:
         names = [name for part, name in drawn if shapely.intersection(part, area).area > _SAME * part.area]
         if len(names) <= 1:
-            sketch.rooms.append(SketchedRoom(area, names[0] if names else None, None, height_m))
+            sketch.rooms.append(SketchedRoom(area, names[0] if names else None, (), height_m))
         # Several drawn rooms divide an open area.
     taken = shapely.union_all([room.shape for room in sketch.rooms])
     for part, name in drawn:
         if shapely.intersection(part, taken).area <= _SAME * part.area:
             free = polygons_from_geometry(part.difference(walls))
-            sketch.rooms += [SketchedRoom(free_part, name, None, height_m) for free_part in free]
+            sketch.rooms += [SketchedRoom(free_part, name, (), height_m) for free_part in free]
     if enclosed is not None:
         sketch.openings += [SketchedOpening("passage", gap.start, gap.end) for gap in enclosed.gaps]
         sketch.drawn = enclosed.walls.envelope
