@@ -179,7 +179,9 @@ class _Tools:
             list[File] | None,
             Field(description="Photographs of one spot in the order of the turn, overlapping by half."),
         ] = None,
-        film: Annotated[File | None, Field(description="A film of one slow turn instead (MP4, MOV, WebM).")] = None,
+        film: Annotated[
+            File | None, Field(description="A film of one slow turn instead (MP4, MOV, WebM, Matroska).")
+        ] = None,
         floorplan_id: PlanId = None,
         venue_id: VenueId = None,
         hfov_deg: FieldOfView = None,

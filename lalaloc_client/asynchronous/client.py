@@ -148,9 +148,9 @@ class AsyncClient(AsyncPlans):
     ) -> SequenceLocalisation:
         """Localise a film of one slow turn, once around on the spot.
 
-        The film is the content or path of an MP4, MOV or WebM file. The frames that the service keeps become poses with
-        `time_s`; `film` of the answer tells how it was read. With `on_device`, as for `localise`, it is read on this
-        device, and the features of its frames and their angles alone are sent.
+        The film is the content or path of an MP4, MOV, WebM or Matroska file. The frames that the service keeps become
+        poses with `time_s`; `film` of the answer tells how it was read. With `on_device`, as for `localise`, it is read
+        on this device, and the features of its frames and their angles alone are sent.
         """
         values = {"floorplan_id": floorplan_id, "venue_id": venue_id, "motion": "turn"}
         if on_device:

@@ -143,14 +143,16 @@ def _turn_answers(
     arguments: argparse.Namespace, model: LaLaLoc, plan: FloorPlan, stated: StatedCamera
 ) -> Iterator[_Found]:
     """Yield the answer for a turn, with the angles of its photographs."""
-    from lalaloc_core.api import pictures_in
+    from lalaloc_core.photograph.picture_folders import turn_files
 
     path = arguments.turn
-    answer = model.localise_turn(plan, path, camera_height_m=arguments.camera_height, camera=stated)
-    document = {"photograph": str(path), **answer.document(), "warnings": _remarks(answer)}
+    files, left_out = turn_files(path) if path.is_dir() else ([], [])
+    source = files if len(files) > 1 else path
+    answer = model.localise_turn(plan, source, camera_height_m=arguments.camera_height, camera=stated)
+    document = {"photograph": str(path), **answer.document(), "warnings": [*left_out, *_remarks(answer)]}
     if answer.film is None:
-        names = [file.name for file in pictures_in(path)]
-        document["poses"] = [{"photograph": name, **pose} for name, pose in zip(names, document["poses"], strict=True)]
+        poses = zip(files, document["poses"], strict=True)
+        document["poses"] = [{"photograph": file.name, **pose} for file, pose in poses]
     yield _Found(path, answer, document)
 
 

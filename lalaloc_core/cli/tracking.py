@@ -94,7 +94,7 @@ def _track(arguments: argparse.Namespace) -> None:
 
 def _photographs(folder: Path) -> list[tuple[float, Path]]:
     """Return times (s) and files of photographs, by rising time."""
-    from lalaloc_core.api import pictures_in
+    from lalaloc_core.photograph.picture_folders import pictures_in
 
     found = []
     for path in pictures_in(folder):

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime, timedelta, timezone
 
 from PIL import ExifTags, Image
 
@@ -45,6 +46,8 @@ _FISHEYES = tuple(
 )
 # Longer equivalent focal lengths of these cameras are those of linear and narrow modes.
 _MAX_FISHEYE_MM = 18.0
+# An attribute or element of the Camera Raw schema.
+_HAS_CROP = re.compile(rb"crs:HasCrop\s{0,9}(?:=\s{0,9}[\"']|>)\s{0,9}True", re.IGNORECASE)
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_RANGE_MM = (4.0, 250.0)
 _FOCAL_RANGE_MM = (0.5, 250.0)
@@ -58,10 +61,19 @@ _STRIP = 6
 _SD, _CROPPED_SD = 0.03, 0.06
 # Characters of a maker's or model's name.
 MAX_NAME = 60
-_TIME_FORMAT = "%Y:%m:%d %H:%M:%S"
+# The farthest time zones from UTC, in minutes.
+_MAX_OFFSET_MIN = 14 * 60
+# Times as cameras and editors write them: "2024:05:01 10:20:30", "2024-05-01T10:20:30.5+02:00", "2024/5/1 3:20 PM".
+_AFTERNOON, _MORNING = "下午 午後 오후 p.m. pm", "上午 午前 오전 a.m. am"
+_HALVES = "|".join(re.escape(word) for word in f"{_AFTERNOON} {_MORNING}".split())
+_TIME = re.compile(
+    rf"(\d{{4}})[:./-](\d{{1,2}})[:./-](\d{{1,2}})[T ,]+({_HALVES})? *(\d{{1,2}})[:.](\d{{2}})(?:[:.](\d{{2}}))?"
+    rf"(?:[.,](\d{{1,6}})\d*)? *({_HALVES})? *(Z|[+-]\d{{2}}:?\d{{2}})?",
+    re.IGNORECASE,
+)
 _TIMES = (
-    (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal),
-    (ExifTags.Base.DateTimeDigitized, ExifTags.Base.SubsecTimeDigitized),
+    (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal, ExifTags.Base.OffsetTimeOriginal),
+    (ExifTags.Base.DateTimeDigitized, ExifTags.Base.SubsecTimeDigitized, ExifTags.Base.OffsetTimeDigitized),
 )
 
 
@@ -88,7 +100,7 @@ class Taken:
     """Time and camera of a photograph; None, empty or 0 for what is unknown.
 
     Attributes:
-        at: time by the camera's clock, without a time zone.
+        at: time by the camera's clock, with its time zone if the file states one.
         width, height: size of the upright picture, pixels.
     """
 
@@ -99,8 +111,11 @@ class Taken:
     height: int = 0
 
 
-def read_exif_lens(exif: Image.Exif, *, width: int, height: int) -> ExifLens:
-    """Read the focal length of a picture of `width` x `height` pixels, in either orientation."""
+def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes | str] = (), *, width: int, height: int) -> ExifLens:
+    """Read the focal length of a picture of `width` x `height` pixels, in either orientation.
+
+    `packets` are its XMP packets, in which editors state that they cropped it.
+    """
     tags = exif.get_ifd(ExifTags.IFD.Exif)
     warnings: list[str] = []
     if tags.get(ExifTags.Base.CustomRendered) == _STRIP:
@@ -108,7 +123,7 @@ def read_exif_lens(exif: Image.Exif, *, width: int, height: int) -> ExifLens:
     zoom = _in_range(tags, ExifTags.Base.DigitalZoomRatio, _ZOOM_RANGE, "", warnings) or 1.0
     film = _in_range(tags, ExifTags.Base.FocalLengthIn35mmFilm, _FILM_RANGE_MM, " mm", warnings)
     lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)
-    if _is_cropped(tags, width, height):
+    if _is_cropped(tags, width, height) or any(map(_states_crop, packets)):
         if film is not None or lens is not None:
             warnings.append("the photograph was cropped after it was taken, so its EXIF focal length is not used")
         return ExifLens(warnings=tuple(warnings))
@@ -175,6 +190,11 @@ def _is_cropped(tags: dict[int, object], width: int, height: int) -> bool:
     return abs(taken * min(width, height) / max(width, height) - 1.0) > _CROPPED
 
 
+def _states_crop(packet: bytes | str) -> bool:
+    """Return whether an editor states a crop (Camera Raw schema, `crs:HasCrop`)."""
+    return bool(_HAS_CROP.search(packet.encode() if isinstance(packet, str) else packet))
+
+
 def _in_range(
     tags: dict[int, object], tag: ExifTags.Base, limits: tuple[float, float], unit: str, warnings: list[str]
 ) -> float | None:
@@ -216,14 +236,38 @@ def read_taken(exif: Image.Exif, *, width: int, height: int) -> Taken:
 def _time(exif: Image.Exif) -> datetime | None:
     """Return when a photograph was taken; the time of the file's last change is not used."""
     tags = exif.get_ifd(ExifTags.IFD.Exif)
-    for tag, subseconds in _TIMES:
-        try:
-            at = datetime.strptime(_text(tags.get(tag)), _TIME_FORMAT)
-        except ValueError:
-            continue
-        digits = _text(tags.get(subseconds))[:6]
-        return at.replace(microsecond=int(digits.ljust(6, "0"))) if digits.isascii() and digits.isdigit() else at
+    for tag, subseconds, offset in _TIMES:
+        at = read_time(_text(tags.get(tag)), _text(tags.get(subseconds)), _text(tags.get(offset)))
+        if at is not None:
+            return at
     return None
+
+
+def read_time(text: str, subseconds: str = "", offset: str = "") -> datetime | None:
+    """Read a time in any common form, with digits of its second and its time zone; None if it is none."""
+    found = _TIME.fullmatch(text)
+    if found is None:
+        return None
+    year, month, day, before, hour, minute, second, digits, after, zone = found.groups()
+    half = (before or after or "").casefold()
+    hours = int(hour) % 12 + 12 * (half in _AFTERNOON.split()) if half else 0 if hour == "24" else int(hour)
+    fraction = (digits or subseconds)[:6].ljust(6, "0")
+    microsecond = int(fraction) if fraction.isascii() and fraction.isdigit() else 0
+    # Some phones write 24:05 for five past midnight, and seconds of 60 are leap seconds.
+    parts = (int(year), int(month), int(day), hours, int(minute), min(int(second or 0), 59), microsecond)
+    try:
+        return datetime(*parts, tzinfo=_zone(zone or offset))
+    except ValueError:
+        return None
+
+
+def _zone(offset: str) -> timezone | None:
+    """Return a time zone such as "+02:00" or "Z"; None for none, or one that is none."""
+    found = re.fullmatch(r"([+-])(\d{2}):?(\d{2})", offset.strip())
+    if found is None:
+        return UTC if offset.strip().upper() == "Z" else None
+    minutes = 60 * int(found[2]) + int(found[3])
+    return timezone(timedelta(minutes=-minutes if found[1] == "-" else minutes)) if minutes <= _MAX_OFFSET_MIN else None
 
 
 def _text(value: object) -> str:

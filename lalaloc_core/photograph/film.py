@@ -35,12 +35,14 @@ from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 
 # Demuxers of FFmpeg by the kind of file; a kind is told by its first bytes.
-_DEMUXERS = {"MP4 or MOV": "mov", "WebM": "matroska"}
+_DEMUXERS = {"MP4 or MOV": "mov", "WebM or Matroska": "matroska"}
 _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
-_EBML, _WEBM, _HEAD = b"\x1a\x45\xdf\xa3", b"webm", 64
+_EBML, _DOC_TYPES, _HEAD = b"\x1a\x45\xdf\xa3", (b"webm", b"matroska"), 64
 _CODECS = {b"h264": "H.264", b"avc1": "H.264", b"hevc": "HEVC", b"hvc1": "HEVC", b"hev1": "HEVC", b"VP90": "VP9"}
-_CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8"}
+_CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8", b"FMP4": "MPEG-4", b"mp4v": "MPEG-4"}
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+# All rows and columns.
+_WHOLE = slice(None), slice(None)
 # Samples per second, and of a whole film.
 _RATE, _SAMPLES = 12.0, 240
 # Times of frames in files are rounded by so much.
@@ -53,8 +55,11 @@ _DARK = 12.0
 _FLOW_SD = math.radians(3.0)
 # Largest turn (radians, by optical flow, which can be wrong by a third) whose frames are kept.
 _MOST_TURN = 1.5 * TWO_PI
-# Turn (radians) that a film shows at least.
-_LEAST_TURN = math.radians(30.0)
+# Turn (radians) that a film shows at least, a nod that nobody makes, and how much larger it is if a film is sideways.
+_LEAST_TURN, _MOST_NOD, _SIDEWAYS = math.radians(30.0), math.radians(100.0), 3.0
+# Black bars: grey levels, share of a row that is brighter beside them, their least share of the picture, the largest
+# difference of two, and pixels and ratio of the sides of what is between them.
+_BLACK, _SEEN, _LEAST_BARS, _UNEVEN, _LEAST_SIDE, _LONGEST = 10, 0.02, 0.08, 0.02, 100, 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,13 +89,26 @@ class _Sample:
 
 @dataclass(eq=False)
 class _Samples:
-    """Sharpest frames by angle, and what became of the others."""
+    """Sharpest frames by angle, the part of them within black bars (rows, columns), and what became of the others."""
 
-    full_size: tuple[int, int] = (0, 0)
+    stored_size: tuple[int, int] = (0, 0)
+    inside: tuple[slice, slice] | None = None
+    lit_bars: int = 0
     best: dict[int, _Sample] = field(default_factory=dict)
     dropped: Counter[str] = field(default_factory=Counter)
     frames: int = 0
     last_s: float = 0.0
+
+    @property
+    def full_size(self) -> tuple[int, int]:
+        """Width and height of the part of frames within the bars."""
+        rows, columns = self.inside or _WHOLE
+        return len(range(self.stored_size[0])[columns]), len(range(self.stored_size[1])[rows])
+
+    @property
+    def bars_share(self) -> float:
+        """Share of frames that is bars."""
+        return 1.0 - math.prod(self.full_size) / max(math.prod(self.stored_size), 1)
 
     def add(self, sample: _Sample, step: float) -> None:
         """Keep a sample if it is the sharpest of its angle."""
@@ -112,7 +130,7 @@ def read_film(
     patch_size: PatchSize | None = None,
     limits: FilmLimits | None = None,
 ) -> Film:
-    """Read a film of a turn on one spot: MP4, MOV or WebM with H.264, HEVC, VP8 or VP9.
+    """Read a film of a turn on one spot: MP4, MOV, WebM or Matroska with H.264, HEVC, MPEG-4, VP8 or VP9.
 
     Raises:
         InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
@@ -125,11 +143,21 @@ def read_film(
         raise InvalidFilmError(
             f"the film has {len(content)} bytes; the limit is {limits.max_bytes} (LALALOC_MAX_FILM_BYTES)"
         )
-    tracker = FlowTracker(None if stated.hfov_deg is None else math.radians(stated.hfov_deg))
-    samples = _sampled(content, tracker, limits)
+    hfov = None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
+    tracker, samples = FlowTracker(hfov), _Samples()
+    _sample_film(content, tracker, samples, limits)
+    if samples.lit_bars:
+        # What was black in the first frame is none of bars.
+        tracker, samples = FlowTracker(hfov), _Samples(inside=_WHOLE)
+        _sample_film(content, tracker, samples, limits)
     kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
     if not kept:
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
+    if tracker.nodded > max(_MOST_NOD, _SIDEWAYS * tracker.turned):
+        raise InvalidFilmError(
+            f"the film lies on its side: in it the camera nods by {math.degrees(tracker.nodded):.0f}° and turns by "
+            f"{math.degrees(tracker.turned):.0f}°; rotate it by 90° in a viewer, save it and send that film"
+        )
     photographs, angles = _turned(kept, samples.full_size, stated, size, tracker)
     joined = _likely(angles)
     first = angles[joined[0]].heading
@@ -145,7 +173,7 @@ def read_film(
         dropped=dict(samples.dropped),
         duration_s=samples.last_s,
         turned=tracker.turned,
-        warnings=(*_warnings(tracker), *_assumed([angles[index] for index in joined])),
+        warnings=(*_on_bars(samples), *_warnings(tracker), *_assumed([angles[index] for index in joined])),
     )
 
 
@@ -187,6 +215,11 @@ def _assumed(angles: Sequence[TurnAngles]) -> list[str]:
     ]
 
 
+def _on_bars(samples: _Samples) -> list[str]:
+    share = samples.bars_share
+    return [f"the film has black bars, {share:.0%} of its picture: they were cut off"] if share > 0.0 else []
+
+
 def _warnings(tracker: FlowTracker) -> list[str]:
     warnings = []
     if tracker.turned < _LEAST_TURN:
@@ -210,9 +243,9 @@ def _warnings(tracker: FlowTracker) -> list[str]:
     return warnings
 
 
-def _sampled(content: bytes, tracker: FlowTracker, limits: FilmLimits) -> _Samples:
-    """Decode a film, and return its sharpest frames by angle."""
-    begin, samples = process_time(), _Samples()
+def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits) -> None:
+    """Decode a film, and add its sharpest frames by angle."""
+    begin = process_time()
     with _opened(content, limits) as (capture, claimed_s):
         interval_s = max(1.0 / _RATE, claimed_s / _SAMPLES)
         next_s = 0.0
@@ -239,17 +272,20 @@ def _sampled(content: bytes, tracker: FlowTracker, limits: FilmLimits) -> _Sampl
             _sample(frame, time_s, samples, tracker)
     if not samples.frames:
         raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
-    return samples
 
 
 def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
     height, width = frame.shape[:2]
-    if samples.full_size == (0, 0):
-        samples.full_size = width, height
-    if samples.full_size != (width, height):
+    if samples.stored_size == (0, 0):
+        samples.stored_size = width, height
+    if samples.stored_size != (width, height):
         samples.dropped["of another size"] += 1
         return
-    share = min(_LONG_SIDE / max(width, height), 1.0)
+    if samples.inside is None and frame.mean() >= _DARK:
+        samples.inside = _inside_bars(frame)
+    samples.lit_bars += _is_lit_beside(frame, samples.inside)
+    frame = frame[samples.inside or _WHOLE]
+    share = min(_LONG_SIDE / max(frame.shape), 1.0)
     picture = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else frame
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     if float(grey.mean()) < _DARK:
@@ -262,13 +298,35 @@ def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples,
     )
 
 
+def _inside_bars(frame: UInt8[np.ndarray, "h w 3"]) -> tuple[slice, slice]:
+    """Return the rows and columns of a frame between two equal black bars; all of them without such bars."""
+    is_seen, parts = frame.max(axis=2) > _BLACK, []
+    for axis, side in ((1, frame.shape[0]), (0, frame.shape[1])):
+        places = np.flatnonzero(is_seen.mean(axis=axis) > _SEEN)
+        before, after = (int(places[0]), side - 1 - int(places[-1])) if len(places) else (0, 0)
+        # A row at each bar can be mixed with it.
+        bar = max(before, after) + 1 if abs(before - after) <= _UNEVEN * side and max(before, after) > 0 else 0
+        parts.append(slice(bar, side - bar))
+    inside = [part.stop - part.start for part in parts]
+    is_picture = min(inside) >= _LEAST_SIDE and max(inside) <= _LONGEST * min(inside)
+    return (parts[0], parts[1]) if is_picture and math.prod(inside) <= (1.0 - _LEAST_BARS) * is_seen.size else _WHOLE
+
+
+def _is_lit_beside(frame: UInt8[np.ndarray, "h w 3"], inside: tuple[slice, slice] | None) -> bool:
+    """Return whether a frame shows something in what is taken for bars."""
+    is_seen = frame.max(axis=2) > 2 * _BLACK
+    is_seen[inside or _WHOLE] = False
+    return inside is not None and inside != _WHOLE and float(is_seen.mean()) > _SEEN
+
+
 @contextmanager
 def _opened(content: bytes, limits: FilmLimits) -> Iterator[tuple[cv2.VideoCapture, float]]:
     """Open a film in memory; yield it with the duration (s) that it claims."""
     kind = film_kind(content)
     if kind is None:
         raise InvalidFilmError(
-            "the file is no MP4, MOV or WebM film by its first bytes; record or export the film in one of these formats"
+            "the file is no MP4, MOV, WebM or Matroska film by its first bytes; record or export the film in one of "
+            "these formats"
         )
     before = os.environ.get(_OPTIONS)
     # No protocol: everything is in memory. FFmpeg would otherwise choose among all of its demuxers by the content.
@@ -291,11 +349,11 @@ def _opened(content: bytes, limits: FilmLimits) -> Iterator[tuple[cv2.VideoCaptu
 
 
 def film_kind(content: bytes) -> str | None:
-    """Return the kind of a film by its first bytes: "MP4 or MOV" or "WebM"; None for other files."""
+    """Return the kind of a film by its first bytes: a key of `_DEMUXERS`; None for other files."""
     if content[4:8] in _BOXES:
         return "MP4 or MOV"
-    if content[:4] == _EBML and _WEBM in content[4:_HEAD]:
-        return "WebM"
+    if content[:4] == _EBML and any(name in content[4:_HEAD] for name in _DOC_TYPES):
+        return "WebM or Matroska"
     return None
 
 

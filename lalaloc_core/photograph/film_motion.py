@@ -50,6 +50,7 @@ class FlowTracker:
         self._errors: list[float] = []
         self._least = self._most = 0.0
         self._nods: list[float] = []
+        self._down = 0.0
         self._shares: list[float] = []
         self._grown = 0.0
 
@@ -83,6 +84,7 @@ class FlowTracker:
         angles = np.arctan(moved.places / focal)
         across, down = np.median(angles[1] - angles[0], axis=0)
         turn = -float(across)
+        self._down += float(down)
         if moved.places.shape[1] < _FEW or abs(turn) < _STILL:
             if swept is None:
                 return math.nan, _GUESSED_SHARE
@@ -128,6 +130,11 @@ class FlowTracker:
     def nod(self) -> float:
         """Root mean square (radians) of the change of nods from sample to sample."""
         return float(np.sqrt(np.mean(np.square(np.diff(self._nods))))) if len(self._nods) > 1 else 0.0
+
+    @property
+    def nodded(self) -> float:
+        """Angle (radians) by which the camera nods from the first sample to the last."""
+        return abs(self._down)
 
     @property
     def shakes(self) -> bool:

@@ -208,7 +208,8 @@ def open_photograph(
         found = opened.sphere_format()
         if found is not None and found.box is not None:
             opened = opened.taken_out(found)
-            lens = Lens(projection="equirectangular", projection_source="estimated")
+            is_sphere = found.is_sphere
+            lens = Lens(projection="equirectangular", projection_source="estimated") if is_sphere else opened.lens()
         elif found is not None and (stated.projection == AUTO or not is_twice_as_wide(opened.width, opened.height)):
             raise InvalidPhotographError(found.text)
         else:
@@ -257,7 +258,7 @@ class _Opened:
             metadata = replace(metadata, pitch=math.radians(stated.pitch_deg))
         if stated.roll_deg is not None:
             metadata = replace(metadata, roll=math.radians(stated.roll_deg))
-        exif = read_exif_lens(file.exif, width=width, height=height)
+        exif = read_exif_lens(file.exif, file.packets, width=width, height=height)
         return cls(file, stated, sphere_size, limits, width, height, metadata, exif)
 
     @cached_property
@@ -300,7 +301,9 @@ class _Opened:
         # Cameras write a focal length into usual photographs.
         if self.exif.focal is not None and any(abs(ratio / usual - 1.0) <= _USUAL_TOLERANCE for usual in _USUAL_RATIOS):
             return None
-        return find_sphere_format(self.thumbnail)
+        found = find_sphere_format(self.thumbnail)
+        is_said = metadata.declared or stated.projection == "equirectangular"
+        return None if found is not None and is_said and not found.is_sphere else found
 
     def taken_out(self, found: SphereFormat) -> _Opened:
         """Return the sphere that the picture holds; GPano metadata count if they are of the same picture."""

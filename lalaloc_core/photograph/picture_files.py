@@ -47,6 +47,8 @@ _UPRIGHT = {
 }
 SIDEWAYS = {5, 6, 7, 8}
 _WHOLE = 0.0, 0.0, 1.0, 1.0
+# Ratios of sides that differ by less (relative) are of one picture.
+_SAME_RATIO = 0.01
 # Largest share of rows that a JPEG without its end can lack.
 _MAX_MISSING = 0.5
 # Decoders raise these for damaged files; their words are not those of users.
@@ -76,6 +78,7 @@ class PictureFile:
     Attributes:
         open: returns the picture, whose pixels are not decoded yet.
         box: part of the upright picture that counts, as shares (left, top, right, bottom).
+        is_upright: its pixels are upright, whatever the Exif orientation.
         is_cut: it is a JPEG whose end is missing.
         warnings: parts of the file that are damaged, or that were ignored.
     """
@@ -86,13 +89,14 @@ class PictureFile:
     exif: Image.Exif
     packets: list[bytes | str]
     box: tuple[float, float, float, float] = _WHOLE
+    is_upright: bool = False
     is_cut: bool = False
     warnings: list[str] = field(default_factory=list)
 
     @property
     def orientation(self) -> int:
-        """Exif orientation, 1 if there is none."""
-        orientation = self.exif.get(ExifTags.Base.Orientation, 1)
+        """Exif orientation; 1 if there is none, or it is not to be applied."""
+        orientation = 1 if self.is_upright else self.exif.get(ExifTags.Base.Orientation, 1)
         return orientation if isinstance(orientation, int) else 1
 
     @property
@@ -134,7 +138,10 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
 
     packets, unread = xmp_packets(content)
     exif, is_damaged = _exif_of(image)
+    was_turned, orientation = _was_turned(exif, size), exif.get(ExifTags.Base.Orientation)
     faults = {
+        f"the Exif orientation {orientation} was ignored, because the picture was turned after it was taken: the Exif "
+        "size is that of a picture on its side; send the camera's original file if this is wrong": was_turned,
         "the file ends before its picture does: the missing part is grey; send the whole file": is_cut,
         f"texts of {left_out} bytes were ignored; all texts of a PNG can have {MAX_TEXT_BYTES} bytes": left_out > 0,
         f"the last {unread} XMP packets were ignored; the limit is {len(packets)}": unread > 0,
@@ -146,6 +153,7 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
         size=size,
         exif=exif,
         packets=[*packets] or [packet for packet in [image.info.get("xmp")] if packet],
+        is_upright=was_turned,
         is_cut=is_cut,
         warnings=[text for text, applies in faults.items() if applies],
     )
@@ -159,6 +167,19 @@ def _exif_of(image: Image.Image) -> tuple[Image.Exif, bool]:
     except _DAMAGE:
         return Image.Exif(), True
     return exif, False
+
+
+def _was_turned(exif: Image.Exif, size: tuple[int, int]) -> bool:
+    """Return whether a picture was turned upright but kept its orientation: it has its Exif size, turned.
+
+    Sensors are wider than high; some cameras state the size of the upright picture.
+    """
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    width, height = (tags.get(tag) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
+    if exif.get(ExifTags.Base.Orientation) not in SIDEWAYS or not isinstance(width, int) or not isinstance(height, int):
+        return False
+    is_alike = abs(width * size[0] - height * size[1]) <= _SAME_RATIO * width * size[0]
+    return is_alike and width > height and size[0] < size[1]
 
 
 def _formats(content: bytes) -> tuple[str, ...]:

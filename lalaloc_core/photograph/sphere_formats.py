@@ -25,8 +25,9 @@ _TOLERANCE = 0.01
 # Eyes of a stereo picture: height and width (pixels) of compared pictures, the smallest correlation of two eyes (other
 # pictures reach 0.57, a plain corridor seen both ways), and the largest shift between them (pixels).
 _EYE, _MIN_CORRELATION, _MAX_SHIFT = (64, 128), 0.75, 6
-# Bars: largest spread of grey levels along a row, and least share of the height.
-_MAX_BAR_SPREAD, _MIN_BARS = 4.0, 0.02
+# Bars: largest spread of grey levels along a row, share of a row that is of the bar, beside texts, and least share of
+# the height; shares of the picture that bars around photographs have, and fewest rows between them.
+_MAX_BAR_SPREAD, _OF_BAR, _MIN_BARS, _PHOTOGRAPH_BARS, _FEWEST_ROWS = 4.0, 0.8, 0.02, (0.08, 0.85), 48
 # Circles: side (pixels) of judged squares, radii of the ring inside and of the corners, and grey levels of the corners.
 _CIRCLE = 64
 _RING, _CORNERS = (0.8, 0.93), 1.12
@@ -45,16 +46,19 @@ _MIN_CONTINUED, _MIN_BROKEN = 0.8, 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class SphereFormat:
-    """Format of a picture that holds a sphere.
+    """Format of a picture that holds a sphere, or a photograph within bars.
 
     Attributes:
-        box: part of the picture with the sphere, as shares (left, top, right, bottom); None if it is refused.
+        box: part of the picture with the sphere or photograph, as shares (left, top, right, bottom); None if it is
+            refused.
+        is_sphere: it holds a sphere.
         is_stored: `box` is one of the stored picture, before its Exif orientation is applied.
     """
 
     text: str
     box: tuple[float, float, float, float] | None = None
     is_stored: bool = False
+    is_sphere: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +213,36 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     )
 
 
+def _find_photograph_in_bars(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a photograph within bars of one colour, such as a screenshot, which can have texts there."""
+    pixels = thumbnail.pixels
+    # Some cameras paint the zenith and nadir of their spheres in one colour.
+    if _has_ratio(pixels, 2.0) and looks_spherical(pixels):
+        return None
+    height, width = pixels.shape[:2]
+    (top, bottom), (left, right) = _bars(pixels), _bars(pixels.transpose(1, 0, 2))
+    share = 1.0 - (bottom - top) * (right - left) / (height * width)
+    if not _PHOTOGRAPH_BARS[0] <= share <= _PHOTOGRAPH_BARS[1] or min(bottom - top, right - left) < _FEWEST_ROWS:
+        return None
+    return SphereFormat(
+        text=f"the photograph is within bars, {share:.0%} of the picture, as in a screenshot: they were cut off; send "
+        "the camera's original file",
+        # A row at each bar can be mixed with it.
+        box=tuple(
+            (place + (0 < place < side) * (1 if place < 0.5 * side else -1)) / side
+            for place, side in ((left, width), (top, height), (right, width), (bottom, height))
+        ),  # type: ignore[arg-type]
+        is_sphere=False,
+    )
+
+
 def _bars(pixels: UInt8[np.ndarray, "n m 3"]) -> tuple[int, int]:
     """Return the first row and the end of the rows between bars of one colour at the top and bottom."""
     mean, spread = cv2.meanStdDev(np.ascontiguousarray(pixels[[0, -1]]))
     if spread.max() > 2.0 * _MAX_BAR_SPREAD:
         return 0, len(pixels)
-    totals = (cv2.reduce(pixels, 1, kind, dtype=cv2.CV_64F)[:, 0] for kind in (cv2.REDUCE_SUM, cv2.REDUCE_SUM2))
-    means, squares = (total / pixels.shape[1] for total in totals)
-    is_bar = (squares - means**2).max(axis=1) < _MAX_BAR_SPREAD**2
-    is_bar &= np.abs(means - mean[:, 0]).max(axis=1) < 2.0 * _MAX_BAR_SPREAD
+    is_colour = np.abs(pixels - mean[:, 0]).max(axis=2) < 2.0 * _MAX_BAR_SPREAD
+    is_bar = is_colour.mean(axis=1) >= _OF_BAR
     if is_bar.all():
         return 0, len(pixels)
     return int(np.argmin(is_bar)), len(pixels) - int(np.argmin(is_bar[::-1]))
@@ -288,4 +313,5 @@ _DETECTORS: tuple[Callable[[Thumbnail], SphereFormat | None], ...] = (
     _find_stereo,
     _find_bars,
     _find_cube,
+    _find_photograph_in_bars,
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 
 Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
-PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
 AUTO = "auto"
 # Horizontal fields of view, degrees.
 HFOV_RANGE_DEG = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +27,19 @@ def open_turn(
     contents: Sequence[bytes], stated: StatedCamera, *, sphere_size: tuple[int, int], patch_size: PatchSize | None
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Read photographs of one spot, in the order in which they were taken, with the angles that overlap tells."""
-    read = partial(open_photograph, sphere_size=sphere_size, patch_size=patch_size)
-    photographs = [read(content, stated=stated, purpose="turn") for content in contents]
-    if any(photograph.overview is None for photograph in photographs):
-        raise InvalidPhotographError("a full sphere is among the photographs; localise it by itself")
+    sizes: dict[str, Any] = {"sphere_size": sphere_size, "patch_size": patch_size}
+    photographs = [open_of_turn(content, stated, **sizes) for content in contents]
     return level_turn(photographs, patch_size or PatchSize())
+
+
+def open_of_turn(
+    content: bytes, stated: StatedCamera, *, sphere_size: tuple[int, int], patch_size: PatchSize | None
+) -> Photograph:
+    """Read one photograph of a turn, before `level_turn`."""
+    photograph = open_photograph(content, sphere_size=sphere_size, stated=stated, patch_size=patch_size, purpose="turn")
+    if photograph.overview is None:
+        raise InvalidPhotographError("the photograph is a full sphere; localise it by itself, not in a turn")
+    return photograph
 
 
 def level_turn(photographs: Sequence[Photograph], size: PatchSize) -> tuple[list[Photograph], list[TurnAngles]]:

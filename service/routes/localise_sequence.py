@@ -29,9 +29,8 @@ router = APIRouter(tags=["localisation"])
 _MIN_PHOTOGRAPHS = 2
 _FILM_SCHEMA = BINARY | {
     "description": f"Instead of `{PHOTO}`: a film of one slow turn, once around on the spot: MP4, "
-    "MOV or WebM with H.264, HEVC, VP8 or VP9. Limits: `max_film_bytes`, `max_film_s`, `max_film_pixels`, "
-    "`max_film_cpu_s`. "
-    "Sharp frames at equal angles become poses."
+    "MOV, WebM or Matroska with H.264, HEVC, MPEG-4, VP8 or VP9. Limits: `max_film_bytes`, `max_film_s`, "
+    "`max_film_pixels`, `max_film_cpu_s`. Sharp frames at equal angles become poses."
 }
 _PHOTOS_SCHEMA = photographs_schema(
     "Photographs in the order in which they were taken", "max_sequence_photographs", minItems=_MIN_PHOTOGRAPHS

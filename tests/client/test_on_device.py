@@ -80,7 +80,7 @@ def test_film_stays_on_the_device(service: Any, home: str, tmp_path: Path) -> No
         assert angle.source == "given"
         missed_deg = angle.value_deg - 60.0 * (pose.time_s - times_s[0])
         assert (missed_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=2.0)
-    with pytest.raises(OnDeviceError, match="is no MP4, MOV or WebM film"):
+    with pytest.raises(OnDeviceError, match="is no MP4, MOV, WebM or Matroska film"):
         service.localise_film(home, b"no film", on_device=True)
 
 

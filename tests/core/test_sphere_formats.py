@@ -10,11 +10,12 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
+from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
 from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
@@ -228,8 +229,35 @@ class TestParts:
             opened(encoded(part, "JPEG", xmp(**stated)))
 
 
-def test_bars_that_leave_no_sphere_are_kept() -> None:
-    view = take(small("study"), Perspective.of_hfov(640, 320, math.radians(80.0)))
+def test_photograph_is_taken_out_of_its_bars() -> None:
+    view = take(small("study"), Perspective.of_hfov(640, 400, math.radians(80.0)))
     buffer = io.BytesIO()
-    Image.fromarray(barred(view, 20, 0)).save(buffer, "PNG")
-    assert opened(buffer.getvalue()).projection == "perspective"
+    Image.fromarray(barred(view, 60, 0)).save(buffer, "PNG")
+    found = opened(buffer.getvalue())
+    assert found.projection == "perspective"
+    assert "within bars, 23% of the picture, as in a screenshot" in found.warnings[0]
+    assert found.camera is not None
+    assert (found.camera.width, found.camera.height) == pytest.approx((640, 400), abs=3)
+
+
+def test_black_zenith_and_nadir_are_of_the_sphere() -> None:
+    pixels = small("kitchen").copy()
+    pixels[:60] = pixels[-60:] = 0
+    for view in (opened(jpeg(pixels)), opened(jpeg(pixels), StatedCamera(projection="equirectangular"))):
+        assert view.is_sphere
+        assert not any("bars" in text for text in view.warnings)
+
+
+@pytest.mark.parametrize(
+    ("size", "stated", "is_ignored"),
+    [((480, 640), (640, 480), True), ((640, 480), (480, 640), False), ((640, 480), (640, 480), False)],
+)
+def test_orientation_of_a_picture_that_was_turned_is_ignored(
+    size: tuple[int, int], stated: tuple[int, int], is_ignored: bool
+) -> None:
+    exif, content = Image.Exif(), io.BytesIO()
+    exif[ExifTags.Base.Orientation] = 6
+    exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExifImageWidth: stated[0], ExifTags.Base.ExifImageHeight: stated[1]}
+    Image.new("RGB", size).save(content, "JPEG", exif=exif.tobytes())
+    with opened_picture(content.getvalue(), PhotographLimits()) as file:
+        assert (file.orientation, len(file.warnings)) == ((1, 1) if is_ignored else (6, 0))

@@ -74,7 +74,7 @@ def test_features_of_a_turn_are_sent_with_its_angles(tmp_path: Path, capsys: pyt
         (("photo.jpg", "--turn", "film.mp4"), "exclude each other"),
         (("--turn", "{}", "--heading", "10"), "--heading does not go with --turn"),
         (("--turn", "{}"), "has 0 photographs; a turn has 2 to 100"),
-        (("--turn", "{}/film.mp4"), "is no MP4, MOV or WebM film by its first bytes"),
+        (("--turn", "{}/film.mp4"), "is no MP4, MOV, WebM or Matroska film by its first bytes"),
     ],
 )
 def test_unusable_turns_are_named(

@@ -34,7 +34,11 @@ export class LookAround {
   private readonly ring = new Ring();
   private readonly hint = h("p", { id: "look-hint", role: "status" });
   private readonly error = h("div", { class: "error", id: "look-error", role: "alert", hidden: true });
-  private readonly film = h("input", { id: "look-film", type: "file", accept: "video/mp4,video/quicktime,video/webm" });
+  private readonly film = h("input", {
+    id: "look-film",
+    type: "file",
+    accept: "video/mp4,video/quicktime,video/webm,.mkv",
+  });
   private readonly instead = h(
     "div",
     { id: "look-instead", hidden: true },

@@ -1,0 +1,66 @@
+"""Folders of photographs: their files, in order."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC
+from pathlib import Path
+
+from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
+from lalaloc_core.photograph.exif import read_taken
+from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
+
+MAX_TURN_PHOTOGRAPHS = 100
+# Larger files are not read for their time.
+_MAX_BYTES = 200 * 2**20
+# Suffixes of files in a folder that can be photographs.
+PICTURES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp"})
+
+
+def turn_files(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the photographs of a turn in a folder, and lines on the files that are left out: empty and hidden ones.
+
+    They are in the order of their times, if all have different ones, else in that of the numbers in their names.
+    """
+    files = pictures_in(folder, require=False)
+    used = [file for file in files if file.stat().st_size]
+    times = {file: _taken_at(file) for file in used} if len(used) <= MAX_TURN_PHOTOGRAPHS else {}
+    if times and None not in times.values() and len(set(times.values())) == len(used):
+        used.sort(key=lambda file: times[file] or 0.0)
+    empty = [f"'{file.name}' is empty and was left out" for file in files if file not in used]
+    hidden = [file.name for file in folder.iterdir() if file.name.startswith(".") and file.suffix.lower() in PICTURES]
+    return used, empty + ([f"{len(hidden)} hidden files, such as '{min(hidden)}', were left out"] if hidden else [])
+
+
+def _taken_at(file: Path) -> float | None:
+    """Return the time (s) of a photograph by its metadata; None without one."""
+    try:
+        if file.stat().st_size > _MAX_BYTES:
+            return None
+        with opened_picture(file.read_bytes(), PhotographLimits()) as picture:
+            at = read_taken(picture.exif, width=0, height=0).at
+    except (OSError, InvalidPhotographError):
+        return None
+    return None if at is None else at.replace(tzinfo=at.tzinfo or UTC).timestamp()
+
+
+def pictures_in(folder: Path, *, require: bool = True) -> list[Path]:
+    """Return the picture files in a folder, sorted by name; numbers in names count as such.
+
+    Raises:
+        InvalidInputError: the folder cannot be read, or has no pictures although they are required.
+    """
+    try:
+        entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise InvalidInputError(f"'{folder}' cannot be read as a folder: {error.strerror}") from error
+    entries.sort(key=lambda entry: _with_numbers(entry.name))
+    found = [entry for entry in entries if entry.suffix.lower() in PICTURES and entry.is_file()]
+    if require and not found:
+        raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(PICTURES))})")
+    return found
+
+
+def _with_numbers(name: str) -> list[str]:
+    """Return a key by which "2.jpg" is before "10.jpg"."""
+    return [part.zfill(20) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
