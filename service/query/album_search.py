@@ -66,7 +66,7 @@ class AlbumSearch:
             made = photograph_entry(query.sha256, self._parts.encoder.with_features(view))
             taken = made.taken
             facts = PhotographFacts(
-                taken_at=None if taken.at is None else taken.at.isoformat(),
+                taken_at=None if taken.at is None else taken.at.replace(tzinfo=None).isoformat(),
                 make=taken.make or None,
                 model=taken.model or None,
                 width=taken.width or None,

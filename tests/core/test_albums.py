@@ -313,8 +313,8 @@ def _exhaustive(evidence: RoomEvidence) -> np.ndarray:
         room = np.array([code // rooms**number % rooms for number in range(count)])
         log = evidence.alone[np.arange(count), room].sum()
         if evidence.walk is not None:
-            log += evidence.walk[room[:-1], room[1:]].sum()
-        log += 0.5 * (evidence.pairs * (room[:, None] == room)).sum()
+            log += (evidence.walk[room[:-1], room[1:]] * evidence.follows[1:]).sum()
+        log += 0.5 * (evidence.pairs * (room[:, None] == room) * (room < rooms - 1)).sum()
         expected = evidence.expected
         off = np.bincount(room, minlength=rooms) - np.nan_to_num(expected)
         off = np.where(np.isnan(expected), 0.0, off)
@@ -330,10 +330,38 @@ def test_assignment_agrees_with_the_sum_over_all(has_order: bool) -> None:
     pairs = np.triu(pairs, 1) + np.triu(pairs, 1).T
     walk = np.log(rng.dirichlet(np.ones(3), 3)) if has_order else None
     evidence = RoomEvidence(
-        alone=rng.normal(0.0, 1.0, (6, 3)), walk=walk, pairs=pairs, expected=np.array([3.0, 3.0, np.nan])
+        alone=rng.normal(0.0, 1.0, (6, 3)),
+        walk=walk,
+        # Two walks, of two photographs and of four.
+        follows=np.array([False, True, False, True, True, True]) & has_order,
+        pairs=pairs,
+        expected=np.array([3.0, 3.0, np.nan]),
+        storeys=(np.array([0]), np.array([1])),
     )
     mean = np.mean([assign_rooms(evidence, seed) for seed in range(6)], axis=0)
     np.testing.assert_allclose(mean, _exhaustive(evidence), atol=0.05)
+
+
+def test_storeys_that_were_confused_are_exchanged() -> None:
+    """Two storeys of four rooms look alike, and the first of sixteen photographs tells them apart."""
+    rooms, count = 8, 16
+    alone = np.full((count, rooms + 1), -12.0)
+    for number in range(count):
+        alone[number, [number // 4, number // 4 + 4]] = 0.0, 0.6
+    alone[0, 4:] = -6.0
+    walk = np.full((rooms + 1, rooms + 1), math.log(1e-9))
+    walk[:4, :4], walk[4:8, 4:8] = math.log(0.25), math.log(0.25)
+    evidence = RoomEvidence(
+        alone=alone,
+        walk=walk,
+        follows=np.arange(count) > 0,
+        pairs=np.zeros((count, count)),
+        expected=np.full(rooms + 1, np.nan),
+        storeys=(np.arange(4), np.arange(4, 8)),
+    )
+    found = [assign_rooms(evidence, seed)[:, 4:8].sum(axis=1).mean() for seed in range(4)]
+    # By the sum over both: -6 for the first photograph against 15 times 0.6.
+    np.testing.assert_allclose(found, 1.0 / (1.0 + math.exp(6.0 - 15 * 0.6)), atol=0.05)
 
 
 def _pin(id: str, pose: PinPose | None) -> Pin:

@@ -252,7 +252,6 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         raise InvalidEntryError(f"taken_at is '{header.taken_at!s:.50}', which is no time") from error
     faults = {
         "id": not 0 < len(header.id) <= _MAX_ID or not header.id.isprintable(),
-        "taken_at": at is not None and at.tzinfo is not None,
         "make": len(header.make) > MAX_NAME or not header.make.isprintable(),
         "model": len(header.model) > MAX_NAME or not header.model.isprintable(),
         "width": not 0 <= header.width <= _MAX_SIDE,

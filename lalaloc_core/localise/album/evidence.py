@@ -13,14 +13,12 @@ import math
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import Manifest, MatchingWeights
-from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import InvalidEntryError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.comparison import BinnedGround, Comparison
@@ -29,7 +27,7 @@ from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.pins import SharedCamera
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost, PoseGrid, layouts_at
-from lalaloc_core.localise.match.cost_terms import ceiling_costs, room_type_losses
+from lalaloc_core.localise.match.cost_terms import ceiling_costs, losses_of_rooms, room_type_losses
 from lalaloc_core.localise.query import DEFAULT_STD_M, NO_HINTS, CameraHeight, Query
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
@@ -144,11 +142,6 @@ class SearchedPlan:
         layouts = layouts_at(plan, poses, np.zeros(len(poses)), columns)
         return cls(plan, poses, _FINE_REACH_M, BinnedGround.of(layouts))
 
-    @cached_property
-    def types(self) -> Int[np.ndarray, "r"]:
-        """Number of each room's type in `conventions.ROOM_TYPES`."""
-        return np.array([ROOM_TYPES.index(room.type) for room in self.plan.rooms])
-
 
 def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photograph: Photograph) -> Arrays:
     """Compare a photograph with all poses.
@@ -182,7 +175,7 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photogra
         "room": searched.poses.room_index[pose].astype(np.int32),
         "hypothesis": hypothesis.astype(np.uint8),
         "log_likelihood": best.ravel()[kept].astype(np.float32),
-        "room_types": _room_types(searched, query, weights).astype(np.float32),
+        "room_types": _room_types(searched.plan, query, weights).astype(np.float32),
         "heights": heights.astype(np.float32),
         "chance": np.array(_by_chance(encoder, compared, usual, int(trusts[best.max(axis=1).argmax()])), np.float32),
     }
@@ -213,17 +206,18 @@ def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], room
     return np.concatenate(parts)
 
 
-def _room_types(searched: SearchedPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r"]:
+def _room_types(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r"]:
     """Return the log likelihood of every room's type.
 
     As in the matching cost, recognised objects replace the encoder's own prediction.
     """
     if query.objects is not None:
-        return -room_type_losses(query.objects.room_type, _CONFIG.floor)[searched.types]
-    if query.room_type is None:
-        return np.zeros(len(searched.types))
-    losses = room_type_losses(query.room_type, _CONFIG.floor)
-    return -weights.room_type * weights.temperature * losses[searched.types]
+        predicted, weight = query.objects.room_type, 1.0
+    elif query.room_type is not None:
+        predicted, weight = query.room_type, weights.room_type * weights.temperature
+    else:
+        return np.zeros(len(plan.rooms))
+    return -weight * losses_of_rooms(room_type_losses(predicted, _CONFIG.floor), plan.type_shares)
 
 
 def _ceilings(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r j"]:

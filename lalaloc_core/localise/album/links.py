@@ -26,6 +26,7 @@ _MIN_MATCHES, _MIN_SHARE, _MAX_TILT = 10, 0.35, math.radians(12.0)
 _ALL_PAIRS, _NEIGHBOURS, _MOST_PAIRS = 60, 4, 3000
 # Log odds of one room by the number of matches, measured on generated homes, and of a turn.
 _MATCHES, _MATCH_ODDS, _TURN_ODDS = (0.0, 6.0, 14.0, 18.0, 24.0, 32.0), (-0.3, -0.3, 0.0, 0.3, 2.0, 4.0), 5.0
+_CERTAIN_MATCHES = 24
 # Share of the pairs of one room that are among the most similar ones, and limits of similarity and log odds.
 _FOUND, _ALIKE, _UNLIKE = 0.65, 0.4, 0.25
 _COLOUR_ODDS = (-2.0, 3.0)
@@ -76,6 +77,12 @@ def pair_odds(
         total[second, first] += odds
     total[np.arange(count), np.arange(count)] = 0.0
     return _WEIGHT * min(_FEW * rooms / count, 1.0) * total
+
+
+def is_one_place(found: Found) -> bool:
+    """Return whether a pair of photographs is certainly of one place."""
+    matches, turn = found
+    return matches >= _CERTAIN_MATCHES or not math.isnan(turn)
 
 
 def _pairs(photographs: Sequence[AlbumPhotograph]) -> list[tuple[int, int]]:

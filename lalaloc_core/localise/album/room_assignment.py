@@ -8,27 +8,36 @@ of a home is unlikely, as people photograph every room.
 People mostly walk from room to room through doors, and photograph large rooms more often (`walk_of`,
 `expected_photographs`).
 
-Several chains are cooled together. Beside single photographs, chains move all photographs of a room, or a run of them,
-to another room, and swap two rooms: these moves leave the pairs alone, between whose optima single moves get stuck.
+Chains of several temperatures exchange their states (parallel tempering: Geyer, 1991); those of temperature 1 count.
+Beside single photographs, chains move all photographs of a room, or a run of them, to another room, and exchange two
+rooms, or two storeys: these moves leave the pairs alone, between whose optima single moves get stuck.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from lalaloc_core.localise.album.ground import AlbumGround
 
-_CHAINS, _HOTTEST = 12, 4.0
-# Sweeps over all photographs: while cooling, and those that are counted. Large albums have fewer, to bound the time.
-_COOLING, _COUNTED, _MAX_UPDATES = 40, 60, 3000
+# Chains of each temperature, and temperatures from 1 to the hottest.
+_LADDERS, _LEVELS, _HOTTEST = 2, 8, 4.0
+_CHAINS = _LADDERS * _LEVELS
+# Sweeps over all photographs: those before counting, and those that are counted. Large albums have fewer, to bound the
+# time.
+_SETTLING, _COUNTED, _MAX_UPDATES = 40, 60, 3000
 _FEWEST = 12
 # Most successive photographs that move together.
 _LONGEST = 6
+# Storeys whose exchange is tried: the largest ones, of at least so many rooms.
+_MOST_STOREYS, _STOREY_ROOMS = 4, 2
 # Probability that the next photograph is of the same room, that it is of any room at all, and the weight of rooms that
 # are a further door away over that of nearer ones; walks are followed through so many doors.
 _STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.05, 0.5, 4
@@ -42,20 +51,25 @@ _SMALL_M2, _SMALL_SHARE = 3.0, 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RoomEvidence:
-    """Evidence for the rooms of n photographs in the order in which they were taken; the last room is "elsewhere".
+    """Evidence for the rooms of n photographs, those of a walk in their order; the last room is "elsewhere".
 
     Attributes:
         alone: (n, r) log likelihood of each photograph in each room.
         walk: (r, r) log probability of the next photograph's room, by that of a photograph; None without an order.
-        pairs: (n, n) log odds that two photographs are of one room, symmetric, zero on the diagonal.
+        follows: (n,) whether a photograph follows the one before it on a walk; never the first.
+        pairs: (n, n) log odds that two photographs are of one room, symmetric, zero on the diagonal; they do not count
+            elsewhere, which is no room.
         expected: (r,) number of photographs that each room has a priori; NaN for rooms that can have any number.
+        storeys: rooms of each storey; empty for no exchange of them.
     """
 
     alone: Float[np.ndarray, "n r"]
     walk: Float[np.ndarray, "r r"] | None
+    follows: Bool[np.ndarray, "n"]
     pairs: Float[np.ndarray, "n n"]
     expected: Float[np.ndarray, "r"]
     tightness: float = 1.0
+    storeys: tuple[Int[np.ndarray, "_"], ...] = ()
 
 
 def assign_rooms(
@@ -66,30 +80,32 @@ def assign_rooms(
     if count == 0:
         return np.zeros(evidence.alone.shape)
     chains = _Chains(evidence, np.random.default_rng(seed))
-    share = min(1.0, _MAX_UPDATES / ((_COOLING + _COUNTED) * count))
-    cooling, counted = (max(round(share * sweeps), _FEWEST) for sweeps in (_COOLING, _COUNTED))
-    for heat in np.geomspace(_HOTTEST, 1.0, cooling):
+    share = min(1.0, _MAX_UPDATES / ((_SETTLING + _COUNTED) * count))
+    settling, counted = (max(round(share * sweeps), _FEWEST) for sweeps in (_SETTLING, _COUNTED))
+    for _ in range(settling):
         pause()
-        chains.sweep(float(heat))
+        chains.sweep()
     total = np.zeros(evidence.alone.shape)
     for _ in range(counted):
         pause()
-        total += chains.sweep(1.0)
+        total += chains.sweep()
     return total / total.sum(axis=1, keepdims=True)
 
 
 def _sampled_walks(
-    alone: Float[np.ndarray, "n r"], walk: Float[np.ndarray, "r r"], rng: np.random.Generator
+    evidence: RoomEvidence, heat: Float[np.ndarray, "c"], rng: np.random.Generator
 ) -> Int[np.ndarray, "c n"]:
-    """Return rooms drawn by evidence and walk alone (forward filtering, backward sampling)."""
-    forward = alone.copy()
-    for number in range(1, len(alone)):
+    """Return rooms drawn by evidence and walk alone (forward filtering, backward sampling) at the highest heat."""
+    hottest = float(heat.max())
+    forward = evidence.alone / hottest
+    walk = np.zeros((forward.shape[1],) * 2) if evidence.walk is None else evidence.walk / hottest
+    for number in np.flatnonzero(evidence.follows).tolist():
         forward[number] += np.logaddexp.reduce(forward[number - 1][:, None] + walk, axis=0)
-    room = np.empty((_CHAINS, len(alone)), int)
-    after = np.zeros((_CHAINS, alone.shape[1]))
-    for number in reversed(range(len(alone))):
-        room[:, number] = (forward[number] + after + rng.gumbel(size=after.shape)).argmax(axis=1)
-        after = walk[:, room[:, number]].T
+    room = np.empty((len(heat), len(forward)), int)
+    for number in reversed(range(len(forward))):
+        is_followed = number + 1 < len(forward) and evidence.follows[number + 1]
+        after = walk[:, room[:, number + 1]].T if is_followed else 0.0
+        room[:, number] = (forward[number] + after + rng.gumbel(size=(len(heat), forward.shape[1]))).argmax(axis=1)
     return room
 
 
@@ -100,26 +116,36 @@ class _Chains:
         self._alone, self._pairs, self._rng = evidence.alone, evidence.pairs, rng
         self._rooms = evidence.alone.shape[1]
         self._walk = np.zeros((self._rooms, self._rooms)) if evidence.walk is None else evidence.walk
+        self._follows = evidence.follows
         self._expected = np.nan_to_num(evidence.expected)
         self._stiffness = np.where(
             np.isnan(evidence.expected), 0.0, evidence.tightness / (2.0 * (self._expected + 1.0))
         )
         self._each = np.arange(_CHAINS)
-        self._room = _sampled_walks(evidence.alone / _HOTTEST, self._walk / _HOTTEST, rng)
+        # Temperature of each chain, and the number of each chain by ladder and temperature.
+        self._heat = np.tile(np.geomspace(1.0, _HOTTEST, _LEVELS), _LADDERS)
+        self._ladder = np.arange(_CHAINS).reshape(_LADDERS, _LEVELS)
+        self._room = _sampled_walks(evidence, self._heat, rng)
         one_hot = np.eye(self._rooms)[self._room]
         # Log odds of each photograph with all others of each room, and photographs by room.
         self._linked = np.einsum("tu,cur->ctr", self._pairs, one_hot)
+        self._linked[:, :, -1] = 0.0
         self._counts = one_hot.sum(axis=1)
+        self._exchanges = _exchanges(evidence)
 
-    def sweep(self, heat: float) -> Float[np.ndarray, "n r"]:
-        """Move everything once; return the summed conditional probabilities of each photograph's room."""
+    def sweep(self) -> Float[np.ndarray, "n r"]:
+        """Move everything once; return the conditional probabilities of each photograph's room at temperature 1."""
         count = self._room.shape[1]
         found = np.empty((count, self._rooms))
         for number in self._rng.permutation(count).tolist():
-            found[number] = self._move_one(number, heat)
+            found[number] = self._move_one(number)
         for number in range(max(count // 2, 4)):
-            self._move_set(heat, whole=number % 2 == 0)
-            self._swap(heat)
+            self._move_set(whole=number % 2 == 0)
+            self._exchange_rooms(self._random_exchange())
+        for rooms in self._exchanges:
+            self._exchange_rooms(np.broadcast_to(rooms, (_CHAINS, self._rooms)))
+        for first in (0, 1):
+            self._exchange_heats(first)
         return found
 
     def _prior(self, counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c r"]:
@@ -131,19 +157,20 @@ class _Chains:
         """Return how the log prior changes with more photographs in a room."""
         return -self._stiffness * more * (2.0 * (counts - self._expected) + more)
 
-    def _move_one(self, number: int, heat: float) -> Float[np.ndarray, "r"]:
-        """Draw the room of one photograph; return its conditional probabilities, summed over chains."""
+    def _move_one(self, number: int) -> Float[np.ndarray, "r"]:
+        """Draw the room of one photograph; return its conditional probabilities, summed over chains that count."""
         room, before = self._room, self._room[:, number].copy()
         others = self._counts.copy()
         others[self._each, before] -= 1.0
         log = self._alone[number] + self._linked[:, number] + self._prior_of_more(others, 1.0)
-        if number > 0:
+        if self._follows[number]:
             log = log + self._walk[room[:, number - 1]]
-        if number + 1 < room.shape[1]:
+        if number + 1 < room.shape[1] and self._follows[number + 1]:
             log = log + self._walk[:, room[:, number + 1]].T
-        share = np.exp(log - log.max(axis=1, keepdims=True))
+        cold = log[self._heat == 1.0]
+        share = np.exp(cold - cold.max(axis=1, keepdims=True))
         share /= share.sum(axis=1, keepdims=True)
-        after = self._drawn(log, heat)
+        after = self._drawn(log)
         moved = np.flatnonzero(after != before)
         if len(moved):
             mask = np.zeros(room.shape, bool)
@@ -151,7 +178,7 @@ class _Chains:
             self._relabel(mask, after)
         return share.sum(axis=0)
 
-    def _move_set(self, heat: float, *, whole: bool) -> None:
+    def _move_set(self, *, whole: bool) -> None:
         """Draw another room for all photographs of one room, or for some successive ones of one room.
 
         Balance needs sets that the move back can choose as well: whole rooms move to empty ones only, and where
@@ -159,8 +186,8 @@ class _Chains:
         """
         room, count = self._room, self._room.shape[1]
         start = self._rng.integers(count, size=_CHAINS)
-        own = room[self._each, start]
-        mask = room == own[:, None]
+        present = room[self._each, start]
+        mask = room == present[:, None]
         if not whole:
             length = self._rng.integers(2, _LONGEST + 1, size=_CHAINS)
             number = np.arange(count)
@@ -168,50 +195,64 @@ class _Chains:
             mask = inside & (mask | ~inside).all(axis=1)[:, None]
         size = mask.sum(axis=1)
         others = self._counts.copy()
-        others[self._each, own] -= size
+        others[self._each, present] -= size
         log = mask @ self._alone + (mask[:, None, :] @ self._linked)[:, 0]
-        # Pairs within the set stay pairs wherever it goes.
-        log[self._each, own] -= ((mask @ self._pairs) * mask).sum(axis=1)
+        # Pairs within the set stay pairs in whichever room it goes to.
+        within = ((mask @ self._pairs) * mask).sum(axis=1)
+        log[self._each, present] -= np.where(present < self._rooms - 1, within, 0.0)
+        log[:, -1] -= 0.5 * within
         log += self._prior_of_more(others, size[:, None])
         first, second = mask[:, :-1], mask[:, 1:]
-        log += (first & second).sum(axis=1)[:, None] * np.diag(self._walk)
+        log += (first & second & self._follows[1:]).sum(axis=1)[:, None] * np.diag(self._walk)
         # The ends of the set, whose neighbours are of other rooms or not of the set.
         for ends, neighbours, walk in (
             (first & ~second, room[:, 1:], self._walk.T),
             (~first & second, room[:, :-1], self._walk),
         ):
-            chain, number = np.nonzero(ends)
+            chain, number = np.nonzero(ends & self._follows[1:])
             np.add.at(log, chain, walk[neighbours[chain, number]])
         if whole:
             log[others > 0.0] = -np.inf
-        self._relabel(mask, self._drawn(log, heat))
+        self._relabel(mask, self._drawn(log))
 
-    def _swap(self, heat: float) -> None:
-        """Exchange the photographs of two rooms."""
-        room = self._room
-        one = room[self._each, self._rng.integers(room.shape[1], size=_CHAINS)]
-        other = self._rng.integers(self._rooms, size=_CHAINS)
-        swapped = np.where(room == one[:, None], other[:, None], np.where(room == other[:, None], one[:, None], room))
-        counts = self._counts.copy()
-        counts[self._each, one] = self._counts[self._each, other]
-        counts[self._each, other] = self._counts[self._each, one]
-        gain = self._energy(swapped, counts) - self._energy(room, self._counts)
-        accepted = np.log(self._rng.random(_CHAINS)) < gain / heat
-        if not accepted.any():
-            return
-        mask = (room == one[:, None]) & accepted[:, None]
-        back = (room == other[:, None]) & accepted[:, None]
-        self._relabel(mask, other)
-        self._relabel(back, one)
+    def _random_exchange(self) -> Int[np.ndarray, "c r"]:
+        """Return an exchange of a photograph's room with any other."""
+        first_room = self._room[self._each, self._rng.integers(self._room.shape[1], size=_CHAINS)]
+        second_room = self._rng.integers(self._rooms - 1, size=_CHAINS)
+        # Elsewhere is no room: pairs do not count there.
+        second_room = np.where(first_room == self._rooms - 1, first_room, second_room)
+        rooms = np.tile(np.arange(self._rooms), (_CHAINS, 1))
+        rooms[self._each, first_room], rooms[self._each, second_room] = second_room, first_room
+        return rooms
+
+    def _exchange_rooms(self, rooms: Int[np.ndarray, "c r"]) -> None:
+        """Give the photographs of every room another one, where the chain accepts it; `rooms` is its own inverse."""
+        room, counts = np.take_along_axis(rooms, self._room, axis=1), np.take_along_axis(self._counts, rooms, axis=1)
+        gain = self._energy(room, counts) - self._energy(self._room, self._counts)
+        for chain in np.flatnonzero(np.log(self._rng.random(_CHAINS)) < gain / self._heat).tolist():
+            self._room[chain], self._counts[chain] = room[chain], counts[chain]
+            changed = np.flatnonzero(rooms[chain] != np.arange(self._rooms))
+            self._linked[chain][:, changed] = self._linked[chain][:, rooms[chain, changed]]
+
+    def _exchange_heats(self, first: int) -> None:
+        """Exchange the states of neighbouring temperatures: 0 and 1, 2 and 3, ..., or from the second on."""
+        energy = self._energy(self._room, self._counts)
+        energy += 0.5 * np.take_along_axis(self._linked, self._room[:, :, None], axis=2).sum(axis=(1, 2))
+        for colder, hotter in zip(self._ladder.T[first:-1:2], self._ladder.T[first + 1 :: 2], strict=True):
+            gain = (1.0 / self._heat[colder] - 1.0 / self._heat[hotter]) * (energy[hotter] - energy[colder])
+            accepted = np.log(self._rng.random(_LADDERS)) < gain
+            one, other = colder[accepted], hotter[accepted]
+            self._heat[one], self._heat[other] = self._heat[other], self._heat[one]
+        self._ladder = np.take_along_axis(self._ladder, self._heat[self._ladder].argsort(axis=1), axis=1)
 
     def _energy(self, room: Int[np.ndarray, "c n"], counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c"]:
         """Return the log probability without the pairs; `counts` are the photographs by room."""
         total = self._alone[np.arange(room.shape[1]), room].sum(axis=1)
-        total += self._walk[room[:, :-1], room[:, 1:]].sum(axis=1)
+        total += (self._walk[room[:, :-1], room[:, 1:]] * self._follows[1:]).sum(axis=1)
         return total + self._prior(counts).sum(axis=1)
 
-    def _drawn(self, log: Float[np.ndarray, "c r"], heat: float) -> Int[np.ndarray, "c"]:
-        return (log / heat + self._rng.gumbel(size=log.shape)).argmax(axis=1)
+    def _drawn(self, log: Float[np.ndarray, "c r"]) -> Int[np.ndarray, "c"]:
+        return (log / self._heat[:, None] + self._rng.gumbel(size=log.shape)).argmax(axis=1)
 
     def _relabel(self, mask: Bool[np.ndarray, "c n"], after: Int[np.ndarray, "c"]) -> None:
         """Give the photographs of a mask a room, the same in each chain."""
@@ -222,7 +263,24 @@ class _Chains:
         for c, t, a, b in zip(chain.tolist(), number.tolist(), before.tolist(), new.tolist(), strict=True):
             self._linked[c, :, a] -= self._pairs[t]
             self._linked[c, :, b] += self._pairs[t]
+        self._linked[:, :, -1] = 0.0
         self._room[chain, number] = new
+
+
+def _exchanges(evidence: RoomEvidence) -> list[Int[np.ndarray, "r"]]:
+    """Return exchanges of two storeys: each room with the one that fits the same photographs best, or with itself."""
+    # Imported late: only albums of several storeys need it.
+    from scipy.optimize import linear_sum_assignment
+
+    share = evidence.alone - evidence.alone.max(axis=1, keepdims=True)
+    alike = np.exp(share - np.logaddexp.reduce(share, axis=1)[:, None])
+    found = []
+    for one, other in combinations(evidence.storeys, 2):
+        first, second = linear_sum_assignment(alike[:, one].T @ alike[:, other], maximize=True)
+        rooms = np.arange(evidence.alone.shape[1])
+        rooms[one[first]], rooms[other[second]] = other[second], one[first]
+        found.append(rooms)
+    return found
 
 
 def walk_of(ground: AlbumGround) -> Float[np.ndarray, "s s"]:
@@ -245,6 +303,14 @@ def walk_of(ground: AlbumGround) -> Float[np.ndarray, "s s"]:
     walk[rooms, :rooms] = (1.0 - _STAY_AWAY) / rooms
     walk[rooms, rooms] = _STAY_AWAY
     return np.log(walk)
+
+
+def storeys_of(ground: AlbumGround) -> tuple[Int[np.ndarray, "_"], ...]:
+    """Return the rooms of the largest parts of a place whose rooms are joined by doors, such as storeys."""
+    _, part = connected_components(csr_array(_joined(ground)), directed=False)
+    size = np.bincount(part)
+    largest = [number for number in np.argsort(-size, kind="stable")[:_MOST_STOREYS] if size[number] >= _STOREY_ROOMS]
+    return tuple(np.flatnonzero(part == number) for number in largest)
 
 
 def expected_photographs(ground: AlbumGround, count: int) -> Float[np.ndarray, "s"]:

@@ -28,8 +28,15 @@ from lalaloc_core.localise.album.evidence import (
 from lalaloc_core.localise.album.ground import AlbumGround, Constraint, constraint_of
 from lalaloc_core.localise.album.links import Found, find_links, pair_odds
 from lalaloc_core.localise.album.pins import Album, Pin, Suggestion
-from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms, expected_photographs, walk_of
+from lalaloc_core.localise.album.room_assignment import (
+    RoomEvidence,
+    assign_rooms,
+    expected_photographs,
+    storeys_of,
+    walk_of,
+)
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
+from lalaloc_core.localise.album.walk_order import WalkOrder, walk_order
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.encode.view_encoder import OBJECT_OUTPUTS, outside_odds
 
@@ -39,8 +46,6 @@ MAX_POSES, MAX_ROOMS = 65_536, 1000
 # Pins whose room is right with at least this probability are sure.
 SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
-# Share of photographs that must have a time for the order to count.
-_TIMED = 0.8
 # Log odds of a photograph of none of the rooms, beside the best pose of other homes; half of them are taken outside.
 _ELSEWHERE = -2.0
 _CERTAIN = 1e4
@@ -76,32 +81,25 @@ def solve_album(
     memory.keep({each.id for each in photographs})
     if not photographs:
         return Album(pins=())
-    ordered = sorted(photographs, key=lambda each: (each.taken.at or datetime.max, each.id))
-    timed = sum(each.taken.at is not None for each in ordered)
-    has_order = by_time and timed >= _TIMED * len(ordered)
+    ordered = sorted(photographs, key=lambda each: ((each.taken.at or datetime.max).replace(tzinfo=None), each.id))
     _compare(ground, encoder, ordered, memory, progress, pause)
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
-    share = _room_shares(ground, ordered, memory, states, links, constraints, has_order=has_order, pause=pause)
+    walk = walk_order(ordered, links) if by_time else None
+    share = _room_shares(ground, ordered, memory, states, links, constraints, walk, pause)
     pins = {
         each.id: _pin(ground, each, state, row, constraints.get(each.id))
         for each, state, row in zip(ordered, states, share, strict=True)
     }
     height_m, scale = camera_height(ground, [memory.evidence[each.id] for each in ordered])
     north = ground.plan.north
-    warnings = []
-    if by_time and not has_order:
-        warnings.append(
-            f"{len(ordered) - timed} of {len(ordered)} photographs have no time, so their order was not used; send the "
-            "camera's original files"
-        )
     return Album(
         pins=tuple(pins[each.id] for each in photographs),
         cameras=shared_cameras(ordered),
         camera_height_m=height_m,
         scale=scale,
         compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
-        warnings=tuple(warnings),
+        warnings=() if walk is None else walk.warnings,
     )
 
 
@@ -165,8 +163,7 @@ def _room_shares(
     states: Sequence[States],
     links: dict[tuple[int, int], Found],
     constraints: dict[str, Constraint],
-    *,
-    has_order: bool,
+    walk: WalkOrder | None,
     pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
     """Return the probability of every room for every photograph; the last is none of the rooms."""
@@ -182,14 +179,20 @@ def _room_shares(
             alone[number] -= _CERTAIN
             alone[number, rooms if wanted is None else wanted] += _CERTAIN
     alone = np.maximum(alone, -2.0 * _CERTAIN)
+    order = np.arange(len(photographs)) if walk is None else walk.order
+    follows = np.zeros(len(photographs), bool) if walk is None else walk.follows
     evidence = RoomEvidence(
-        alone=alone,
-        walk=walk_of(ground) if has_order else None,
-        pairs=pair_odds(photographs, links, rooms),
+        alone=alone[order],
+        walk=walk_of(ground) if follows.any() else None,
+        follows=follows,
+        pairs=pair_odds(photographs, links, rooms)[np.ix_(order, order)],
         expected=expected_photographs(ground, len(photographs)),
         tightness=_TIGHTNESS,
+        storeys=storeys_of(ground),
     )
-    return assign_rooms(evidence, pause=pause)
+    share = np.empty(alone.shape)
+    share[order] = assign_rooms(evidence, pause=pause)
+    return share
 
 
 def _outside(photograph: AlbumPhotograph) -> float:

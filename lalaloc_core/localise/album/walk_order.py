@@ -1,0 +1,163 @@
+"""Order of an album's photographs: the walk by the clocks of its cameras.
+
+Photographs whose file states a time zone have instants. The clocks of other cameras can be set to any time: pairs of
+photographs of one place, one by each of two cameras, tell the difference of the two, if enough of them agree. Where it
+stays unknown, the order counts within each camera only.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, timedelta, tzinfo
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from lalaloc_core.localise.album.entry import AlbumPhotograph
+from lalaloc_core.localise.album.links import Found, is_one_place
+from lalaloc_core.photograph.exif import Taken
+
+# Share of the photographs by a clock that must have a time for its order to count.
+_TIMED = 0.8
+# People go from one photograph to the next within this time (s); later ones are of another visit.
+_VISIT_S = 3.0 * 3600.0
+# Photographs of one place by two cameras are taken within this time (s); pairs that must agree on a difference.
+_PLACE_S, _MIN_PAIRS, _MIN_SHARE = 300.0, 3, 0.5
+# Smaller differences of clocks (s) are not reported; cameras that are named.
+_SAME_S, _MAX_NAMED = 60.0, 5
+_ZONED = "cameras with time zones"
+
+
+@dataclass(frozen=True, eq=False)
+class WalkOrder:
+    """Order of n photographs.
+
+    Attributes:
+        order: (n,) numbers of the photographs, those of a walk in their order.
+        follows: (n,) whether the photograph at that place of the order follows the one before it on a walk.
+        warnings: what was assumed about clocks, and what was not used.
+    """
+
+    order: Int[np.ndarray, "n"]
+    follows: Bool[np.ndarray, "n"]
+    warnings: tuple[str, ...]
+
+
+def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found]) -> WalkOrder:
+    """Return the order in which photographs were taken, as far as their clocks tell it; `links` are by their number."""
+    zones = {_name(each.taken): each.taken.at.tzinfo for each in photographs if each.taken.at and each.taken.at.tzinfo}
+    seconds, rows_of = _seconds(photographs, zones), _clocks(photographs, zones)
+    names = [name for name, rows in rows_of.items() if np.isfinite(seconds[rows]).mean() >= _TIMED]
+    # Cameras with time zones are right, so the others are compared with them.
+    names.sort(key=lambda name: name != _ZONED)
+    clock = np.full(len(photographs), -1)
+    for number, name in enumerate(names):
+        clock[rows_of[name]] = number
+    untimed = np.isnan(seconds)
+    clock[untimed] = -1
+    warnings = _on_missing(len(clock), int(untimed.sum()), int(((clock < 0) & ~untimed).sum()))
+    walk, ahead_s = _joined(len(names), _differences(seconds, clock, links))
+    for number, (first, difference_s) in enumerate(zip(walk, ahead_s, strict=True)):
+        if abs(difference_s) > _SAME_S:
+            way = "ahead of" if difference_s > 0.0 else "behind"
+            reference = "universal time" if names[first] == _ZONED else f"that of {names[first]}"
+            warnings.append(
+                f"the clock of {names[number]} is {timedelta(seconds=round(abs(difference_s)))} {way} {reference}, by "
+                "photographs of the same places, which the order takes into account"
+            )
+    if len(set(walk)) > 1:
+        more = f" and {len(names) - _MAX_NAMED} others" if len(names) > _MAX_NAMED else ""
+        warnings.append(
+            f"the clocks of {', '.join(names[:_MAX_NAMED])}{more} could not all be compared, so photographs are in "
+            "order within each camera only"
+        )
+    is_timed = clock >= 0
+    of_walk = np.where(is_timed, np.array([*walk, -1])[clock], -1)
+    seconds = seconds - np.where(is_timed, np.array([*ahead_s, 0.0])[clock], 0.0)
+    order = np.lexsort((np.nan_to_num(seconds), of_walk))
+    follows = np.zeros(len(order), bool)
+    before, after = order[:-1], order[1:]
+    near = np.abs(seconds[after] - seconds[before]) <= _VISIT_S
+    follows[1:] = (of_walk[before] == of_walk[after]) & (of_walk[after] >= 0) & near
+    return WalkOrder(order, follows, tuple(warnings))
+
+
+def _on_missing(count: int, untimed: int, dropped: int) -> list[str]:
+    """Return warnings on photographs without a time, and on those whose time is not used."""
+    found = []
+    if untimed:
+        found.append(
+            f"{untimed} of {count} photographs have no time, so no place in the order; send the original files"
+        )
+    if dropped:
+        found.append(
+            f"the times of {dropped} of {count} photographs were not used, because fewer than {_TIMED:.0%} of their "
+            "camera's photographs have one"
+        )
+    return found
+
+
+def _name(taken: Taken) -> str:
+    return " ".join(filter(None, (taken.make, taken.model))) or "an unknown camera"
+
+
+def _seconds(photographs: Sequence[AlbumPhotograph], zones: Mapping[str, tzinfo]) -> Float[np.ndarray, "n"]:
+    """Return the times of photographs, of those without a time zone by the camera's clock; NaN without any."""
+    seconds = np.full(len(photographs), np.nan)
+    for number, photograph in enumerate(photographs):
+        taken = photograph.taken
+        if taken.at is not None:
+            zone = taken.at.tzinfo or zones.get(_name(taken), UTC)
+            seconds[number] = taken.at.replace(tzinfo=zone).timestamp()
+    return seconds
+
+
+def _clocks(photographs: Sequence[AlbumPhotograph], zones: Mapping[str, tzinfo]) -> dict[str, Int[np.ndarray, "m"]]:
+    """Return the numbers of the photographs by clock; cameras that state time zones have one clock together."""
+    found: dict[str, list[int]] = {}
+    for number, photograph in enumerate(photographs):
+        name = _name(photograph.taken)
+        found.setdefault(_ZONED if name in zones else name, []).append(number)
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def _differences(
+    seconds: Float[np.ndarray, "n"], clock: Int[np.ndarray, "n"], links: Mapping[tuple[int, int], Found]
+) -> dict[tuple[int, int], float]:
+    """Return how far the second clock of a pair is ahead of the first (s), where photographs of one place tell it."""
+    apart: defaultdict[tuple[int, int], list[float]] = defaultdict(list)
+    for (first, second), found in links.items():
+        if min(clock[first], clock[second]) >= 0 and clock[first] != clock[second] and is_one_place(found):
+            early, late = sorted((first, second), key=lambda number: clock[number])
+            apart[int(clock[early]), int(clock[late])].append(seconds[late] - seconds[early])
+    agreed = {pair: _agreed(np.sort(values)) for pair, values in apart.items()}
+    return {pair: difference_s for pair, difference_s in agreed.items() if difference_s is not None}
+
+
+def _agreed(sorted_s: Float[np.ndarray, "n"]) -> float | None:
+    """Return the value on which enough of the differences agree; None without one."""
+    last = np.searchsorted(sorted_s, sorted_s + _PLACE_S, side="right")
+    begin = int((last - np.arange(len(last))).argmax())
+    agreeing = sorted_s[begin : last[begin]]
+    return float(np.median(agreeing)) if len(agreeing) >= max(_MIN_PAIRS, _MIN_SHARE * len(sorted_s)) else None
+
+
+def _joined(count: int, differences_s: Mapping[tuple[int, int], float]) -> tuple[list[int], list[float]]:
+    """Return the first clock that each is compared with, also through others, and how far it is ahead of it (s)."""
+    ways: defaultdict[int, list[tuple[int, float]]] = defaultdict(list)
+    for (first, second), difference_s in differences_s.items():
+        ways[first].append((second, difference_s))
+        ways[second].append((first, -difference_s))
+    walk, ahead_s = [-1] * count, [0.0] * count
+    for root in range(count):
+        pending = [root] if walk[root] < 0 else []
+        while pending:
+            number = pending.pop()
+            walk[number] = root
+            for neighbour, difference_s in ways[number]:
+                if walk[neighbour] < 0:
+                    ahead_s[neighbour] = ahead_s[number] + difference_s
+                    pending.append(neighbour)
+    return walk, ahead_s
