@@ -28,9 +28,10 @@ class Bench:
     textures: Textures = None
     homes: Annotated[int, "test homes per accuracy figure, 4 queries each"] = 250
     out: Annotated[Path | None, "also write the JSON to this file; with `only`, update it"] = None
-    annotated: Annotated[Path | None, "folder of annotated photographs, for albums, bounds and films of real rooms"] = (
+    data: Annotated[Path | None, "folder with `annotated` and `rendered_house`, for figures of pictures by others"] = (
         None
     )
+    rooms: Annotated[Path | None, "folder of path-traced rooms, for albums of them"] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +87,8 @@ def _bench(arguments: Bench) -> None:
         arguments.only,
         homes=arguments.homes,
         textures=arguments.textures,
-        annotated=arguments.annotated,
+        data=arguments.data,
+        rooms=arguments.rooms,
     )
     if arguments.out is not None:
         keep = bool(arguments.only) and arguments.out.exists()

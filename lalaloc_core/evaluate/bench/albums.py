@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,9 @@ from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
+from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.drawn_rooms import plan_of_rooms
+from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated
 from lalaloc_core.learn.data.synthetic.albums import taken_album, two_views
 from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.localise.album.entry import AlbumPhotograph
@@ -30,8 +30,10 @@ from lalaloc_core.photograph import StatedCamera
 from lalaloc_core.photograph.exif import Taken
 
 _PHOTOGRAPHS = 20
-# Annotated rooms of an album, their distance (m), and the field of view (degrees) of their two photographs.
-_ROOMS, _APART_M, _FIELD_DEG = 10, 3.0, 70.0
+# Rooms of an album of annotated and of path-traced ones, their distance (m), and the field of view (degrees) of their
+# two photographs.
+_ROOMS = {"annotated": 10, "rooms": 20}
+_APART_M, _FIELD_DEG = 3.0, 70.0
 _BEGIN = datetime(2026, 1, 1, 12)
 
 
@@ -39,8 +41,8 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
     """Measure albums of 20 photographs, with unknown field of view, camera height and heading.
 
     Rows: in the order of a walk, without order, each alone, and as spheres; of annotated photographs, two views of each
-    in albums of ten rooms, without doors or order. Photographs that are refused, as overexposed walls can be taken for
-    paper, are counted and in no other figure.
+    in albums of ten rooms, without doors or order, and of path-traced rooms in albums of twenty. Photographs that are
+    refused, as overexposed walls can be taken for paper, are counted and in no other figure.
     """
     model, refused = setting.model, 0
     scores: defaultdict[str, list[Found]] = defaultdict(list)
@@ -58,9 +60,10 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
         clicks.append(count)
         again_s.append(clicks_s / (count + 1))
         scores["spheres"] += _solved(model, _home(setting, index, spheres=True), AlbumMemory())
-    for case in [] if setting.annotated is None else _annotated(model, setting.annotated):
-        scores["annotated"] += _solved(model, case, AlbumMemory())
-        scores["annotated_each_alone"] += _alone(model, case)
+    for name, rooms in _by_others(setting).items():
+        for case in _galleries(model, rooms, _ROOMS[name]):
+            scores[name] += _solved(model, case, AlbumMemory())
+            scores[f"{name}_each_alone"] += _alone(model, case)
     return {row: _figures(found) for row, found in scores.items()} | {
         "refused_photographs": refused,
         "clicks_per_album": float(np.mean(clicks)),
@@ -81,14 +84,23 @@ def _home(setting: Setting, index: int, *, spheres: bool) -> AlbumCase:
     return AlbumCase.of(model, album.plan, photographs, truth)
 
 
-def _annotated(model: LocalModel, folder: Path) -> list[AlbumCase]:
-    """Return an album for every photograph that counts: its room with nine others, drawn at random."""
-    usable = [photograph for photograph in AnnotatedPhotographs(folder).photographs if photograph.counts]
+def _by_others(setting: Setting) -> dict[str, list[AnnotatedPhotograph]]:
+    """Return the photographs whose rooms are albums."""
+    found = {}
+    if setting.annotated is not None:
+        found["annotated"] = [each for each in AnnotatedPhotographs(setting.annotated).photographs if each.counts]
+    if setting.rooms is not None:
+        found["rooms"] = annotated(PosedSpheres(setting.rooms), "validation")
+    return found
+
+
+def _galleries(model: LocalModel, usable: Sequence[AnnotatedPhotograph], rooms: int) -> list[AlbumCase]:
+    """Return an album for every photograph: its room with others, drawn at random."""
     cases = []
     for number, own in enumerate(usable):
         rng = np.random.default_rng([7, number])
         others = [photograph for photograph in usable if photograph is not own]
-        chosen = [own, *(others[index] for index in rng.permutation(len(others))[: _ROOMS - 1])]
+        chosen = [own, *(others[index] for index in rng.permutation(len(others))[: rooms - 1])]
         places, left_m = [], 0.0
         for photograph in chosen:
             outline_m = photograph.outlines[0].polygon_m

@@ -19,6 +19,7 @@ from lalaloc_core.evaluate.bench.accuracy import (
 )
 from lalaloc_core.evaluate.bench.albums import bench_albums
 from lalaloc_core.evaluate.bench.bounds import bench_bounds
+from lalaloc_core.evaluate.bench.house import bench_house
 from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.bench.service_latency import bench_service
 from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
@@ -34,6 +35,7 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
     "bounds": bench_bounds,
     "steps": bench_steps,
     "albums": bench_albums,
+    "house": bench_house,
     "localisability": bench_localisability,
     "uninformative": bench_uninformative,
     "azimuths": bench_azimuths,
@@ -43,13 +45,19 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
 
 
 def run_bench(
-    bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None, annotated: Path | None = None
+    bundle_folder: Path,
+    groups: Sequence[str],
+    *,
+    homes: int,
+    textures: Path | None = None,
+    data: Path | None = None,
+    rooms: Path | None = None,
 ) -> dict[str, Any]:
     """Measure groups of figures, by default all, with one bundle; see `Setting`."""
     for number, group in enumerate(groups):
         if group not in _BENCHMARKS:
             raise ConfigError(f"only[{number}] is '{group}'; the groups are {', '.join(_BENCHMARKS)}")
     bundle = Bundle.open(bundle_folder)
-    setting = Setting(bundle, homes, textures, annotated)
+    setting = Setting(bundle, homes, textures, data, rooms)
     machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
     return machine | {group: _BENCHMARKS[group](setting) for group in groups or _BENCHMARKS}

@@ -33,12 +33,32 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Setting:
-    """A bundle, the number of test homes, and folders of textures for the renderer and of annotated photographs."""
+    """A bundle, the number of test homes, and folders.
+
+    Attributes:
+        textures: textures for the renderer.
+        data: pictures by others: `annotated` and `rendered_house`.
+        rooms: path-traced rooms (`posed_spheres`).
+    """
 
     bundle: Bundle
     homes: int
     textures: Path | None = None
-    annotated: Path | None = None
+    data: Path | None = None
+    rooms: Path | None = None
+
+    @property
+    def annotated(self) -> Path | None:
+        """Folder of annotated photographs."""
+        return self._folder("annotated")
+
+    @property
+    def house(self) -> Path | None:
+        """Folder of the rendered house."""
+        return self._folder("rendered_house")
+
+    def _folder(self, name: str) -> Path | None:
+        return self.data / name if self.data is not None and (self.data / name).is_dir() else None
 
     @cached_property
     def model(self) -> LocalModel:

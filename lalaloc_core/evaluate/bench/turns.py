@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,14 +14,14 @@ import numpy as np
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.bench.measured import Found, Setting, best_pose, evaluate, summary
-from lalaloc_core.evaluate.calibrate.measured_errors import photograph_of, spots
+from lalaloc_core.evaluate.calibrate.measured_errors import Spot, photograph_of, spots
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, score_galleries
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
-from lalaloc_core.learn.data.dataset import Scene
+from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph, Scene
 from lalaloc_core.learn.data.synthetic.turned import (
     Frame,
     Instant,
@@ -55,9 +55,15 @@ _SPHERE_SIZE, _GALLERIES = (1024, 2048), 1
 
 def bench_turns(setting: Setting) -> dict[str, Any]:
     """Measure three views of 80°, a third of a turn apart, heading unknown, 4 spots in each furnished test home."""
-    model, manifest = setting.model, setting.bundle.manifest
+    found = found_in_turns(setting.model, spots(setting.homes, "test", setting.textures))
+    return {row: summary(answers) for row, answers in found.items()}
+
+
+def found_in_turns(model: LocalModel, places: Iterable[Spot]) -> dict[str, list[Found]]:
+    """Return the answers for the views of spots, by what is known of their angles."""
+    manifest = model.bundle.manifest
     answers: dict[str, list[Found]] = {"known_angles": [], "unknown_angles": []}
-    for spot in spots(setting.homes, "test", setting.textures):
+    for spot in places:
         (plan, views), height = spot, CameraHeight(spot.views[0].camera_height_m)
         ground = Ground(plan, model.grid(plan, height.height_m))
         opened = [photograph_of(view).open(patch_size(manifest)) for view in views]
@@ -65,7 +71,7 @@ def bench_turns(setting: Setting) -> dict[str, Any]:
             turn = Turn.of_headings(opened, [UNKNOWN_HEADING] * len(opened), height, turns, std=0.0)
             answer = model.search_turn(turn, ground)
             answers[row].append(Found.of(best_pose(answer.joint), views[0], answer.confidence(manifest)))
-    return {row: summary(found) for row, found in answers.items()}
+    return answers
 
 
 class _Links(NamedTuple):
@@ -178,7 +184,7 @@ def _annotated_films(setting: Setting, folder: Path) -> dict[str, Any]:
     """
     scenes = AnnotatedPhotographs(folder)
     keys, by_name = scenes.keys(_GALLERIES), {photograph.name: photograph for photograph in scenes.photographs}
-    film_of = cache(lambda name: _filmed(setting.model, by_name[name]))
+    film_of = cache(lambda name: _filmed(setting.model, name, by_name[name].photograph))
     filmed: list[Prediction] = []
     for key in keys:
         (film, turn), scene = film_of(key.photograph), scenes.load(key.scene)
@@ -199,10 +205,19 @@ def _annotated_films(setting: Setting, folder: Path) -> dict[str, Any]:
     return {name: _gallery_figures(predictions, scenes.photographs) for name, predictions in rows.items()}
 
 
-def _filmed(model: LocalModel, photograph: AnnotatedPhotograph) -> tuple[Film, float]:
+def found_in_film(model: LocalModel, plan: FloorPlan, camera: Camera) -> Found:
+    """Return the answer for a film once around, cut from a camera's sphere, with an unknown heading."""
+    (photograph,) = camera.photographs.values()
+    film, turn = _filmed(model, camera.name, photograph)
+    found = _localised_film(model, plan, film, camera.camera_height_m)
+    pose = _turned(best_pose(found.pictures[0]), turn)
+    return Found.of(pose, camera, found.confidence(model.bundle.manifest))
+
+
+def _filmed(model: LocalModel, name: str, photograph: DatasetPhotograph) -> tuple[Film, float]:
     """Return a film of a sphere, and the turn (radians) from the sphere's centre to the first frame that was kept."""
-    instants = turn_by_hand(np.random.default_rng(zlib.crc32(photograph.name.encode())))
-    sphere = photograph.photograph.image(*_SPHERE_SIZE)
+    instants = turn_by_hand(np.random.default_rng(zlib.crc32(name.encode())))
+    sphere = photograph.image(*_SPHERE_SIZE)
     frames = (exposed(sphere, _FILMING.camera, instant, azimuth=instant.turn) for instant in instants)
     film = read_film(encode_film(frames), patch_size=patch_size(model.bundle.manifest))
     return film, _turns_at(film, instants)[0]

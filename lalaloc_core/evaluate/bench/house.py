@@ -1,0 +1,156 @@
+"""Accuracy in a furnished house that others made, with metric plans and poses: spheres, views, turns, films and albums.
+
+`DATA/rendered_house` has the plans, their spheres with poses (`views.json`, read as `posed_spheres`), and the program
+`cut_album.py`, which cuts photographs of both storeys and writes their rooms to `truth.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lalaloc_core.evaluate.bench.measured import Found, Setting, evaluate, summary
+from lalaloc_core.evaluate.bench.turns import found_in_film, found_in_turns
+from lalaloc_core.evaluate.calibrate.measured_errors import Spot
+from lalaloc_core.evaluate.runs.albums import album_entry
+from lalaloc_core.evaluate.runs.predictions import RunInfo
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.folder import HeldoutScenes
+from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres
+from lalaloc_core.learn.data.views import ViewScenes
+from lalaloc_core.localise.album.entry import AlbumPhotograph
+from lalaloc_core.localise.album.evidence import AlbumMemory
+from lalaloc_core.localise.album.ground import AlbumGround
+from lalaloc_core.localise.album.solve import solve_album
+from lalaloc_core.localise.local_model import LocalModel
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.photograph import StatedCamera
+
+# Fields of view (degrees), and views of each sphere; those of turns.
+_FIELDS_DEG, _VIEWS, _TURN_DEG, _TURN_VIEWS = (60.0, 67.0, 80.0, 106.0), 8, 80.0, 3
+# Photographs of elsewhere that are added to the album: views of annotated rooms.
+_ELSEWHERE = 5
+_LEAST = 1e-3
+
+
+def bench_house(setting: Setting) -> dict[str, Any]:
+    """Measure the house; nothing without its folder.
+
+    Rows: spheres, and views by field of view, heading and what is stated; turns of three views and films; albums
+    without and with the order of a walk and focal lengths, with photographs of elsewhere, and in a foreign plan.
+    """
+    if setting.house is None:
+        return {}
+    folder = setting.house
+    rows: dict[str, Any] = {}
+    for heading, known in (("known_heading", True), ("unknown_heading", False)):
+        rows[f"sphere_{heading}"] = _localised(setting, folder, None, known=known)
+        for field_deg in _FIELDS_DEG:
+            for stated in ("field", "nothing"):
+                views = {"field_deg": field_deg, "per_camera": _VIEWS, "stated": stated}
+                rows[f"view_{field_deg:g}_{stated}_{heading}"] = _localised(setting, folder, views, known=known)
+    rows |= {f"turn_{name}": summary(found) for name, found in found_in_turns(setting.model, _spots(folder)).items()}
+    scenes = list(map(PosedSpheres(folder).load, PosedSpheres(folder).scenes("validation")))
+    films = [found_in_film(setting.model, scene.plan, camera) for scene in scenes for camera in scene.cameras]
+    return rows | {"film": summary(films), **_albums(setting, folder)}
+
+
+def _localised(setting: Setting, folder: Path, views: dict[str, Any] | None, *, known: bool) -> dict[str, float]:
+    info = RunInfo(
+        label="house",
+        dataset="rendered house",
+        split="validation",
+        data=str(folder),
+        views=views,
+        heading_known=known,
+        bundle=str(setting.bundle.folder),
+    )
+    found = [Found.of(each.final_pose, each.truth, each.confidence) for each in evaluate(info)]
+    return summary(found) | {"right_room": float(np.mean([each.right_room for each in found]))}
+
+
+def _spots(folder: Path) -> Iterator[Spot]:
+    scenes = ViewScenes(PosedSpheres(folder), _TURN_DEG, _TURN_VIEWS)
+    for scene in map(scenes.load, scenes.scenes("validation")):
+        for first in range(0, len(scene.cameras), _TURN_VIEWS):
+            yield Spot(scene.plan, scene.cameras[first : first + _TURN_VIEWS])
+
+
+def _albums(setting: Setting, folder: Path) -> dict[str, Any]:
+    model = setting.model
+    own = _ground(model, {name: FloorPlan.from_json((folder / name).read_bytes()) for name in _plans(folder).values()})
+    heldout = HeldoutScenes(homes=1)
+    foreign = _ground(model, {name: heldout.load(name).plan for name in heldout.scenes("test")})
+    plain, walk = _photographs(model, folder), _photographs(model, folder, "--exif", "--walk")
+    outside = [
+        album_entry(model, f"elsewhere {path.stem}", path.read_bytes(), StatedCamera())
+        for path in ([] if setting.annotated is None else sorted(setting.annotated.glob("*.jpg"))[:_ELSEWHERE])
+    ]
+    rows = {
+        "album": _pinned(setting, own, plain),
+        "album_walk": _pinned(setting, own, walk),
+        "album_in_foreign_plan": _pinned(setting, foreign, {}, list(plain)),
+    }
+    return rows | ({"album_with_elsewhere": _pinned(setting, own, plain, outside)} if outside else {})
+
+
+def _plans(folder: Path) -> dict[int, str]:
+    """Return the file of the plan of each floor."""
+    return {view["floor"]: view["plan"] for view in json.loads((folder / VIEWS_FILE).read_bytes())}
+
+
+def _ground(model: LocalModel, plans: dict[str, FloorPlan]) -> AlbumGround:
+    height_m = next(iter(plans.values())).camera_height_m
+    grids = [model.grid(plan, height_m) for plan in plans.values()]
+    return AlbumGround(tuple(plans), MergedPlans.of(list(plans.values()), grids, height_m))
+
+
+def _photographs(model: LocalModel, folder: Path, *options: str) -> dict[AlbumPhotograph, tuple[str, str]]:
+    """Return the photographs that the house's program cuts, each with the plan and id of its room."""
+    plans = _plans(folder)
+    with tempfile.TemporaryDirectory(prefix="lalaloc-album-") as out:
+        subprocess.run([sys.executable, str(folder / "cut_album.py"), out, *options], check=True)
+        truth = json.loads(Path(out, "truth.json").read_bytes())
+        return {
+            album_entry(model, name, Path(out, name).read_bytes(), StatedCamera()): (plans[row["plan"]], row["room"])
+            for name, row in truth.items()
+        }
+
+
+def _pinned(
+    setting: Setting,
+    ground: AlbumGround,
+    photographs: dict[AlbumPhotograph, tuple[str, str]],
+    outside: Sequence[AlbumPhotograph] = (),
+) -> dict[str, float]:
+    """Return the figures of an album: of its own photographs, and of those of elsewhere."""
+    album = solve_album(ground, setting.model.encoder, [*photographs, *outside], memory=AlbumMemory())
+    own, others = album.pins[: len(photographs)], album.pins[len(photographs) :]
+    is_right = [
+        pin.pose is not None and (pin.pose.plan_id, pin.pose.room_id) == room
+        for pin, room in zip(own, photographs.values(), strict=True)
+    ]
+    logs = [
+        math.log(max([_LEAST, *(row.probability for row in pin.rooms if (row.plan_id, row.room_id) == room)]))
+        for pin, room in zip(own, photographs.values(), strict=True)
+    ]
+    sure = [pin.state == "sure" for pin in own]
+    logs_row = {"mean_log_probability": float(np.mean(logs))} if logs else {}
+    return logs_row | {
+        "n": len(own),
+        "right_room": sum(is_right),
+        "set_aside": sum(pin.state == "set_aside" for pin in own),
+        "sure": sum(sure),
+        "sure_and_wrong": sum(np.array(sure) & ~np.array(is_right, bool)),
+        "elsewhere": len(others),
+        "elsewhere_sure": sum(pin.state == "sure" for pin in others),
+        "elsewhere_set_aside": sum(pin.state == "set_aside" for pin in others),
+    }
