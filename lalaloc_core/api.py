@@ -52,15 +52,14 @@ from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film, read_film
+from lalaloc_core.photograph.picture_folders import MAX_TURN_PHOTOGRAPHS, pictures_in, turn_files
 from lalaloc_core.photograph.turn_angles import TurnAngles
-from lalaloc_core.photograph.turned import open_turn
+from lalaloc_core.photograph.turned import level_turn, open_of_turn
+from lalaloc_core.shown_text import printable
 
 PlanSource = FloorPlan | ImportedPlan | str | PathLike[str] | bytes | Image.Image | UInt8[np.ndarray, "h w *c"]
 PhotographSource = str | PathLike[str] | bytes | Image.Image | UInt8[np.ndarray, "h w 3"] | Photograph
 TurnSource = Sequence[PhotographSource] | str | PathLike[str] | bytes
-# Suffixes of files in a folder that can be photographs.
-PICTURES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp"})
-MAX_TURN_PHOTOGRAPHS = 100
 # Plans whose pose grids are kept for the next photograph.
 _GRIDS = 8
 
@@ -179,7 +178,7 @@ class LaLaLoc:
         Args:
             plan: the floor plan.
             photographs: at least two photographs in the order in which they were taken, none of them a full sphere;
-                the path of a folder of them, in the order of their names; or a film, as a path or its bytes.
+                the path of a folder of them, in the order of their times or names; or a film, as a path or its bytes.
             camera_height_m: metres above the floor; by default the plan's, else estimated.
             camera: projection, field of view and tilt, where the photographs do not say so themselves.
 
@@ -279,7 +278,7 @@ class LaLaLoc:
         self, number: int, source: PhotographSource, stated: StatedCamera, entries: dict[str, AlbumPhotograph]
     ) -> PinnedPhotograph:
         """Read a photograph into the entries of an album; copies of an earlier one have its entry."""
-        name = Path(source).name if isinstance(source, str | PathLike) else ""
+        name = printable(Path(source).name) if isinstance(source, str | PathLike) else ""
         try:
             content = photograph_content(source)
             id = hashlib.sha256(content).hexdigest()
@@ -288,10 +287,10 @@ class LaLaLoc:
                 entries[id] = photograph_entry(id, view)
         except InvalidPhotographError as error:
             return PinnedPhotograph(number, name, None, reason=str(error))
-        taken = entries[id].taken.at
-        return PinnedPhotograph(
-            number, name, id, taken="" if taken is None else taken.isoformat(sep=" ", timespec="seconds")
-        )
+        at = entries[id].taken.at
+        # As the service answers it: the time at the place, without its zone.
+        taken = "" if at is None else at.replace(tzinfo=None).isoformat(sep=" ", timespec="seconds")
+        return PinnedPhotograph(number, name, id, taken=taken)
 
     def _new_ground(self, plan: FloorPlan, camera_height_m: float) -> Ground:
         return Ground(plan, self._model.grid(plan, camera_height_m))
@@ -371,30 +370,17 @@ def read_turn(
         except InvalidFilmError as error:
             raise InvalidFilmError(f"'{source}': {error}" if is_path else str(error)) from error
         return film.photographs, film.angles, film
-    sources = pictures_in(Path(source), require=False) if is_path else source
+    sources, left_out = turn_files(Path(source)) if is_path else (source, [])
     if not 2 <= len(sources) <= MAX_TURN_PHOTOGRAPHS:
         where = f"'{source}'" if is_path else "the turn"
         raise InvalidInputError(f"{where} has {len(sources)} photographs; a turn has 2 to {MAX_TURN_PHOTOGRAPHS}")
-    with named(source):
-        contents = [photograph_content(each) for each in sources]
-        photographs, angles = open_turn(contents, stated, sphere_size=sphere_size(manifest), patch_size=size)
-    return photographs, angles, None
-
-
-def pictures_in(folder: Path, *, require: bool = True) -> list[Path]:
-    """Return the picture files in a folder, sorted by name.
-
-    Raises:
-        InvalidInputError: the folder cannot be read, or has no pictures although they are required.
-    """
-    try:
-        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    except OSError as error:
-        raise InvalidInputError(f"'{folder}' cannot be read as a folder: {error.strerror}") from error
-    found = [entry for entry in entries if entry.suffix.lower() in PICTURES and entry.is_file()]
-    if require and not found:
-        raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(PICTURES))})")
-    return found
+    opened = []
+    for each in sources:
+        with named(each):
+            content = photograph_content(each)
+            opened.append(open_of_turn(content, stated, sphere_size=sphere_size(manifest), patch_size=size))
+    opened[0] = replace(opened[0], warnings=(*left_out, *opened[0].warnings))
+    return *level_turn(opened, size), None
 
 
 def photograph_content(source: PhotographSource) -> bytes:

@@ -26,6 +26,7 @@ LAYERS = {
     "lalaloc_core.answer_numbers": 0,
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.files": 0,
+    "lalaloc_core.shown_text": 0,
     "lalaloc_core.configuration": 1,
     # The query side.
     "lalaloc_core.floorplan": 1,

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.plan_files import check_picture_name, write_picture, write_text
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.shown_text import no_formula
 
 if TYPE_CHECKING:
     from lalaloc_core.draw.plan import Marker
     from lalaloc_core.floorplan import FloorPlan
 
 _COLUMNS = ("photograph", "room", "x_m", "y_m", "heading_deg", "within_95_m", "confidence", "error")
-# A spreadsheet takes a text that begins with one of these for a formula.
-_FORMULA = tuple("=+@\t\r")
 
 
 FILES = """
@@ -67,7 +66,7 @@ def csv_text(columns: Iterable[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _row(answer: dict[str, Any]) -> list[str]:
-    return [unread(answer["photograph"]), *_cells(answer), unread(answer.get("error", ""))]
+    return [no_formula(answer["photograph"]), *_cells(answer), no_formula(answer.get("error", ""))]
 
 
 def _cells(answer: dict[str, Any]) -> list[str]:
@@ -81,18 +80,13 @@ def _cells(answer: dict[str, Any]) -> list[str]:
         (xx, xy), (_, yy) = covariance
         within = f"{ellipse_m((xx, xy, yy))[0]:.3f}"
     return [
-        unread(answer["room"]),
+        no_formula(answer["room"]),
         f"{answer['position']['x_m']:.3f}",
         f"{answer['position']['y_m']:.3f}",
         f"{answer['heading_deg']:.1f}",
         within,
         "" if confidence is None else f"{confidence:.4f}",
     ]
-
-
-def unread(text: str) -> str:
-    """Return text that a spreadsheet does not read as a formula."""
-    return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 @dataclass(frozen=True)

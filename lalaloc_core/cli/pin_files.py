@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lalaloc_core.cli.answer_files import EarthPlace, csv_text, place_feature, place_on_earth, unread
+from lalaloc_core.cli.answer_files import EarthPlace, csv_text, place_feature, place_on_earth
 from lalaloc_core.cli.plan_files import write_text
 from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.shown_text import no_formula
 
 if TYPE_CHECKING:
     from lalaloc_core.draw.pins import ReportRow
@@ -22,16 +23,16 @@ if TYPE_CHECKING:
 
 _COLUMNS: Mapping[str, Callable[[dict[str, Any]], object]] = {
     "number": lambda entry: entry["number"],
-    "photograph": lambda entry: unread(entry["photograph"]),
+    "photograph": lambda entry: no_formula(entry["photograph"]),
     "taken": lambda entry: entry["taken"] or "",
-    "plan": lambda entry: unread(entry["plan"] or ""),
-    "room": lambda entry: unread(entry["room"] or ""),
+    "plan": lambda entry: no_formula(entry["plan"] or ""),
+    "room": lambda entry: no_formula(entry["room"] or ""),
     "x_m": lambda entry: "" if entry["position"] is None else f"{entry['position']['x_m']:.3f}",
     "y_m": lambda entry: "" if entry["position"] is None else f"{entry['position']['y_m']:.3f}",
     "heading_deg": lambda entry: "" if entry["heading_deg"] is None else f"{entry['heading_deg']:.1f}",
     "confidence": lambda entry: f"{entry['confidence']:.4f}",
     "state": lambda entry: entry["state"],
-    "reason": lambda entry: unread(entry["reason"]),
+    "reason": lambda entry: no_formula(entry["reason"]),
 }
 COPIES = "photographs"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,13 @@ from lalaloc_core.cli.options import BUNDLE, PLAN, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.shown_text import printable
 
 _OPTIONS = f"""
 {PLAN}
 folder FOLDER: folder of photographs, up to 500; never changed
---out DIR: folder to write, which is created
+--out DIR: folder to write, which is created; it must be new or empty
+--replace: write over the files of an earlier run in --out; others there stay
 --previous FILE: pins.json of an earlier run; list what moved since, such as in a new revision of the plan
 --no-copies: write no copies of the photographs
 --json: print JSON instead of a table
@@ -44,6 +46,7 @@ def _pin(arguments: argparse.Namespace) -> None:
     from lalaloc_core.localise.answers.pinned import read_pins
 
     paths, notes = _photographs_in(arguments.folder, arguments.out, arguments.plan)
+    _check_out(arguments.out, [*paths, arguments.plan, arguments.previous], replace=arguments.replace)
     previous = None if arguments.previous is None else read_pins(arguments.previous)
     stated = stated_camera(arguments)
     plans = [imported.plan() for imported in read_plans(arguments.plan, arguments)]
@@ -89,13 +92,32 @@ def _progress_bars() -> Iterator[Callable[[str, int, int], None]]:
         close()
 
 
+def _check_out(out: Path, sources: Iterable[Path | None], *, replace: bool) -> None:
+    """Refuse a folder where files that are read would be written, or others unasked."""
+    from lalaloc_core.cli.pin_files import COPIES
+
+    written = [folder for folder in (out, out / COPIES) if folder.is_dir()]
+    sources = [path for path in sources if path is not None and path.exists()]
+    read = next((path for path in sources if any(map(path.resolve().parent.samefile, written))), None)
+    if read is not None:
+        raise InvalidInputError(
+            f"--out would write beside '{printable(str(read))}', which is read and never changed; choose another folder"
+        )
+    if out.exists() and not out.is_dir():
+        raise InvalidInputError(f"'{out}' is no folder; choose another name")
+    is_used = out.is_dir() and any(not path.name.startswith(".") for path in out.iterdir())
+    if is_used and not (replace and (out / "pins.json").is_file()):
+        raise InvalidInputError(
+            f"'{out}' has files; choose a new folder, or add --replace to write over an earlier run's"
+        )
+
+
 def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:
     """Return the picture files of a folder, and notes on what is left out."""
-    from lalaloc_core.api import MAX_PHOTOGRAPHS, pictures_in
+    from lalaloc_core.api import MAX_PHOTOGRAPHS
+    from lalaloc_core.photograph.picture_folders import pictures_in
 
     found = [path for path in pictures_in(folder) if path.resolve() != plan.resolve()]
-    if out.resolve() == folder.resolve():
-        raise InvalidInputError("--out is the folder of the photographs, which is never changed; choose another one")
     if len(found) > MAX_PHOTOGRAPHS:
         raise InvalidInputError(
             f"'{folder}' has {len(found)} photographs; the limit is {MAX_PHOTOGRAPHS}: divide them into several folders"

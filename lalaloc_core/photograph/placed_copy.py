@@ -19,6 +19,7 @@ from PIL import ExifTags, Image
 
 from lalaloc_core.photograph.file_segments import APP1, START, START_OF_SCAN, markers, png_chunks
 from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
+from lalaloc_core.shown_text import printable
 
 _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _EXIF = b"Exif\0\0"
@@ -106,6 +107,7 @@ def _dms(degrees: float) -> tuple[float, float, float]:
 
 def _xmp(packet: bytes | str | None, place: Place) -> bytes:
     """Return an XMP packet with a place: the given one, if it can be read, with more properties."""
+    room, level = printable(place.room), printable(place.level)
     for prefix, name in _NAMES.items():
         ElementTree.register_namespace(prefix, name)
     root = _parsed(packet)
@@ -115,9 +117,9 @@ def _xmp(packet: bytes | str | None, place: Place) -> bytes:
     description = rdf.find(f"{{{_RDF}}}Description")
     if description is None:
         description = SubElement(rdf, f"{{{_RDF}}}Description", {f"{{{_RDF}}}about": ""})
-    _add_words(rdf, description, "dc", "subject", [place.room, place.level])
-    _add_words(rdf, description, "lr", "hierarchicalSubject", [f"{place.level}|{place.room}"])
-    values = {("Iptc4xmpCore", "Location"): place.room}
+    _add_words(rdf, description, "dc", "subject", [room, level])
+    _add_words(rdf, description, "lr", "hierarchicalSubject", [f"{level}|{room}"])
+    values = {("Iptc4xmpCore", "Location"): room}
     if place.latitude is not None and place.longitude is not None:
         values["exif", "GPSLatitude"] = _minutes(place.latitude, "NS")
         values["exif", "GPSLongitude"] = _minutes(place.longitude, "EW")

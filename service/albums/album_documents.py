@@ -15,6 +15,7 @@ from lalaloc_core.draw.canvas import INK, PAPER, xml_text
 from lalaloc_core.draw.plan import Bounds, svg_around
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.entry import Correction
+from lalaloc_core.shown_text import no_formula
 from service.errors import InvalidRequestError
 from service.schemas.albums import AlbumPhotographAnswer, CorrectionDocument, PinAnswer
 from service.schemas.query_fields import PlanPoint
@@ -80,24 +81,9 @@ def _fault(field: str, message: str) -> InvalidRequestError:
 # Colours of pins by state, from Okabe and Ito's palette; uncertain ones have a dashed edge as well.
 COLOURS = {"sure": "#007a5a", "corrected": "#0067a5", "uncertain": "#c84f00"}
 _COLUMNS: tuple[str, ...] = (
-    "number",
-    "name",
-    "taken_at",
-    "state",
-    "confidence",
-    "floorplan_id",
-    "level",
-    "room_id",
-    "room",
-    "x_m",
-    "y_m",
-    "heading_deg",
-    "latitude",
-    "longitude",
-    "reason",
-)
-# Spreadsheets take texts that begin so for formulas.
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+    "number", "name", "taken_at", "state", "confidence", "floorplan_id", "level", "room_id", "room", "x_m", "y_m",
+    "heading_deg", "latitude", "longitude", "reason",
+)  # fmt: skip
 # Radius of a pin, and length of its arrow, as shares of the drawing's size.
 _RADIUS, _ARROW = 0.016, 2.6
 
@@ -160,7 +146,7 @@ def _row(photograph: AlbumPhotographAnswer) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """Return a value that spreadsheets do not take for a formula."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+    return no_formula(value) if isinstance(value, str) else value
 
 
 def _mark(photograph: AlbumPhotographAnswer, pin: PinAnswer, radius_m: float) -> str:

@@ -3,7 +3,9 @@
 import csv
 import io
 import json
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.draw.canvas import document, words
 from lalaloc_core.draw.pdf import write_pdf
 from lalaloc_core.photograph.placed_copy import Place, placed_copy
+from lalaloc_core.shown_text import no_formula, printable
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLACE = Place(room="Küche", level="Ground & first", latitude=-33.8568, longitude=151.2153, direction_deg=271.24)
@@ -115,6 +118,36 @@ def test_originals_stay_and_copies_have_the_same_pixels(pinned: tuple[Path, Path
             gps = copy.getexif().get_ifd(ExifTags.IFD.GPSInfo)
         assert gps[ExifTags.GPS.GPSLatitudeRef] == "N"
         assert ExifTags.GPS.GPSImgDirection in gps
+
+
+@pytest.mark.parametrize(
+    ("folder", "out", "message"),
+    [
+        ("photographs", ".", "would write beside '.*photographs/kitchen.jpg', which is read"),
+        ("visit", "visit", "would write beside '.*visit/kitchen.jpg', which is read"),
+        ("visit", ".", "would write beside '.*flat.json', which is read"),
+        ("visit", "used", "'.*used' has files; choose a new folder, or add --replace"),
+    ],
+)
+def test_no_file_is_overwritten_unasked(
+    folder: str, out: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (tmp_path / folder / "kitchen.jpg", tmp_path / "flat.json", tmp_path / "used" / "pins.json"):
+        path.parent.mkdir(exist_ok=True)
+        shutil.copy(EXAMPLES / path.name if path.name != "pins.json" else EXAMPLES / "flat.json", path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    assert main(["pin", str(tmp_path / "flat.json"), str(tmp_path / folder), "--out", str(tmp_path / out)]) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
+def test_names_are_shown_without_formulas_and_characters_that_no_document_has() -> None:
+    assert [no_formula(text) for text in ("=1", "-1", " ＝1", "a=1", "")] == ["'=1", "'-1", "' ＝1", "a=1", ""]
+    name = printable("K\udcffche\x07\ufffe.jpg")
+    assert name == "K\ufffdche\ufffd\ufffd.jpg"
+    copy = placed_copy(_picture("JPEG"), replace(PLACE, room="K\ufffeche"))
+    with Image.open(io.BytesIO(copy.content)) as picture:
+        assert picture.getxmp()["xmpmeta"]["RDF"]["Description"]["Location"] == "K\ufffdche"
 
 
 @pytest.mark.slow

@@ -1,0 +1,20 @@
+"""Names of files and rooms in what people open: documents, tables and terminals."""
+
+from __future__ import annotations
+
+import re
+
+# Characters that begin a formula in a spreadsheet, also in their full width.
+_FORMULA = frozenset("=+-@＝＋－＠\t\r")
+# Control characters, bytes that were no UTF-8, and characters that are none.
+_NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\ufdd0-\ufdef\ufffe\uffff]")
+
+
+def printable(name: str) -> str:
+    """Return a name with U+FFFD for what no document has: control characters, and bytes that are no UTF-8."""
+    return _NO_TEXT.sub("\ufffd", name)
+
+
+def no_formula(text: str) -> str:
+    """Return text that a spreadsheet does not take for a formula."""
+    return f"'{text}" if _FORMULA.intersection((text[:1], text.lstrip()[:1])) else text
