@@ -75,7 +75,8 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
             ]
             outlines += floors
             text = str(name)[:200] if name else None
-            sketch.rooms += [SketchedRoom(floor.simplify(cell_m), text) for floor in floors]
+            simple = [part for floor in floors for part in polygons_from_geometry(floor.simplify(cell_m))]
+            sketch.rooms += [SketchedRoom(part, text) for part in simple]
     if not sketch.rooms:
         raise InvalidFloorPlanError("the map has no segments: let the robot divide it into rooms, and send it again")
     builder.notes.append("rooms are where the robot drives: their outlines leave out furniture that stands at walls")
