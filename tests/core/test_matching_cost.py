@@ -36,7 +36,7 @@ PLAN = FloorPlan.from_dict(
     {
         "rooms": [
             {"name": "hall", "type": "corridor", "ceiling_height_m": 2.5, "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]},
-            {"name": "den", "ceiling_height_m": 3.5, "polygon": [[4.1, 0], [8, 0], [8, 3], [4.1, 3]]},
+            {"name": "den", "types": [], "ceiling_height_m": 3.5, "polygon": [[4.1, 0], [8, 0], [8, 3], [4.1, 3]]},
         ],
         "openings": [{"kind": "door", "line": [[4, 1], [4, 2]]}, {"kind": "window", "line": [[1, 0], [2, 0]]}],
     }

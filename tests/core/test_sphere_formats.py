@@ -17,6 +17,7 @@ from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
 from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
 from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format
+from tests.core.fault_photographs import FOLDER
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
 
@@ -261,3 +262,16 @@ def test_orientation_of_a_picture_that_was_turned_is_ignored(
     Image.new("RGB", size).save(content, "JPEG", exif=exif.tobytes())
     with opened_picture(content.getvalue(), PhotographLimits()) as file:
         assert (file.orientation, len(file.warnings)) == ((1, 1) if is_ignored else (6, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "hfov_deg"),
+    [
+        ("crop_half.jpg", "was cropped after it was taken", 67.0),
+        ("stale_orientation.jpg", "because the picture was turned after it was taken", 90.0),
+    ],
+)
+def test_field_of_view_is_that_of_the_edited_picture(name: str, said: str, hfov_deg: float) -> None:
+    view = opened((FOLDER / name).read_bytes())
+    assert said in view.warnings[0]
+    assert math.degrees(view.hfov.value) == pytest.approx(hfov_deg, abs=6.0)

@@ -255,10 +255,11 @@ def _drawn_thick(drawing: Drawing, role: Role | None, bounds: RoomBounds) -> lis
 
 
 def _covered(item: Stroke | Area, bounds: RoomBounds) -> BaseGeometry:
-    """Return what a line of a thick pen covers, of the outline of a wall or pillar with its body."""
+    """Return what a line of a thick pen covers; the outline of a wall or pillar is its faces, whatever the pen."""
+    if isinstance(item, Area) and not _is_outline(item, bounds):
+        return item.shape
     line = item.line if isinstance(item, Stroke) else item.shape.boundary
-    covered = line.buffer(0.5 * item.width, cap_style="square", join_style="mitre")
-    return covered if isinstance(item, Stroke) or _is_outline(item, bounds) else covered.union(item.shape)
+    return line.buffer(0.5 * item.width, cap_style="square", join_style="mitre")
 
 
 def _is_thick(drawn: Stroke | Area, bounds: RoomBounds) -> bool:
