@@ -47,7 +47,7 @@ def check_turn(film: Film) -> None:
     assert film.warnings == ()
 
 
-@pytest.mark.parametrize(("name", "options"), [("turn.mov", HEVC), ("turn.webm", VP9)])
+@pytest.mark.parametrize(("name", "options"), [("turn.mov", HEVC), ("turn.webm", VP9), ("turn.mkv", VP9)])
 def test_film_of_any_codec_gives_angles(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
     check_turn(read_film(encode(turn(), tmp_path / name, *options), stated=FIELD))
 
@@ -184,15 +184,15 @@ def test_limits_are_named(h264: bytes, limits: dict[str, float], reason: str) ->
 
 
 def test_broken_and_soundless_files_are_refused(h264: bytes, tmp_path: Path) -> None:
-    sound, mpeg4 = tmp_path / "sound.mp4", tmp_path / "old.mp4"
+    sound, jpegs = tmp_path / "sound.mp4", tmp_path / "jpegs.mp4"
     run("-f", "lavfi", "-i", "sine=duration=1", "-c:a", "aac", str(sound))
-    encode(turn()[:5], mpeg4, "-c:v", "mpeg4")
+    encode(turn()[:5], jpegs, "-c:v", "mjpeg")
     for content, reason in (
         (b"", "by its first bytes"),
         (b"\xff\xd8\xff picture", "by its first bytes"),
         (h264[:2000], "damaged, or holds sound only"),
         (sound.read_bytes(), "damaged, or holds sound only|no frame of the film"),
-        (mpeg4.read_bytes(), "codec is .*; it must be one of H.264, HEVC, VP8, VP9"),
+        (jpegs.read_bytes(), "codec is .*; it must be one of H.264, HEVC, MPEG-4, VP8, VP9"),
         (bytes([0, 0, 0, 24]) + b"ftypisom" + bytes(500), "damaged, or holds sound only"),
     ):
         with pytest.raises(InvalidFilmError, match=reason):
