@@ -141,7 +141,7 @@ def test_no_file_is_overwritten_unasked(
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
-def test_names_are_shown_without_formulas_and_characters_that_no_document_has() -> None:
+def test_shown_names_hold_no_formulas_or_control_characters() -> None:
     assert [no_formula(text) for text in ("=1", "-1", " ＝1", "a=1", "")] == ["'=1", "'-1", "' ＝1", "a=1", ""]
     name = printable("K\udcffche\x07\ufffe.jpg")
     assert name == "K\ufffdche\ufffd\ufffd.jpg"

@@ -295,7 +295,7 @@ def test_fixtures_belong_to_the_storey_of_their_layer():
     assert [room.get("type") for room in upper.document["rooms"]] == [None]
 
 
-def test_text_without_a_place_is_skipped_and_that_between_points_is_in_their_middle():
+def test_fitted_text_is_in_the_middle_of_its_points():
     document: Any = new_dxf("R2010", units=6)
     space = document.modelspace()
     for x in (0.0, 4.2):
