@@ -1,4 +1,4 @@
-"""`lalaloc lab synth`, `train`, `export`, `export-again` and `add-objects`."""
+"""`lalaloc lab synth`, `train`, `mean`, `export`, `export-again` and `add-objects`."""
 
 from __future__ import annotations
 
@@ -68,6 +68,16 @@ class Train:
         "(default: device if it is a GPU)",
     ] = None
     validation_homes: Annotated[int, "maximum number of homes or scenes for validation"] = _VALIDATION_HOMES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mean:
+    """Write the mean of a run's last weights and of those that it began from, as a run."""
+
+    run_: Annotated[Path, "folder of the run"]
+    from_: Annotated[Path, "bundle or run that it began from"]
+    out: Annotated[Path, "folder of the mean"]
+    share: Annotated[float, "share of the run's weights"] = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,6 +204,21 @@ def _keep_freed_memory() -> None:
         libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
+def _mean(arguments: Mean) -> None:
+    from lalaloc_core.learn.training.warm_start import find_checkpoint, load_warm_start, mean_with
+
+    check_range(arguments, 0, "share")
+    if arguments.share > 1.0:
+        raise InvalidInputError(f"--share is {arguments.share:g}; it must be at most 1")
+    stages = [stage for stage in ("image", "view") if (arguments.run_ / f"{stage}.pt").exists()]
+    if not stages:
+        raise InvalidInputError(f"'{arguments.run_}' has no weights of an encoder of spheres or of views")
+    for stage in stages:
+        checkpoint = find_checkpoint(stage, arguments.run_, last=True)
+        earlier = load_warm_start(arguments.from_, stage, checkpoint.config).checkpoint
+        mean_with(checkpoint, earlier, arguments.share).save(arguments.out / f"{stage}.pt")
+
+
 def _export(arguments: Export) -> None:
     from lalaloc_core.learn.export.run_export import export_into, export_run
 
@@ -242,6 +267,7 @@ def _synth(arguments: Synth) -> None:
 COMMANDS = {
     "synth": Command(Synth, _synth, "out"),
     "train": Command(Train, _train, "stage"),
+    "mean": Command(Mean, _mean, "run_"),
     "export": Command(Export, _export, "run_"),
     "export-again": Command(ExportAgain, _export_again, "bundle"),
     "add-objects": Command(AddObjects, _add_objects, "bundle"),

@@ -281,18 +281,25 @@ def test_evidence_of_photographs_of_one_spot_counts_once() -> None:
     pose, room = np.arange(6), np.array([0, 0, 0, 1, 1, 1])
     states = [
         States.of(
-            {"pose": pose, "position_m": np.zeros((6, 2)), "room": room, "hypothesis": 0 * pose, "log_likelihood": log},
+            {
+                "pose": pose,
+                "position_m": np.zeros((6, 2)),
+                "room": room,
+                "hypothesis": 0 * pose,
+                "log_likelihood": log,
+                "rooms": np.logaddexp.reduce(log.reshape(2, 3), axis=1) - math.log(3.0),
+            },
             128,
         )
         for log in logs
     ]
     turned = turned_together(states, {(0, 1): 0.0, (0, 2): 0.0, (1, 2): 0.0}, 6)
-    of_rooms = np.array([state.best_of_rooms(2) for state in turned])
-    # Room against room, all three together have the evidence of their best common pose.
-    total = logs.sum(axis=0)
-    assert np.diff(of_rooms.sum(axis=0)) == pytest.approx(total[3:].max() - total[:3].max(), abs=0.2)
-    # Rooms against none of them, it is as without the others.
-    np.testing.assert_allclose(of_rooms.max(axis=1), logs.max(axis=1))
+    of_rooms = np.array([state.evidence(1e-9) for state in turned])
+    # All three together have the evidence of their common poses, once.
+    total = np.logaddexp.reduce(logs.sum(axis=0).reshape(2, 3), axis=1) - math.log(3.0)
+    np.testing.assert_allclose(of_rooms.sum(axis=0), total, atol=0.3)
+    # What a photograph says against a room is bounded by its being misread.
+    assert turned[0].evidence(0.2).min() >= math.log(0.2)
 
 
 def test_pairs_of_many_photographs_of_a_room_weigh_no_more_than_those_of_few(
@@ -315,10 +322,12 @@ def _exhaustive(evidence: RoomEvidence) -> np.ndarray:
         if evidence.walk is not None:
             log += (evidence.walk[room[:-1], room[1:]] * evidence.follows[1:]).sum()
         log += 0.5 * (evidence.pairs * (room[:, None] == room) * (room < rooms - 1)).sum()
-        expected = evidence.expected
-        off = np.bincount(room, minlength=rooms) - np.nan_to_num(expected)
-        off = np.where(np.isnan(expected), 0.0, off)
-        log -= (evidence.tightness * np.square(off) / (2.0 * (np.nan_to_num(expected) + 1.0))).sum()
+        counts = np.bincount(room, minlength=rooms)
+        if evidence.expected is not None:
+            expected = counts[:-1].sum() * evidence.expected
+            log -= (evidence.tightness * np.square(counts[:-1] - expected) / (2.0 * (expected + 1.0))).sum()
+        # One of n photographs is of none of the rooms, given the others, as often as 1 + k in 10 + n - 1.
+        log += math.log(math.prod(range(1, counts[-1] + 1)) * math.prod(range(9, 9 + counts[:-1].sum())))
         total[np.arange(count), room] += math.exp(log)
     return total / total.sum(axis=1, keepdims=True)
 
@@ -335,7 +344,7 @@ def test_assignment_agrees_with_the_sum_over_all(has_order: bool) -> None:
         # Two walks, of two photographs and of four.
         follows=np.array([False, True, False, True, True, True]) & has_order,
         pairs=pairs,
-        expected=np.array([3.0, 3.0, np.nan]),
+        expected=np.array([0.5, 0.5]),
         storeys=(np.array([0]), np.array([1])),
     )
     mean = np.mean([assign_rooms(evidence, seed) for seed in range(6)], axis=0)
@@ -356,7 +365,7 @@ def test_storeys_that_were_confused_are_exchanged() -> None:
         walk=walk,
         follows=np.arange(count) > 0,
         pairs=np.zeros((count, count)),
-        expected=np.full(rooms + 1, np.nan),
+        expected=None,
         storeys=(np.arange(4), np.arange(4, 8)),
     )
     found = [assign_rooms(evidence, seed)[:, 4:8].sum(axis=1).mean() for seed in range(4)]

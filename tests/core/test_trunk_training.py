@@ -34,7 +34,7 @@ from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.learn.training.validate import cached_pictures
-from lalaloc_core.learn.training.warm_start import load_warm_start
+from lalaloc_core.learn.training.warm_start import load_warm_start, mean_with
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
@@ -422,6 +422,17 @@ class TestWarmStart:
         again = train_stage("image", SHORT_RING, tmp_path / "second", device=CPU, data=FEW, workers=0, resume=True)
         assert again.begun_from == second.begun_from
 
+    def test_mean_lies_between_a_run_and_its_start(self) -> None:
+        start = {"bias": torch.tensor([3.0, 3.0], dtype=torch.float16), "steps": torch.tensor(2)}
+        later = {"bias": torch.tensor([1.0, 3.0]), "steps": torch.tensor(4), "new": torch.tensor([5.0])}
+        run = Checkpoint(stage="image", config=RING, weights={}, averaged={"image_encoder": later}, step=7)
+        earlier = Checkpoint(stage="image", config=RING, weights={"image_encoder": start})
+        mean = mean_with(run, earlier, 0.25)
+        expected = {"bias": torch.tensor([2.5, 3.0]), "steps": torch.tensor(4), "new": torch.tensor([5.0])}
+        assert same_weights(mean.inference_weights, {"image_encoder": expected})
+        assert mean.step == 7
+        assert same_weights(run.averaged, {"image_encoder": later})
+
     def test_layout_stage_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
         layout = train_stage("layout", SHORT_RING, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
         assert layout.begun_from["name"] == "tiny"
@@ -459,6 +470,10 @@ class TestWarmStart:
         config = Checkpoint.load(tmp_path / "image.pt").config
         assert (config.image.uses_per_sphere, config.image.batch) == (2, 4)
         assert main([*words, "--resume"]) == 2
+        mean = ["lab", "mean", str(tmp_path), "--from", str(tiny_bundle), "--out", str(tmp_path / "mean")]
+        assert main(mean) == 0
+        assert Checkpoint.load(tmp_path / "mean" / "image.pt").step == 1
+        assert main([*mean, "--share", "2"]) == 2
         assert main(["lab", "train", "layout", "--out", str(tmp_path), "--set", "image.batch"]) == 2
         assert (
             main(["lab", "export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"])

@@ -35,13 +35,14 @@ from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 # Finer grid for plans of at most so many poses, and the distance (m) within which its best pose counts as exact:
 # single photographs name the right room more often than with the grid of queries.
 _FINE_STEP_M, _FINE_REACH_M, _MAX_FINE = 0.25, 0.08, 8000
-# Logs of true over usual camera height that are tried, and the height (m) that people hold cameras at.
+# Logs of true over usual camera height that are tried, the height (m) that people hold cameras at, and that of the
+# ceilings of other homes.
 _OFFSETS = np.linspace(-0.36, 0.36, 9)
-_USUAL_HEIGHT_M, _USUAL_LOG_SD = 1.5, 0.15
+_USUAL_HEIGHT_M, _USUAL_LOG_SD, _USUAL_CEILING_M = 1.5, 0.15, 2.5
 # States that are kept: of every room, at least so many, and of all.
 _PER_ROOM, _MAX_STATES = 96, 8192
-# Every so many of the poses of other homes are compared: about as many as a home has.
-_EVERY = 4
+# Every so many of the poses of other homes are compared; version of the evidence in stored memories.
+_EVERY, _VERSION = 4, 2
 _CONFIG = MatchingConfig()
 # Arrays of one photograph by name.
 Arrays = dict[str, np.ndarray]
@@ -70,7 +71,10 @@ class AlbumMemory:
 
     def use(self, ground: AlbumGround, manifest: Manifest) -> None:
         """Drop everything that is of another ground or model."""
-        key = hashlib.sha256(f"{ground.digest} {sorted(manifest.files.items())}".encode()).hexdigest()
+        files = sorted(manifest.files.items())
+        key = hashlib.sha256(
+            f"{_VERSION} {ground.digest} {files} {manifest.evidence_for(view=True)}".encode()
+        ).hexdigest()
         if key != self.key:
             # Links depend on the photographs alone.
             self.key, self.evidence = key, {}
@@ -146,51 +150,72 @@ class SearchedPlan:
 def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photograph: Photograph) -> Arrays:
     """Compare a photograph with all poses.
 
+    Likelihoods are ratios to the mean likelihood of poses of other homes: above 1 a place explains the photograph
+    better than homes in general do, whatever can be told from it.
+
     Returns:
         `pose`, `position_m`, `room`, `hypothesis` and `log_likelihood` of the states that are kept;
-        `room_types` (r,), the log likelihood of the type of every room; `heights` (j,), the log evidence of each height
-        offset; `chance`, the log likelihood of the best of as many poses of other homes.
+        `rooms` (r,), the log mean likelihood of every room's poses under all headings;
+        `room_types` (r,), the log likelihood of the type of every room, over that of a room of unknown type;
+        `heights` (j,), the log evidence of each height offset.
     """
+    plan, poses = searched.plan, searched.poses
     weights = encoder.manifest.evidence_for(view=not photograph.is_sphere)
     query = encoder.query(photograph, None, CameraHeight(_USUAL_HEIGHT_M, 0.0))
-    compared = Comparison.of(searched.plan, query, searched.reach_m, weights, _OFFSETS)
-    usual = (0.5 * np.square(_OFFSETS / _USUAL_LOG_SD)).astype(np.float32)
-    ceilings = (usual + _ceilings(searched.plan, query, weights)).astype(np.float32)
-    best = np.empty((len(searched.poses), len(query.roll)), np.float32)
+    compared = Comparison.of(plan, query, searched.reach_m, weights, _OFFSETS)
+    ceilings = _height_costs(plan.ceiling_heights_m, query, weights)
+    best = np.empty((len(poses), len(query.roll)), np.float32)
     heights = np.full(len(_OFFSETS), -np.inf)
-    trusts = searched.plan.class_trusts[1][searched.poses.room_index]
-    pose = np.arange(len(best))
-    places = PlaceCost.of(searched.plan, query, NO_HINTS, 1.0, searched.poses.position_m, searched.poses.room_index)
+    trusts = plan.class_trusts[1][poses.room_index]
     for part, log in compared.log_likelihoods(searched.binned, trusts):
-        log -= ceilings[searched.poses.room_index[part], None, :]
+        log -= ceilings[poses.room_index[part], None, :]
         heights = np.logaddexp(heights, [_log_sum(log[:, :, number]) for number in range(len(_OFFSETS))])
         best[part] = log.max(axis=2)
-        if places is not None:
-            best[part] -= places.of_poses(pose[part])
-    kept = _kept(best, searched.poses.room_index, len(searched.plan.rooms))
+    trust = int(trusts[best.max(axis=1).argmax()])
+    others = _height_costs(np.array([_USUAL_CEILING_M]), query, weights)
+    best -= _of_other_homes(encoder, compared, others, trust, best)
+    places = PlaceCost.of(plan, query, NO_HINTS, 1.0, poses.position_m, poses.room_index)
+    if places is not None:
+        # How probable it is that the lines and fixtures that are seen are there, over the mean of the plan.
+        log_share = np.broadcast_to(-places.of_poses(np.arange(len(poses))), best.shape)
+        best += log_share - (_log_sum(log_share) - math.log(log_share.size))
+    kept = _kept(best, poses.room_index, len(plan.rooms))
     pose, hypothesis = np.divmod(kept, best.shape[1])
     return {
         "pose": pose.astype(np.int32),
-        "position_m": searched.poses.position_m[pose].astype(np.float32),
-        "room": searched.poses.room_index[pose].astype(np.int32),
+        "position_m": poses.position_m[pose].astype(np.float32),
+        "room": poses.room_index[pose].astype(np.int32),
         "hypothesis": hypothesis.astype(np.uint8),
         "log_likelihood": best.ravel()[kept].astype(np.float32),
-        "room_types": _room_types(searched.plan, query, weights).astype(np.float32),
+        "rooms": _room_means(best, poses.room_index, len(plan.rooms)).astype(np.float32),
+        "room_types": _room_types(plan, query, weights).astype(np.float32),
         "heights": heights.astype(np.float32),
-        "chance": np.array(_by_chance(encoder, compared, usual, int(trusts[best.max(axis=1).argmax()])), np.float32),
     }
 
 
-def _by_chance(
-    encoder: PhotographEncoder, compared: Comparison, usual: Float[np.ndarray, "j"], trust_number: int
+def _of_other_homes(
+    encoder: PhotographEncoder,
+    compared: Comparison,
+    costs: Float[np.ndarray, "1 j"],
+    trust_number: int,
+    own: Float[np.ndarray, "n k"],
 ) -> float:
-    """Return the log likelihood of the best pose of other homes, under one trust; -inf if the model has none."""
+    """Return the log mean likelihood of poses of other homes, under one trust; of `own` if the model has none."""
     cohort = encoder.layouts.cohort
     if cohort is None:
-        return -math.inf
+        return _log_sum(own) - math.log(own.size)
     layouts = cohort.layouts.rows(np.arange(0, len(cohort.layouts), _EVERY))
     ground, trusts = BinnedGround.of(layouts), np.full(len(layouts), trust_number)
-    return max(float((log - usual).max()) for _, log in compared.log_likelihoods(ground, trusts))
+    best = [(log - costs).max(axis=2) for _, log in compared.log_likelihoods(ground, trusts)]
+    return _log_sum(np.concatenate(best)) - math.log(len(layouts) * own.shape[1])
+
+
+def _room_means(log: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Float[np.ndarray, "r"]:
+    """Return the log mean likelihood of every room; of the least likely one for rooms without poses."""
+    highest = float(log.max())
+    total = np.bincount(room_index, np.exp(log - highest).mean(axis=1), minlength=rooms)
+    mean = total / np.maximum(np.bincount(room_index, minlength=rooms), 1)
+    return highest + np.log(np.where(mean > 0.0, mean, mean[mean > 0.0].min()))
 
 
 def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Int[np.ndarray, "m"]:
@@ -207,7 +232,7 @@ def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], room
 
 
 def _room_types(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r"]:
-    """Return the log likelihood of every room's type.
+    """Return the log likelihood of every room's type, over that of a room of unknown type.
 
     As in the matching cost, recognised objects replace the encoder's own prediction.
     """
@@ -217,15 +242,20 @@ def _room_types(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Floa
         predicted, weight = query.room_type, weights.room_type * weights.temperature
     else:
         return np.zeros(len(plan.rooms))
-    return -weight * losses_of_rooms(room_type_losses(predicted, _CONFIG.floor), plan.type_shares)
+    loss = room_type_losses(predicted, _CONFIG.floor)
+    return weight * (loss[0] - losses_of_rooms(loss, plan.type_shares))
 
 
-def _ceilings(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r j"]:
-    """Return the negative log likelihood of every room's ceiling at each height."""
+def _height_costs(
+    ceiling_m: Float[np.ndarray, "r"], query: Query, weights: MatchingWeights
+) -> Float[np.ndarray, "r j"]:
+    """Return the negative log likelihood of each height offset, with that of each ceiling (m above the floor) then."""
+    usual = 0.5 * np.square(_OFFSETS / _USUAL_LOG_SD)
     if query.ceiling is None:
-        return np.zeros((len(plan.rooms), len(_OFFSETS)))
-    clearance_m = plan.ceiling_heights_m[:, None] - _USUAL_HEIGHT_M * np.exp(_OFFSETS)
-    return weights.ceiling * weights.temperature * ceiling_costs(query.ceiling, clearance_m, _OFFSETS, weights.tail)
+        return np.tile(usual, (len(ceiling_m), 1)).astype(np.float32)
+    clearance_m = ceiling_m[:, None] - _USUAL_HEIGHT_M * np.exp(_OFFSETS)
+    cost = ceiling_costs(query.ceiling, clearance_m, _OFFSETS, weights.tail)
+    return (usual + weights.ceiling * weights.temperature * cost).astype(np.float32)
 
 
 def _log_sum(values: np.ndarray) -> float:

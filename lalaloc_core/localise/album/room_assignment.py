@@ -3,7 +3,8 @@
 The energy of an assignment is the sum of four parts: the evidence of each photograph for its room, the log probability
 of the walk from each photograph to the next, the log odds of pairs that look as if they are of one room, and a prior of
 how many photographs each room has. The last one makes the evidence exclusive: a bathroom that explains all photographs
-of a home is unlikely, as people photograph every room.
+of a home is unlikely, as people photograph every room. How many are of none of the rooms is learnt in the album: the
+share of them has a beta distribution, so that the more there are, the more likely is another one.
 
 People mostly walk from room to room through doors, and photograph large rooms more often (`walk_of`,
 `expected_photographs`).
@@ -24,6 +25,7 @@ import shapely
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.special import betaln
 
 from lalaloc_core.localise.album.ground import AlbumGround
 
@@ -43,8 +45,8 @@ _MOST_STOREYS, _STOREY_ROOMS = 4, 2
 _STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.05, 0.5, 4
 # Rooms nearer than this (m) are joined if the plan draws no doors.
 _JOINED_M = 0.4
-# Probability of a photograph of none of the rooms, after one of a room and after another of none.
-_LEAVE, _STAY_AWAY = 0.05, 0.5
+# Beta distribution of the share of photographs of none of the rooms: in most folders it is one in ten.
+_AWAY = 1.0, 9.0
 # Rooms smaller than this (m²) are often left out.
 _SMALL_M2, _SMALL_SHARE = 3.0, 0.5
 
@@ -59,7 +61,7 @@ class RoomEvidence:
         follows: (n,) whether a photograph follows the one before it on a walk; never the first.
         pairs: (n, n) log odds that two photographs are of one room, symmetric, zero on the diagonal; they do not count
             elsewhere, which is no room.
-        expected: (r,) number of photographs that each room has a priori; NaN for rooms that can have any number.
+        expected: (r - 1,) share that each room has a priori of the photographs that are of any; None for no prior.
         storeys: rooms of each storey; empty for no exchange of them.
     """
 
@@ -67,7 +69,7 @@ class RoomEvidence:
     walk: Float[np.ndarray, "r r"] | None
     follows: Bool[np.ndarray, "n"]
     pairs: Float[np.ndarray, "n n"]
-    expected: Float[np.ndarray, "r"]
+    expected: Float[np.ndarray, "q"] | None
     tightness: float = 1.0
     storeys: tuple[Int[np.ndarray, "_"], ...] = ()
 
@@ -117,10 +119,11 @@ class _Chains:
         self._rooms = evidence.alone.shape[1]
         self._walk = np.zeros((self._rooms, self._rooms)) if evidence.walk is None else evidence.walk
         self._follows = evidence.follows
-        self._expected = np.nan_to_num(evidence.expected)
-        self._stiffness = np.where(
-            np.isnan(evidence.expected), 0.0, evidence.tightness / (2.0 * (self._expected + 1.0))
-        )
+        self._expected = np.zeros(self._rooms - 1) if evidence.expected is None else evidence.expected
+        self._tightness = 0.0 if evidence.expected is None else 0.5 * evidence.tightness
+        # Log probability of the photographs that are of none of the rooms, by their number.
+        away, count = np.arange(len(evidence.alone) + 1), len(evidence.alone)
+        self._away = betaln(_AWAY[0] + away, _AWAY[1] + count - away) - betaln(*_AWAY)
         self._each = np.arange(_CHAINS)
         # Temperature of each chain, and the number of each chain by ladder and temperature.
         self._heat = np.tile(np.geomspace(1.0, _HOTTEST, _LEVELS), _LADDERS)
@@ -148,21 +151,32 @@ class _Chains:
             self._exchange_heats(first)
         return found
 
-    def _prior(self, counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c r"]:
-        return -self._stiffness * np.square(counts - self._expected)
+    def _prior(self, counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c"]:
+        """Return the log prior of numbers of photographs."""
+        inside = counts[:, :-1]
+        expected = inside.sum(axis=1, keepdims=True) * self._expected
+        unusual = self._tightness * np.square(inside - expected) / (expected + 1.0)
+        return self._away[counts[:, -1].astype(int)] - unusual.sum(axis=1)
 
-    def _prior_of_more(
-        self, counts: Float[np.ndarray, "c r"], more: float | Int[np.ndarray, "c 1"]
-    ) -> Float[np.ndarray, "c r"]:
-        """Return how the log prior changes with more photographs in a room."""
-        return -self._stiffness * more * (2.0 * (counts - self._expected) + more)
+    def _prior_with(self, counts: Float[np.ndarray, "c r"], more: Float[np.ndarray, "#c"]) -> Float[np.ndarray, "c r"]:
+        """Return the log prior with more photographs in each of the rooms."""
+        inside, away = counts[:, :-1], counts[:, -1].astype(int)
+        expected = (inside.sum(axis=1) + more)[:, None] * self._expected
+        weight, off = self._tightness / (expected + 1.0), inside - expected
+        found = np.empty(counts.shape)
+        found[:, :-1] = -weight * more[:, None] * (2.0 * off + more[:, None])
+        found[:, :-1] += (self._away[away] - (weight * np.square(off)).sum(axis=1))[:, None]
+        outside = counts.copy()
+        outside[:, -1] += more
+        found[:, -1] = self._prior(outside)
+        return found
 
     def _move_one(self, number: int) -> Float[np.ndarray, "r"]:
         """Draw the room of one photograph; return its conditional probabilities, summed over chains that count."""
         room, before = self._room, self._room[:, number].copy()
         others = self._counts.copy()
         others[self._each, before] -= 1.0
-        log = self._alone[number] + self._linked[:, number] + self._prior_of_more(others, 1.0)
+        log = self._alone[number] + self._linked[:, number] + self._prior_with(others, np.ones(1))
         if self._follows[number]:
             log = log + self._walk[room[:, number - 1]]
         if number + 1 < room.shape[1] and self._follows[number + 1]:
@@ -201,7 +215,7 @@ class _Chains:
         within = ((mask @ self._pairs) * mask).sum(axis=1)
         log[self._each, present] -= np.where(present < self._rooms - 1, within, 0.0)
         log[:, -1] -= 0.5 * within
-        log += self._prior_of_more(others, size[:, None])
+        log += self._prior_with(others, size.astype(float))
         first, second = mask[:, :-1], mask[:, 1:]
         log += (first & second & self._follows[1:]).sum(axis=1)[:, None] * np.diag(self._walk)
         # The ends of the set, whose neighbours are of other rooms or not of the set.
@@ -249,7 +263,7 @@ class _Chains:
         """Return the log probability without the pairs; `counts` are the photographs by room."""
         total = self._alone[np.arange(room.shape[1]), room].sum(axis=1)
         total += (self._walk[room[:, :-1], room[:, 1:]] * self._follows[1:]).sum(axis=1)
-        return total + self._prior(counts).sum(axis=1)
+        return total + self._prior(counts)
 
     def _drawn(self, log: Float[np.ndarray, "c r"]) -> Int[np.ndarray, "c"]:
         return (log / self._heat[:, None] + self._rng.gumbel(size=log.shape)).argmax(axis=1)
@@ -284,7 +298,10 @@ def _exchanges(evidence: RoomEvidence) -> list[Int[np.ndarray, "r"]]:
 
 
 def walk_of(ground: AlbumGround) -> Float[np.ndarray, "s s"]:
-    """Return log probabilities of the next photograph's room (columns) by that of a photograph; the last is none."""
+    """Return log probabilities of the next photograph's room (columns) by that of a photograph.
+
+    The last row and column are none of the rooms, which order tells nothing about.
+    """
     near = _joined(ground)
     rooms = len(near)
     step = near / np.maximum(near.sum(axis=1, keepdims=True), 1)
@@ -296,12 +313,8 @@ def walk_of(ground: AlbumGround) -> Float[np.ndarray, "s s"]:
     mass = total.sum(axis=1, keepdims=True)
     # A room without doors leads anywhere.
     total = np.where(mass > 0.0, total / np.maximum(mass, 1e-9), 1.0 / rooms)
-    inside = _STAY * np.eye(rooms) + (1.0 - _STAY) * ((1.0 - _ANYWHERE) * total + _ANYWHERE / rooms)
-    walk = np.empty((rooms + 1, rooms + 1))
-    walk[:rooms, :rooms] = (1.0 - _LEAVE) * inside
-    walk[:rooms, rooms] = _LEAVE
-    walk[rooms, :rooms] = (1.0 - _STAY_AWAY) / rooms
-    walk[rooms, rooms] = _STAY_AWAY
+    walk = np.full((rooms + 1, rooms + 1), 1.0 / rooms)
+    walk[:rooms, :rooms] = _STAY * np.eye(rooms) + (1.0 - _STAY) * ((1.0 - _ANYWHERE) * total + _ANYWHERE / rooms)
     return np.log(walk)
 
 
@@ -313,17 +326,14 @@ def storeys_of(ground: AlbumGround) -> tuple[Int[np.ndarray, "_"], ...]:
     return tuple(np.flatnonzero(part == number) for number in largest)
 
 
-def expected_photographs(ground: AlbumGround, count: int) -> Float[np.ndarray, "s"]:
-    """Return the number of photographs that each room has a priori; NaN for none of the rooms.
+def expected_photographs(ground: AlbumGround, count: int) -> Float[np.ndarray, "r"] | None:
+    """Return the share of the photographs that each room has a priori.
 
-    Large rooms have more, and plans with far more rooms than photographs have no expectation.
+    Large rooms have more; None in plans with more rooms than photographs, which have no expectation.
     """
     area = np.array([room.area_m2 for room in ground.plan.rooms])
     share = np.sqrt(area) * np.where(area < _SMALL_M2, _SMALL_SHARE, 1.0)
-    expected = count * share / share.sum()
-    if count < len(area):
-        expected = np.full(len(area), np.nan)
-    return np.append(expected, np.nan)
+    return None if count < len(area) else share / share.sum()
 
 
 def _joined(ground: AlbumGround) -> Bool[np.ndarray, "r r"]:

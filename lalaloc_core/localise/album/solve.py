@@ -46,8 +46,14 @@ MAX_POSES, MAX_ROOMS = 65_536, 1000
 # Pins whose room is right with at least this probability are sure.
 SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
-# Log odds of a photograph of none of the rooms, beside the best pose of other homes; half of them are taken outside.
-_ELSEWHERE = -2.0
+# Share of photographs whose walls and openings are misread, as if so many had been seen before, and share beyond which
+# an album does not fit its plan.
+_MISREAD, _SEEN_BEFORE, _MISFIT, _ROUNDS = 0.2, 10.0, 0.5, 20
+_MISFIT_WARNING = (
+    "the photographs fit this plan badly: walls and openings of {:.0f} % of them agree with it no better than with "
+    "other homes, so none is sure; check that it is the plan of this home, its scale, and that it draws the doors and "
+    "windows"
+)
 _CERTAIN = 1e4
 # How much the number of photographs of a room keeps to what its size lets expect.
 _TIGHTNESS = 2.5
@@ -86,9 +92,11 @@ def solve_album(
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
-    share = _room_shares(ground, ordered, memory, states, links, constraints, walk, pause)
+    misread = misread_share([state.rooms / state.photographs for state in states])
+    share = _room_shares(ground, ordered, memory, states, links, constraints, walk, misread, pause)
+    misfit = () if misread <= _MISFIT else (_MISFIT_WARNING.format(100.0 * misread),)
     pins = {
-        each.id: _pin(ground, each, state, row, constraints.get(each.id))
+        each.id: _pin(ground, each, state, row, constraints.get(each.id), fits=not misfit)
         for each, state, row in zip(ordered, states, share, strict=True)
     }
     height_m, scale = camera_height(ground, [memory.evidence[each.id] for each in ordered])
@@ -99,8 +107,25 @@ def solve_album(
         camera_height_m=height_m,
         scale=scale,
         compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
-        warnings=() if walk is None else walk.warnings,
+        warnings=(
+            *(() if fits else (_MISFIT_WARNING.format(100.0 * misread),)),
+            *(() if walk is None else walk.warnings),
+        ),
     )
+
+
+def misread_share(rooms: Sequence[Float[np.ndarray, "r"]]) -> float:
+    """Return the share of photographs whose walls and openings fit the plan no better than other homes.
+
+    It is found by expectation maximisation under a beta prior, from the log likelihood of every room for each
+    photograph (`States.rooms`): how well plans are drawn and photographs are read differs between homes.
+    """
+    ratio = np.array([np.logaddexp.reduce(each) - math.log(len(each)) for each in rooms])
+    share = _MISREAD
+    for _ in range(_ROUNDS):
+        misread = 1.0 / (1.0 + np.exp(np.clip(math.log1p(-share) - math.log(share) + ratio, -50.0, 50.0)))
+        share = (float(misread.sum()) + _SEEN_BEFORE * _MISREAD) / (len(ratio) + _SEEN_BEFORE)
+    return share
 
 
 def _check(ground: AlbumGround, photographs: Sequence[AlbumPhotograph]) -> None:
@@ -164,16 +189,16 @@ def _room_shares(
     links: dict[tuple[int, int], Found],
     constraints: dict[str, Constraint],
     walk: WalkOrder | None,
+    misread: float,
     pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
     """Return the probability of every room for every photograph; the last is none of the rooms."""
     rooms = len(ground.plan.rooms)
     alone = np.empty((len(photographs), rooms + 1))
     for number, (each, state) in enumerate(zip(photographs, states, strict=True)):
-        arrays = memory.evidence[each.id]
-        alone[number, :rooms] = state.best_of_rooms(rooms) + arrays["room_types"]
-        elsewhere = _ELSEWHERE + float(np.logaddexp(0.0, _outside(each))) - math.log(2.0)
-        alone[number, rooms] = float(arrays["chance"]) + elsewhere
+        alone[number, :rooms] = state.evidence(misread) + memory.evidence[each.id]["room_types"]
+        # Half of the photographs of none of the rooms are taken outside.
+        alone[number, rooms] = float(np.logaddexp(0.0, _outside(each))) - math.log(2.0)
         if each.id in constraints:
             wanted = constraints[each.id].room
             alone[number] -= _CERTAIN
@@ -208,6 +233,8 @@ def _pin(
     states: States,
     share: Float[np.ndarray, "s"],
     constraint: Constraint | None,
+    *,
+    fits: bool,
 ) -> Pin:
     """Return the pin of a photograph by the probabilities of its rooms."""
     rooms = len(ground.plan.rooms)
@@ -242,7 +269,7 @@ def _pin(
             reason = "no furniture or fittings are recognised in it, as in photographs of façades and gardens"
         return replace(base, state="set_aside", reason=reason)
     confidence = float(share[order[0]])
-    is_sure = confidence >= SURE
+    is_sure = fits and confidence >= SURE
     also = ", ".join(f"{row.room} {100.0 * row.probability:.0f} %" for row in listed[1:3])
     return replace(
         base,

@@ -32,9 +32,9 @@ class States:
         pose: (m,) number of the pose in the grid.
         room: (m,) number of its room.
         heading: (m,) azimuth of the photograph's centre, radians.
-        log: (m,) log likelihood.
-        photographs: number of photographs whose evidence `log` sums up.
-        highest: highest log likelihood of the photograph alone.
+        log: (m,) log likelihood, over that of poses of other homes (`evidence.single_evidence`).
+        rooms: (r,) the same of each room, over its poses and all headings.
+        photographs: number of photographs whose evidence these sum up.
     """
 
     pose: Int[np.ndarray, "m"]
@@ -42,8 +42,8 @@ class States:
     room: Int[np.ndarray, "m"]
     heading: Float[np.ndarray, "m"]
     log: Float[np.ndarray, "m"]
-    photographs: int
-    highest: float
+    rooms: Float[np.ndarray, "r"]
+    photographs: int = 1
 
     @classmethod
     def of(cls, arrays: Arrays, headings: int) -> States:
@@ -54,19 +54,25 @@ class States:
             room=arrays["room"],
             heading=arrays["hypothesis"] * (TWO_PI / headings),
             log=arrays["log_likelihood"].astype(float),
-            photographs=1,
-            highest=float(arrays["log_likelihood"].max()),
+            rooms=arrays["rooms"].astype(float),
         )
 
-    def best_of_rooms(self, rooms: int) -> Float[np.ndarray, "r"]:
-        """Return the log likelihood of every room at its best state: this photograph's share of the joint evidence.
+    def evidence(self, misread: float) -> Float[np.ndarray, "r"]:
+        """Return the log likelihood of every room for one of the photographs, which is misread with a probability.
 
-        Each photograph of a spot has the evidence of all, which counts once for all of them. Their best state fits each
-        one worse than its own best; rooms of other buildings would, too, so the highest value stays.
+        Each photograph of a spot has the evidence of all, which counts once for all of them. A photograph that is
+        misread fits all rooms as it fits other homes, which bounds what one photograph can say against a room.
         """
-        best = np.full(rooms, self.log.min(initial=0.0) - 10.0)
-        np.maximum.at(best, self.room, self.log)
-        return self.highest + (best - best.max()) / self.photographs
+        return np.logaddexp(math.log1p(-misread) + self.rooms / self.photographs, math.log(misread))
+
+    def changed(self, log: Float[np.ndarray, "m"], photographs: int | None = None) -> States:
+        """Return the states with another log likelihood; that of rooms changes with that of the states kept of each."""
+        rooms, count = self.rooms.copy(), len(self.rooms)
+        highest = max(self.log.max(initial=0.0), log.max(initial=0.0))
+        before, after = (np.bincount(self.room, np.exp(each - highest), minlength=count) for each in (self.log, log))
+        known = (before > 0.0) & (after > 0.0)
+        rooms[known] += np.log(after[known] / before[known])
+        return replace(self, log=log, rooms=rooms, photographs=photographs or self.photographs)
 
     def modes(self, room: int) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
         """Return distinct states of a room, best first, and their shares of its probability."""
@@ -100,17 +106,16 @@ def turned_together(states: Sequence[States], turns: Mapping[tuple[int, int], fl
     for (first, second), turn in turns.items():
         for own, other, change in ((first, second, turn), (second, first, -turn)):
             column = np.rint(states[other].heading / step).astype(int)
-            floor = float(states[other].log.min())
+            floor = float(states[other].log.min(initial=0.0))
             table = np.full((poses, _HEADINGS), floor)
             for apart, penalty in zip(range(-2, 3), spread, strict=True):
                 np.maximum.at(table, (states[other].pose, (column + apart) % _HEADINGS), states[other].log + penalty)
             wanted = np.rint((states[own].heading + change) / step).astype(int) % _HEADINGS
-            seen = table[states[own].pose, wanted] - float(states[other].log.max())
-            found[own] += np.logaddexp(seen + math.log1p(-_WRONG_TURN), math.log(_WRONG_TURN) + seen.min())
+            seen = table[states[own].pose, wanted]
+            # With a wrong turn, the other photograph can be anywhere.
+            found[own] += np.logaddexp(seen + math.log1p(-_WRONG_TURN), math.log(_WRONG_TURN))
             photographs[own] += 1
-    return [
-        replace(state, log=log, photographs=count) for state, log, count in zip(states, found, photographs, strict=True)
-    ]
+    return [state.changed(log, count) for state, log, count in zip(states, found, photographs, strict=True)]
 
 
 def by_compass(
@@ -140,9 +145,10 @@ def by_compass(
         likely = kernel @ np.exp(states[number].heading_log)
         total += np.log(np.roll(likely, -shift))
     best = float(bias[int(total.argmax())])
-    found = list(states)
+    found, usual = list(states), (1.0 - _WRONG_COMPASS) * _COMPASS_SD / math.sqrt(TWO_PI) + _WRONG_COMPASS
     for number in known:
         missed = wrap_angle(states[number].heading - (compass[number] or 0.0) - best)
         fits = (1.0 - _WRONG_COMPASS) * np.exp(-0.5 * np.square(missed / _COMPASS_SD)) + _WRONG_COMPASS
-        found[number] = replace(states[number], log=states[number].log + np.log(fits))
+        # Over any heading, as likelihoods are over those of other homes.
+        found[number] = states[number].changed(states[number].log + np.log(fits / usual))
     return found, best
