@@ -22,5 +22,11 @@ from lalaloc_core.bundle.bundle import (
     ViewManifest,
     write_manifest,
 )
-from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, LogisticModel, MatchingWeights, PredictionErrors
+from lalaloc_core.bundle.fitted_parameters import (
+    AlbumWeights,
+    ConfidenceModel,
+    LogisticModel,
+    MatchingWeights,
+    PredictionErrors,
+)
 from lalaloc_core.files import MANIFEST_NAME, default_bundle

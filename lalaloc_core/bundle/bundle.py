@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle.fitted_parameters import ConfidenceModel, MatchingWeights, PredictionErrors
+from lalaloc_core.bundle.fitted_parameters import AlbumWeights, ConfidenceModel, MatchingWeights, PredictionErrors
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
@@ -86,11 +86,15 @@ class ObjectsManifest:
         names: names of the objects, in the order of the network's outputs.
         shares: (objects, room types) share of each object that a room of each type accounts for.
         floor: probability that is added to that of every type, since most photographs show none of the objects.
+        weight, recognition: the log likelihoods of types count w m^p times, with the summed probability m of all
+            objects: a wall without any of them tells no type.
     """
 
     names: list[str]
     shares: list[list[float]]
     floor: float = 0.01
+    weight: float = 1.0
+    recognition: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the shape of `shares`."""
@@ -119,6 +123,7 @@ class Manifest:
         objects: classifier of objects; None if the bundle has none.
         confidence: models of the confidence; None leaves answers without one.
         evidence: weights of the matching cost.
+        album: weights of what counts in albums only.
         errors: measured errors of the predictions; None if they were not measured.
         training: commands, seeds, hardware and counts of the training.
         metrics: validation figures with their n.
@@ -144,6 +149,7 @@ class Manifest:
     objects: ObjectsManifest | None = None
     confidence: ConfidenceModel | None = None
     evidence: MatchingWeights = field(default_factory=MatchingWeights)
+    album: AlbumWeights = field(default_factory=AlbumWeights)
     errors: PredictionErrors | None = None
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)

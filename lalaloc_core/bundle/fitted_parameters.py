@@ -96,6 +96,26 @@ class MatchingWeights:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AlbumWeights:
+    """Weights of what counts in albums only, fitted on albums of pictures by others (`evaluate.calibrate.album_fit`).
+
+    Attributes:
+        misread: share of photographs whose walls and openings are misread, before those of an album tell.
+        pairs: weight of the log odds that two photographs are of one room.
+        crowding: how much the number of photographs of a room keeps to what its size lets expect.
+    """
+
+    misread: float = 0.2
+    pairs: float = 0.25
+    crowding: float = 2.5
+
+    def __post_init__(self) -> None:
+        """Check the range of `misread`."""
+        if not 0.0 < self.misread < 1.0:
+            raise ConfigError(f"album.misread is {self.misread:g}; it must be between 0 and 1")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ConfidenceModel:
     """Models of the confidence and covariance of answers, fitted on validation queries.
 

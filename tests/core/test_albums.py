@@ -307,7 +307,7 @@ def test_pairs_of_many_photographs_of_a_room_weigh_no_more_than_those_of_few(
 ) -> None:
     def weight(count: int) -> float:
         alike = [photographs[number % 2] for number in range(count)]
-        return float(np.abs(pair_odds(alike, {}, 2)).sum(axis=1).max())
+        return float(np.abs(pair_odds(alike, {}, 2, 0.25)).sum(axis=1).max())
 
     assert weight(120) < 1.3 * weight(6)
 
@@ -325,7 +325,7 @@ def _exhaustive(evidence: RoomEvidence) -> np.ndarray:
         counts = np.bincount(room, minlength=rooms)
         if evidence.expected is not None:
             expected = counts[:-1].sum() * evidence.expected
-            log -= (evidence.tightness * np.square(counts[:-1] - expected) / (2.0 * (expected + 1.0))).sum()
+            log -= (evidence.crowding * np.square(counts[:-1] - expected) / (2.0 * (expected + 1.0))).sum()
         # One of n photographs is of none of the rooms, given the others, as often as 1 + k in 10 + n - 1.
         log += math.log(math.prod(range(1, counts[-1] + 1)) * math.prod(range(9, 9 + counts[:-1].sum())))
         total[np.arange(count), room] += math.exp(log)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from typing import Any
@@ -18,10 +18,12 @@ from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.drawn_rooms import plan_of_rooms
 from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated
 from lalaloc_core.learn.data.synthetic.albums import taken_album, two_views
 from lalaloc_core.learn.data.views import encode_jpeg
+from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.local_model import LocalModel
@@ -48,7 +50,7 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
     scores: defaultdict[str, list[Found]] = defaultdict(list)
     clicks, seconds, again_s = list[int](), list[float](), list[float]()
     for index in range(setting.homes):
-        case = _home(setting, index, spheres=False)
+        case = home_album(setting, index, spheres=False)
         refused += _PHOTOGRAPHS - len(case.photographs)
         memory = AlbumMemory()
         solve_s, walk = timed(_solved, model, case, memory)
@@ -59,9 +61,9 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
         clicks_s, count = timed(case.clicks, model, memory)
         clicks.append(count)
         again_s.append(clicks_s / (count + 1))
-        scores["spheres"] += _solved(model, _home(setting, index, spheres=True), AlbumMemory())
-    for name, rooms in _by_others(setting).items():
-        for case in _galleries(model, rooms, _ROOMS[name]):
+        scores["spheres"] += _solved(model, home_album(setting, index, spheres=True), AlbumMemory())
+    for name, cases in galleries(setting).items():
+        for case in cases:
             scores[name] += _solved(model, case, AlbumMemory())
             scores[f"{name}_each_alone"] += _alone(model, case)
     return {row: _figures(found) for row, found in scores.items()} | {
@@ -72,9 +74,12 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
     }
 
 
-def _home(setting: Setting, index: int, *, spheres: bool) -> AlbumCase:
+def home_album(
+    setting: Setting, index: int, *, spheres: bool = False, split: Split = "test", furniture: FurnitureLevel = "full"
+) -> AlbumCase:
+    """Return an album of a generated home, without photographs that are refused."""
     model = setting.model
-    album = taken_album("test", index, _PHOTOGRAPHS, spheres=spheres, textures=setting.textures)
+    album = taken_album(split, index, _PHOTOGRAPHS, spheres=spheres, furniture=furniture, textures=setting.textures)
     projection = "equirectangular" if spheres else "perspective"
     photographs, truth = list[AlbumPhotograph](), list[Pose]()
     for number, each in enumerate(album.photographs):
@@ -84,19 +89,18 @@ def _home(setting: Setting, index: int, *, spheres: bool) -> AlbumCase:
     return AlbumCase.of(model, album.plan, photographs, truth)
 
 
-def _by_others(setting: Setting) -> dict[str, list[AnnotatedPhotograph]]:
-    """Return the photographs whose rooms are albums."""
+def galleries(setting: Setting) -> dict[str, Iterator[AlbumCase]]:
+    """Return albums of annotated photographs and of path-traced rooms: two views of each room."""
     found = {}
     if setting.annotated is not None:
         found["annotated"] = [each for each in AnnotatedPhotographs(setting.annotated).photographs if each.counts]
     if setting.rooms is not None:
         found["rooms"] = annotated(PosedSpheres(setting.rooms), "validation")
-    return found
+    return {name: _albums_of_rooms(setting.model, usable, _ROOMS[name]) for name, usable in found.items()}
 
 
-def _galleries(model: LocalModel, usable: Sequence[AnnotatedPhotograph], rooms: int) -> list[AlbumCase]:
-    """Return an album for every photograph: its room with others, drawn at random."""
-    cases = []
+def _albums_of_rooms(model: LocalModel, usable: Sequence[AnnotatedPhotograph], rooms: int) -> Iterator[AlbumCase]:
+    """Yield an album for every photograph: its room with others, drawn at random."""
     for number, own in enumerate(usable):
         rng = np.random.default_rng([7, number])
         others = [photograph for photograph in usable if photograph is not own]
@@ -114,8 +118,7 @@ def _galleries(model: LocalModel, usable: Sequence[AnnotatedPhotograph], rooms: 
             for pixels, azimuth in two_views(photograph.photograph.image(512, 1024), _FIELD_DEG, rng):
                 photographs.append(_entry(model, len(photographs), pixels, "perspective", None))
                 truth.append(Pose.at(place, room_index, azimuth))
-        cases.append(AlbumCase.of(model, plan, photographs, truth))
-    return cases
+        yield AlbumCase.of(model, plan, photographs, truth)
 
 
 def _entry(

@@ -17,6 +17,7 @@ from lalaloc_core.evaluate.bench.accuracy import (
     bench_uninformative,
     measure,
 )
+from lalaloc_core.evaluate.bench.album_weights import bench_album_weights
 from lalaloc_core.evaluate.bench.albums import bench_albums
 from lalaloc_core.evaluate.bench.bounds import bench_bounds
 from lalaloc_core.evaluate.bench.house import bench_house
@@ -41,7 +42,10 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
     "azimuths": bench_azimuths,
     "methods": bench_methods,
     "datasets": bench_datasets,
+    "album_weights": bench_album_weights,
 }
+# Measured only on request: it takes hours, and chooses weights instead of measuring them.
+_ON_REQUEST = ("album_weights",)
 
 
 def run_bench(
@@ -53,11 +57,12 @@ def run_bench(
     data: Path | None = None,
     rooms: Path | None = None,
 ) -> dict[str, Any]:
-    """Measure groups of figures, by default all, with one bundle; see `Setting`."""
+    """Measure groups of figures, by default all but those on request, with one bundle; see `Setting`."""
     for number, group in enumerate(groups):
         if group not in _BENCHMARKS:
             raise ConfigError(f"only[{number}] is '{group}'; the groups are {', '.join(_BENCHMARKS)}")
     bundle = Bundle.open(bundle_folder)
     setting = Setting(bundle, homes, textures, data, rooms)
     machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
-    return machine | {group: _BENCHMARKS[group](setting) for group in groups or _BENCHMARKS}
+    chosen = groups or [group for group in _BENCHMARKS if group not in _ON_REQUEST]
+    return machine | {group: _BENCHMARKS[group](setting) for group in chosen}

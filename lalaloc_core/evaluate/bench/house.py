@@ -7,20 +7,17 @@
 from __future__ import annotations
 
 import json
-import math
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from lalaloc_core.evaluate.bench.measured import Found, Setting, evaluate, summary
 from lalaloc_core.evaluate.bench.turns import found_in_film, found_in_turns
 from lalaloc_core.evaluate.calibrate.measured_errors import Spot
-from lalaloc_core.evaluate.runs.albums import album_entry
+from lalaloc_core.evaluate.runs.albums import RoomKey, album_entry, pin_figures
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.folder import HeldoutScenes
@@ -38,7 +35,6 @@ from lalaloc_core.photograph import StatedCamera
 _FIELDS_DEG, _VIEWS, _TURN_DEG, _TURN_VIEWS = (60.0, 67.0, 80.0, 106.0), 8, 80.0, 3
 # Photographs of elsewhere that are added to the album: views of annotated rooms.
 _ELSEWHERE = 5
-_LEAST = 1e-3
 
 
 def bench_house(setting: Setting) -> dict[str, Any]:
@@ -60,7 +56,13 @@ def bench_house(setting: Setting) -> dict[str, Any]:
     rows |= {f"turn_{name}": summary(found) for name, found in found_in_turns(setting.model, _spots(folder)).items()}
     scenes = list(map(PosedSpheres(folder).load, PosedSpheres(folder).scenes("validation")))
     films = [found_in_film(setting.model, scene.plan, camera) for scene in scenes for camera in scene.cameras]
-    return rows | {"film": summary(films), **_albums(setting, folder)}
+    pinned = {
+        name: pin_figures(
+            solve_album(album.ground, setting.model.encoder, album.photographs, memory=AlbumMemory()).pins, album.rooms
+        )
+        for name, album in house_albums(setting).items()
+    }
+    return rows | {"film": summary(films), **pinned}
 
 
 def _localised(setting: Setting, folder: Path, views: dict[str, Any] | None, *, known: bool) -> dict[str, float]:
@@ -84,8 +86,19 @@ def _spots(folder: Path) -> Iterator[Spot]:
             yield Spot(scene.plan, scene.cameras[first : first + _TURN_VIEWS])
 
 
-def _albums(setting: Setting, folder: Path) -> dict[str, Any]:
-    model = setting.model
+class HouseAlbum(NamedTuple):
+    """An album of the house, with the true room of every photograph."""
+
+    ground: AlbumGround
+    photographs: list[AlbumPhotograph]
+    rooms: list[RoomKey]
+
+
+def house_albums(setting: Setting) -> dict[str, HouseAlbum]:
+    """Return albums by name: see `bench_house`."""
+    model, folder = setting.model, setting.house
+    if folder is None:
+        return {}
     own = _ground(model, {name: FloorPlan.from_json((folder / name).read_bytes()) for name in _plans(folder).values()})
     heldout = HeldoutScenes(homes=1)
     foreign = _ground(model, {name: heldout.load(name).plan for name in heldout.scenes("test")})
@@ -94,12 +107,13 @@ def _albums(setting: Setting, folder: Path) -> dict[str, Any]:
         album_entry(model, f"elsewhere {path.stem}", path.read_bytes(), StatedCamera())
         for path in ([] if setting.annotated is None else sorted(setting.annotated.glob("*.jpg"))[:_ELSEWHERE])
     ]
-    rows = {
-        "album": _pinned(setting, own, plain),
-        "album_walk": _pinned(setting, own, walk),
-        "album_in_foreign_plan": _pinned(setting, foreign, {}, list(plain)),
+    rooms: list[RoomKey] = [*plain.values(), *[None] * len(outside)]
+    return {
+        "album": HouseAlbum(own, list(plain), list(plain.values())),
+        "album_walk": HouseAlbum(own, list(walk), list(walk.values())),
+        "album_with_elsewhere": HouseAlbum(own, [*plain, *outside], rooms),
+        "album_in_foreign_plan": HouseAlbum(foreign, list(plain), [None] * len(plain)),
     }
-    return rows | ({"album_with_elsewhere": _pinned(setting, own, plain, outside)} if outside else {})
 
 
 def _plans(folder: Path) -> dict[int, str]:
@@ -113,7 +127,7 @@ def _ground(model: LocalModel, plans: dict[str, FloorPlan]) -> AlbumGround:
     return AlbumGround(tuple(plans), MergedPlans.of(list(plans.values()), grids, height_m))
 
 
-def _photographs(model: LocalModel, folder: Path, *options: str) -> dict[AlbumPhotograph, tuple[str, str]]:
+def _photographs(model: LocalModel, folder: Path, *options: str) -> dict[AlbumPhotograph, RoomKey]:
     """Return the photographs that the house's program cuts, each with the plan and id of its room."""
     plans = _plans(folder)
     with tempfile.TemporaryDirectory(prefix="lalaloc-album-") as out:
@@ -123,34 +137,3 @@ def _photographs(model: LocalModel, folder: Path, *options: str) -> dict[AlbumPh
             album_entry(model, name, Path(out, name).read_bytes(), StatedCamera()): (plans[row["plan"]], row["room"])
             for name, row in truth.items()
         }
-
-
-def _pinned(
-    setting: Setting,
-    ground: AlbumGround,
-    photographs: dict[AlbumPhotograph, tuple[str, str]],
-    outside: Sequence[AlbumPhotograph] = (),
-) -> dict[str, float]:
-    """Return the figures of an album: of its own photographs, and of those of elsewhere."""
-    album = solve_album(ground, setting.model.encoder, [*photographs, *outside], memory=AlbumMemory())
-    own, others = album.pins[: len(photographs)], album.pins[len(photographs) :]
-    is_right = [
-        pin.pose is not None and (pin.pose.plan_id, pin.pose.room_id) == room
-        for pin, room in zip(own, photographs.values(), strict=True)
-    ]
-    logs = [
-        math.log(max([_LEAST, *(row.probability for row in pin.rooms if (row.plan_id, row.room_id) == room)]))
-        for pin, room in zip(own, photographs.values(), strict=True)
-    ]
-    sure = [pin.state == "sure" for pin in own]
-    logs_row = {"mean_log_probability": float(np.mean(logs))} if logs else {}
-    return logs_row | {
-        "n": len(own),
-        "right_room": sum(is_right),
-        "set_aside": sum(pin.state == "set_aside" for pin in own),
-        "sure": sum(sure),
-        "sure_and_wrong": sum(np.array(sure) & ~np.array(is_right, bool)),
-        "elsewhere": len(others),
-        "elsewhere_sure": sum(pin.state == "sure" for pin in others),
-        "elsewhere_set_aside": sum(pin.state == "set_aside" for pin in others),
-    }

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from lalaloc_core.errors import DatasetError, InvalidInputError, InvalidPhotographError
 from lalaloc_core.evaluate.methods.method import Pose
@@ -22,9 +25,14 @@ from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
 from lalaloc_core.photograph import StatedCamera, open_photograph
 from lalaloc_core.photograph.exif import Taken
 
-_PLAN = "plan"
+# Id of the plan of an album of one plan, and the least probability whose logarithm counts.
+PLAN_ID, _LEAST = "plan", 1e-3
 # Size of generated spheres, pixels.
 _SPHERE_SIZE = (512, 1024)
+
+
+# Room of a pin: the ids of its plan and of the room; None for none of the rooms.
+RoomKey = tuple[str, str] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +54,12 @@ class AlbumCase:
     ) -> AlbumCase:
         """Return the case of one plan, with poses `step_m` apart."""
         grid = model.grid(plan, plan.camera_height_m, step_m)
-        return cls(AlbumGround.of_plan(_PLAN, plan, grid), photographs, truth)
+        return cls(AlbumGround.of_plan(PLAN_ID, plan, grid), photographs, truth)
+
+    @property
+    def rooms(self) -> list[RoomKey]:
+        """The room of every photograph."""
+        return [(PLAN_ID, self.ground.plan.rooms[pose.room_index].id) for pose in self.truth]
 
     def solve(self, model: LocalModel, memory: AlbumMemory, *, by_time: bool = True) -> Sequence[Pin]:
         """Return a pin for every photograph."""
@@ -59,23 +72,46 @@ class AlbumCase:
 
     def clicks(self, model: LocalModel, memory: AlbumMemory) -> int:
         """Return how many pins must be corrected, the least sure wrong one first, until all rooms are right."""
-        rooms = [self.ground.plan.rooms[truth.room_index].id for truth in self.truth]
+        rooms = [room for room in self.rooms if room is not None]
         case = self
         for count in range(len(rooms)):
             pins = case.solve(model, memory)
             wrong = [
                 (pin.confidence, number)
                 for number, (pin, room) in enumerate(zip(pins, rooms, strict=True))
-                if pin.pose is None or pin.pose.room_id != room
+                if pin.pose is None or pin.pose.room_id != room[1]
             ]
             if not wrong:
                 return count
             number = min(wrong)[1]
-            stated = Correction(kind="room", plan_id=_PLAN, room_id=rooms[number])
+            stated = Correction(kind="room", plan_id=PLAN_ID, room_id=rooms[number][1])
             corrected = replace(case.photographs[number], correction=stated)
             photographs = [*case.photographs[:number], corrected, *case.photographs[number + 1 :]]
             case = replace(case, photographs=photographs)
         return len(rooms)
+
+
+def pin_figures(pins: Sequence[Pin], truth: Sequence[RoomKey]) -> dict[str, float]:
+    """Return counts of pins by whether their room is right, and the mean log probability of the right room."""
+    right, logs = list[bool](), list[float]()
+    for pin, room in zip(pins, truth, strict=True):
+        shares = {(row.plan_id, row.room_id): row.probability for row in pin.rooms}
+        probability = 1.0 - sum(shares.values()) if room is None else shares.get(room, 0.0)
+        logs.append(math.log(max(probability, _LEAST)))
+        right.append(pin.pose is not None and (pin.pose.plan_id, pin.pose.room_id) == room)
+    sure, aside = (np.array([pin.state == state for pin in pins]) for state in ("sure", "set_aside"))
+    own, is_right = np.array([room is not None for room in truth]), np.array(right)
+    return {
+        "n": int(own.sum()),
+        "mean_log_probability": float(np.mean(logs)),
+        "right_room": int(is_right.sum()),
+        "set_aside": int((aside & own).sum()),
+        "sure": int((sure & own).sum()),
+        "sure_and_wrong": int((sure & own & ~is_right).sum()),
+        "elsewhere": int((~own).sum()),
+        "elsewhere_sure": int((sure & ~own).sum()),
+        "elsewhere_set_aside": int((aside & ~own).sum()),
+    }
 
 
 def album_entry(

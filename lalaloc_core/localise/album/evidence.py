@@ -28,7 +28,7 @@ from lalaloc_core.localise.album.pins import SharedCamera
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost, PoseGrid, layouts_at
 from lalaloc_core.localise.match.cost_terms import ceiling_costs, losses_of_rooms, room_type_losses
-from lalaloc_core.localise.query import DEFAULT_STD_M, NO_HINTS, CameraHeight, Query
+from lalaloc_core.localise.query import DEFAULT_STD_M, NO_HINTS, CameraHeight, PredictedRoomType, Query
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 
@@ -72,9 +72,8 @@ class AlbumMemory:
     def use(self, ground: AlbumGround, manifest: Manifest) -> None:
         """Drop everything that is of another ground or model."""
         files = sorted(manifest.files.items())
-        key = hashlib.sha256(
-            f"{_VERSION} {ground.digest} {files} {manifest.evidence_for(view=True)}".encode()
-        ).hexdigest()
+        weights = manifest.evidence_for(view=False), manifest.evidence_for(view=True)
+        key = hashlib.sha256(f"{_VERSION} {ground.digest} {files} {weights}".encode()).hexdigest()
         if key != self.key:
             # Links depend on the photographs alone.
             self.key, self.evidence = key, {}
@@ -156,7 +155,7 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photogra
     Returns:
         `pose`, `position_m`, `room`, `hypothesis` and `log_likelihood` of the states that are kept;
         `rooms` (r,), the log mean likelihood of every room's poses under all headings;
-        `room_types` (r,), the log likelihood of the type of every room, over that of a room of unknown type;
+        `room_types` (r,), the log likelihood of the type of every room by the encoder's own prediction;
         `heights` (j,), the log evidence of each height offset.
     """
     plan, poses = searched.plan, searched.poses
@@ -188,7 +187,7 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photogra
         "hypothesis": hypothesis.astype(np.uint8),
         "log_likelihood": best.ravel()[kept].astype(np.float32),
         "rooms": _room_means(best, poses.room_index, len(plan.rooms)).astype(np.float32),
-        "room_types": _room_types(plan, query, weights).astype(np.float32),
+        "room_types": _by_type(plan, query.room_type, weights.room_type * weights.temperature),
         "heights": heights.astype(np.float32),
     }
 
@@ -231,19 +230,22 @@ def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], room
     return np.concatenate(parts)
 
 
-def _room_types(plan: FloorPlan, query: Query, weights: MatchingWeights) -> Float[np.ndarray, "r"]:
+def room_types(
+    plan: FloorPlan, encoder: PhotographEncoder, photograph: Photograph, evidence: Arrays
+) -> Float[np.ndarray, "r"]:
     """Return the log likelihood of every room's type, over that of a room of unknown type.
 
-    As in the matching cost, recognised objects replace the encoder's own prediction.
+    As in the matching cost, recognised objects replace the encoder's own prediction, which `evidence` has.
     """
-    if query.objects is not None:
-        predicted, weight = query.objects.room_type, 1.0
-    elif query.room_type is not None:
-        predicted, weight = query.room_type, weights.room_type * weights.temperature
-    else:
-        return np.zeros(len(plan.rooms))
+    objects = encoder.seen_objects([(photograph, 0.0)])
+    return evidence["room_types"] if objects is None else _by_type(plan, objects.room_type, 1.0)
+
+
+def _by_type(plan: FloorPlan, predicted: PredictedRoomType | None, weight: float) -> Float[np.ndarray, "r"]:
+    if predicted is None:
+        return np.zeros(len(plan.rooms), np.float32)
     loss = room_type_losses(predicted, _CONFIG.floor)
-    return weight * (loss[0] - losses_of_rooms(loss, plan.type_shares))
+    return np.float32(weight) * (loss[0] - losses_of_rooms(loss, plan.type_shares)).astype(np.float32)
 
 
 def _height_costs(

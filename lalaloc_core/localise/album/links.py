@@ -30,9 +30,9 @@ _CERTAIN_MATCHES = 24
 # Share of the pairs of one room that are among the most similar ones, and limits of similarity and log odds.
 _FOUND, _ALIKE, _UNLIKE = 0.65, 0.4, 0.25
 _COLOUR_ODDS = (-2.0, 3.0)
-# Each photograph of a room has pairs with all others, which are no independent signs: weight for up to so many
-# photographs of a room on average; with more, the weight of all pairs of a photograph together stays the same.
-_WEIGHT, _FEW = 0.25, 3.0
+# Photographs of a room on average beyond which pairs count less, so that those of a photograph have the same weight
+# together.
+_FEW = 3.0
 # Matches of a pair, and turn (radians; NaN if none was found).
 Found = tuple[int, float]
 
@@ -66,9 +66,12 @@ def find_links(
 
 
 def pair_odds(
-    photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int], Found], rooms: int
+    photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int], Found], rooms: int, weight: float
 ) -> Float[np.ndarray, "n n"]:
-    """Return the log odds that two photographs are of one of some rooms, symmetric, with zeros on the diagonal."""
+    """Return the log odds that two photographs are of one of some rooms, symmetric, with zeros on the diagonal.
+
+    They count by a weight, since pairs are no independent signs.
+    """
     count = len(photographs)
     total = _colour_odds(photographs)
     for (first, second), (matches, turn) in links.items():
@@ -76,7 +79,7 @@ def pair_odds(
         total[first, second] += odds
         total[second, first] += odds
     total[np.arange(count), np.arange(count)] = 0.0
-    return _WEIGHT * min(_FEW * rooms / count, 1.0) * total
+    return weight * min(_FEW * rooms / count, 1.0) * total
 
 
 def is_one_place(found: Found) -> bool:

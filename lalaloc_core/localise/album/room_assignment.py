@@ -70,7 +70,7 @@ class RoomEvidence:
     follows: Bool[np.ndarray, "n"]
     pairs: Float[np.ndarray, "n n"]
     expected: Float[np.ndarray, "q"] | None
-    tightness: float = 1.0
+    crowding: float = 1.0
     storeys: tuple[Int[np.ndarray, "_"], ...] = ()
 
 
@@ -120,7 +120,7 @@ class _Chains:
         self._walk = np.zeros((self._rooms, self._rooms)) if evidence.walk is None else evidence.walk
         self._follows = evidence.follows
         self._expected = np.zeros(self._rooms - 1) if evidence.expected is None else evidence.expected
-        self._tightness = 0.0 if evidence.expected is None else 0.5 * evidence.tightness
+        self._crowding = 0.0 if evidence.expected is None else 0.5 * evidence.crowding
         # Log probability of the photographs that are of none of the rooms, by their number.
         away, count = np.arange(len(evidence.alone) + 1), len(evidence.alone)
         self._away = betaln(_AWAY[0] + away, _AWAY[1] + count - away) - betaln(*_AWAY)
@@ -155,14 +155,14 @@ class _Chains:
         """Return the log prior of numbers of photographs."""
         inside = counts[:, :-1]
         expected = inside.sum(axis=1, keepdims=True) * self._expected
-        unusual = self._tightness * np.square(inside - expected) / (expected + 1.0)
+        unusual = self._crowding * np.square(inside - expected) / (expected + 1.0)
         return self._away[counts[:, -1].astype(int)] - unusual.sum(axis=1)
 
     def _prior_with(self, counts: Float[np.ndarray, "c r"], more: Float[np.ndarray, "#c"]) -> Float[np.ndarray, "c r"]:
         """Return the log prior with more photographs in each of the rooms."""
         inside, away = counts[:, :-1], counts[:, -1].astype(int)
         expected = (inside.sum(axis=1) + more)[:, None] * self._expected
-        weight, off = self._tightness / (expected + 1.0), inside - expected
+        weight, off = self._crowding / (expected + 1.0), inside - expected
         found = np.empty(counts.shape)
         found[:, :-1] = -weight * more[:, None] * (2.0 * off + more[:, None])
         found[:, :-1] += (self._away[away] - (weight * np.square(off)).sum(axis=1))[:, None]

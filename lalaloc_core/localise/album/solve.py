@@ -22,6 +22,7 @@ from lalaloc_core.localise.album.evidence import (
     AlbumMemory,
     SearchedPlan,
     camera_height,
+    room_types,
     shared_cameras,
     single_evidence,
 )
@@ -46,17 +47,15 @@ MAX_POSES, MAX_ROOMS = 65_536, 1000
 # Pins whose room is right with at least this probability are sure.
 SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
-# Share of photographs whose walls and openings are misread, as if so many had been seen before, and share beyond which
-# an album does not fit its plan.
-_MISREAD, _SEEN_BEFORE, _MISFIT, _ROUNDS = 0.2, 10.0, 0.5, 20
+# The usual share of misread photographs counts like so many photographs; albums with more than the limit do not fit
+# their plan; and rounds of expectation maximisation.
+_SEEN_BEFORE, _MISFIT, _ROUNDS = 10.0, 0.5, 20
 _MISFIT_WARNING = (
     "the photographs fit this plan badly: walls and openings of {:.0f} % of them agree with it no better than with "
     "other homes, so none is sure; check that it is the plan of this home, its scale, and that it draws the doors and "
     "windows"
 )
 _CERTAIN = 1e4
-# How much the number of photographs of a room keeps to what its size lets expect.
-_TIGHTNESS = 2.5
 
 
 def solve_album(
@@ -92,8 +91,9 @@ def solve_album(
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
-    misread = misread_share([state.rooms / state.photographs for state in states])
-    share = _room_shares(ground, ordered, memory, states, links, constraints, walk, misread, pause)
+    usual = encoder.manifest.album.misread
+    misread = misread_share([state.rooms / state.photographs for state in states], usual)
+    share = _room_shares(ground, encoder, ordered, memory, states, links, constraints, walk, misread, pause)
     misfit = () if misread <= _MISFIT else (_MISFIT_WARNING.format(100.0 * misread),)
     pins = {
         each.id: _pin(ground, each, state, row, constraints.get(each.id), fits=not misfit)
@@ -114,17 +114,17 @@ def solve_album(
     )
 
 
-def misread_share(rooms: Sequence[Float[np.ndarray, "r"]]) -> float:
+def misread_share(rooms: Sequence[Float[np.ndarray, "r"]], usual: float) -> float:
     """Return the share of photographs whose walls and openings fit the plan no better than other homes.
 
-    It is found by expectation maximisation under a beta prior, from the log likelihood of every room for each
-    photograph (`States.rooms`): how well plans are drawn and photographs are read differs between homes.
+    It is found by expectation maximisation, with a prior of its usual value, from the log likelihood of every room for
+    each photograph (`States.rooms`): how well plans are drawn and photographs are read differs between homes.
     """
     ratio = np.array([np.logaddexp.reduce(each) - math.log(len(each)) for each in rooms])
-    share = _MISREAD
+    share = usual
     for _ in range(_ROUNDS):
         misread = 1.0 / (1.0 + np.exp(np.clip(math.log1p(-share) - math.log(share) + ratio, -50.0, 50.0)))
-        share = (float(misread.sum()) + _SEEN_BEFORE * _MISREAD) / (len(ratio) + _SEEN_BEFORE)
+        share = (float(misread.sum()) + _SEEN_BEFORE * usual) / (len(ratio) + _SEEN_BEFORE)
     return share
 
 
@@ -183,6 +183,7 @@ def _states(
 
 def _room_shares(
     ground: AlbumGround,
+    encoder: PhotographEncoder,
     photographs: Sequence[AlbumPhotograph],
     memory: AlbumMemory,
     states: Sequence[States],
@@ -193,10 +194,11 @@ def _room_shares(
     pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
     """Return the probability of every room for every photograph; the last is none of the rooms."""
-    rooms = len(ground.plan.rooms)
+    rooms, weights = len(ground.plan.rooms), encoder.manifest.album
     alone = np.empty((len(photographs), rooms + 1))
     for number, (each, state) in enumerate(zip(photographs, states, strict=True)):
-        alone[number, :rooms] = state.evidence(misread) + memory.evidence[each.id]["room_types"]
+        types = room_types(ground.plan, encoder, each.photograph, memory.evidence[each.id])
+        alone[number, :rooms] = state.evidence(misread) + types
         # Half of the photographs of none of the rooms are taken outside.
         alone[number, rooms] = float(np.logaddexp(0.0, _outside(each))) - math.log(2.0)
         if each.id in constraints:
@@ -210,9 +212,9 @@ def _room_shares(
         alone=alone[order],
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
-        pairs=pair_odds(photographs, links, rooms)[np.ix_(order, order)],
+        pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],
         expected=expected_photographs(ground, len(photographs)),
-        tightness=_TIGHTNESS,
+        crowding=weights.crowding,
         storeys=storeys_of(ground),
     )
     share = np.empty(alone.shape)

@@ -20,7 +20,7 @@ from lalaloc_core.localise.encode.view_encoder import (
     VIEW_OUTPUTS,
     ObjectEncoder,
     ViewEncoder,
-    seen_objects,
+    objects_of_views,
 )
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
@@ -91,7 +91,7 @@ class PhotographEncoder:
         assert self._views is not None
         turned = [(photograph, 0.0), *others]
         helper = None if photograph.features is not None or self._objects is None else self.layouts.helper()
-        beside = None if helper is None else helper.submit(self._seen_objects, turned)
+        beside = None if helper is None else helper.submit(self.seen_objects, turned)
         if photograph.features is None:
             patches = self._patches(turned)
             outputs = self._views.outputs([patch.rgba for patch, _ in patches], height_m)
@@ -103,7 +103,7 @@ class PhotographEncoder:
         query = self._views.query_of_outputs(
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
-        objects = self._seen_objects(turned) if beside is None else beside.result()
+        objects = self.seen_objects(turned) if beside is None else beside.result()
         directions = tuple(
             WallDirection(view.wall_direction.value + turn, view.wall_direction.sd)
             for view, turn in turned
@@ -146,7 +146,7 @@ class PhotographEncoder:
             (replace(patch, azimuth_rad=azimuth), tilt) for (patch, azimuth), tilt in zip(placed, tilts, strict=True)
         ]
 
-    def _seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
+    def seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
         """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
         if self._objects is None:
             return None
@@ -158,7 +158,7 @@ class PhotographEncoder:
             if not outputs.keys() >= set(OBJECT_OUTPUTS):
                 return None
             views.append((outputs["object_probability"], outputs["object_azimuth"] + turn))
-        return seen_objects(self.manifest.objects, views)
+        return objects_of_views(self.manifest.objects, views)
 
     def check(self, photograph: Photograph) -> None:
         """Refuse a photograph that the model cannot encode.

@@ -171,7 +171,7 @@ class ObjectEncoder:
         self._session.run(["probability"], {"image": image})
 
 
-def seen_objects(
+def objects_of_views(
     manifest: ObjectsManifest, views: Sequence[tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]]
 ) -> SeenObjects:
     """Return what the photographs of one spot show.
@@ -180,10 +180,12 @@ def seen_objects(
     of the first one.
     """
     probability = np.stack([share for share, _ in views])
-    score = probability.mean(axis=0) @ np.array(manifest.shares) + manifest.floor
+    mean = probability.mean(axis=0)
+    weight = manifest.weight * min(float(mean.sum()), 1.0) ** manifest.recognition
+    log = weight * np.log(mean @ np.array(manifest.shares) + manifest.floor)
     # Objects are never those of the unknown type.
-    score[0] = _NEVER
-    room_type = PredictedRoomType(np.log(score / score.sum()), np.full(len(score), 1.0 / (len(score) - 1)))
+    log[0] = math.log(_NEVER) + log[1:].max()
+    room_type = PredictedRoomType(log - np.logaddexp.reduce(log), np.full(len(log), 1.0 / (len(log) - 1)))
     best = probability.argmax(axis=0)
     named = [number for number in np.argsort(-probability.max(axis=0)) if probability[best[number], number] >= _LEAST]
     objects = tuple(

@@ -16,6 +16,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.data.views import cut_view, tilt_by_hand
+from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
 from lalaloc_core.learn.synth.homes.plans import Home, home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import Window
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, POSE_MARGIN_M, Shot
@@ -58,9 +59,16 @@ class TakenAlbum(NamedTuple):
 
 
 def taken_album(
-    split: Split, index: int, count: int, *, spheres: bool = False, textures: Path | None = None, seed: int = 0
+    split: Split,
+    index: int,
+    count: int,
+    *,
+    spheres: bool = False,
+    furniture: FurnitureLevel = "full",
+    textures: Path | None = None,
+    seed: int = 0,
 ) -> TakenAlbum:
-    """Return an album of one furnished home of a split."""
+    """Return an album of one home of a split."""
     number = SPLIT_NUMBERS[split]
     home, rng = home_of(number, seed, index)
     renderers = split_renderer_cache(number, seed, textures)
@@ -77,7 +85,7 @@ def taken_album(
             room_index=spot.room_index,
             heading=spot.heading % TWO_PI,
             camera_height_m=min(height_m + float(rng.normal(0.0, _HAND_SD_M)), lowest_m),
-            furniture="full",
+            furniture=furniture,
             seed=look,
             lighting="raw",
         )
