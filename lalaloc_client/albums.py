@@ -54,6 +54,7 @@ class Pin:
 
     Attributes:
         state: `sure`, `uncertain`, `set_aside` or `corrected`.
+        confidence: probability that the room is right; services call it `room_confidence` as well.
         within_1m: probability that the position is right within 1 m.
         suggestions: up to five places, the most probable first.
         moved: change by the latest revision of the plan; None without one.

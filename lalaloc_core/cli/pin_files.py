@@ -33,6 +33,8 @@ _COLUMNS: Mapping[str, Callable[[dict[str, Any]], object]] = {
     "confidence": lambda entry: f"{entry['confidence']:.4f}",
     "state": lambda entry: entry["state"],
     "reason": lambda entry: no_formula(entry["reason"]),
+    "room_confidence": lambda entry: f"{entry['room_confidence']:.4f}",
+    "within_1m": lambda entry: f"{entry['within_1m']:.4f}",
 }
 COPIES = "photographs"
 

@@ -82,7 +82,7 @@ def _fault(field: str, message: str) -> InvalidRequestError:
 COLOURS = {"sure": "#007a5a", "corrected": "#0067a5", "uncertain": "#c84f00"}
 _COLUMNS: tuple[str, ...] = (
     "number", "name", "taken_at", "state", "confidence", "floorplan_id", "level", "room_id", "room", "x_m", "y_m",
-    "heading_deg", "latitude", "longitude", "reason",
+    "heading_deg", "latitude", "longitude", "reason", "room_confidence", "within_1m",
 )  # fmt: skip
 # Radius of a pin, and length of its arrow, as shares of the drawing's size.
 _RADIUS, _ARROW = 0.016, 2.6
@@ -135,7 +135,7 @@ def _row(photograph: AlbumPhotographAnswer) -> dict[str, Any]:
     row = {"number": photograph.number, "name": photograph.name, "taken_at": photograph.view.taken_at}
     if pin is None:
         return row
-    row |= {"state": pin.state, "confidence": pin.confidence, "reason": pin.reason}
+    row |= {key: getattr(pin, key) for key in ("state", "room_confidence", "confidence", "within_1m", "reason")}
     if (place := pin.place) is not None:
         row |= {key: getattr(place, key) for key in ("floorplan_id", "level", "room_id", "room", "heading_deg")}
         row |= {"x_m": place.position.x_m, "y_m": place.position.y_m}

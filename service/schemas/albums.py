@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
 
 from lalaloc_core.answer_numbers import HEADING_MEANING, Degrees, HeadingDeg, Metres, Score, Share, SignedDegrees
 from lalaloc_core.localise.answers.documents import Position
@@ -120,7 +120,12 @@ class PinAnswer(ResponseModel):
         "the rooms, for `reason`; `corrected`: a person stated it."
     )
     place: PinPlace | None = Field(description="Null for a photograph that is set aside.")
-    confidence: Share = Field(description="Probability that the room is right; 1 for a corrected pin.")
+    room_confidence: Share = Field(
+        # Stored pins of earlier versions have the other name alone.
+        validation_alias=AliasChoices("room_confidence", "confidence"),
+        description="Probability that the room is right; 1 for a corrected pin.",
+    )
+    confidence: Share = Field(description="The same as `room_confidence`, its earlier name.")
     within_1m: Share = Field(description="Probability that the position is right within 1 m.")
     reason: str = Field(description="Reason why the pin is uncertain or set aside; else empty.")
     rooms: list[RoomProbability] = Field(description="Probable rooms, the most probable first.")

@@ -300,7 +300,8 @@ def _exchanges(evidence: RoomEvidence) -> list[Int[np.ndarray, "r"]]:
 def walk_of(ground: AlbumGround) -> Float[np.ndarray, "s s"]:
     """Return log probabilities of the next photograph's room (columns) by that of a photograph.
 
-    The last row and column are none of the rooms, which order tells nothing about.
+    The last column is none of the rooms, which order does not change; after it, all rooms are as likely as those of a
+    walk are on average, so that it costs nothing to leave a photograph out of the walk.
     """
     near = _joined(ground)
     rooms = len(near)
@@ -313,9 +314,11 @@ def walk_of(ground: AlbumGround) -> Float[np.ndarray, "s s"]:
     mass = total.sum(axis=1, keepdims=True)
     # A room without doors leads anywhere.
     total = np.where(mass > 0.0, total / np.maximum(mass, 1e-9), 1.0 / rooms)
-    walk = np.full((rooms + 1, rooms + 1), 1.0 / rooms)
-    walk[:rooms, :rooms] = _STAY * np.eye(rooms) + (1.0 - _STAY) * ((1.0 - _ANYWHERE) * total + _ANYWHERE / rooms)
-    return np.log(walk)
+    inside = _STAY * np.eye(rooms) + (1.0 - _STAY) * ((1.0 - _ANYWHERE) * total + _ANYWHERE / rooms)
+    walk = np.zeros((rooms + 1, rooms + 1))
+    walk[:rooms, :rooms] = np.log(inside)
+    walk[rooms, :rooms] = (inside * walk[:rooms, :rooms]).sum(axis=1).mean()
+    return walk
 
 
 def storeys_of(ground: AlbumGround) -> tuple[Int[np.ndarray, "_"], ...]:

@@ -208,8 +208,11 @@ def _room_shares(
     alone = np.maximum(alone, -2.0 * _CERTAIN)
     order = np.arange(len(photographs)) if walk is None else walk.order
     follows = np.zeros(len(photographs), bool) if walk is None else walk.follows
+    alone = alone[order]
+    # Without a photograph before it, each is of any room alike.
+    alone[~follows, :rooms] -= math.log(rooms)
     evidence = RoomEvidence(
-        alone=alone[order],
+        alone=alone,
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
         pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],

@@ -97,6 +97,8 @@ def pin_document(pin: Pin) -> dict[str, Any]:
     return {
         "place": None if pin.pose is None else _place(pin.pose),
         "state": pin.state,
+        "room_confidence": _share(pin.confidence),
+        # Its earlier name.
         "confidence": _share(pin.confidence),
         "within_1m": _share(pin.within_1m),
         "reason": pin.reason,
