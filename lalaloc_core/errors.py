@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 # Largest number of levels named in a message.
 _SHOWN_LEVELS = 12
@@ -12,6 +12,16 @@ _SHOWN_LEVELS = 12
 
 class LaLaLocError(Exception):
     """Base of every error this project raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Support pickling, so that errors of worker processes keep their attributes, whatever their constructor."""
+        return _unpickled, (type(self), self.args, vars(self))
+
+
+def _unpickled(kind: type[LaLaLocError], arguments: tuple[Any, ...], attributes: dict[str, Any]) -> LaLaLocError:
+    error = kind.__new__(kind, *arguments)
+    vars(error).update(attributes)
+    return error
 
 
 class InvalidInputError(LaLaLocError, ValueError):
@@ -133,10 +143,6 @@ class DatasetError(InvalidInputError):
         location += [f"room '{room}'"] if room is not None else []
         location += [f"'{path}'"] if path is not None else []
         super().__init__(f"{', '.join(location)}: {reason}" if location else reason)
-
-    def __reduce__(self) -> tuple[Callable[..., DatasetError], tuple[object, ...]]:
-        """Support pickling, so that errors of worker processes keep their attributes."""
-        return partial(DatasetError, scene=self.scene, room=self.room, path=self.path), (self.reason,)
 
 
 class ConfigError(LaLaLocError, ValueError):

@@ -1,7 +1,7 @@
 """Program of a decoding worker process, which opens uploaded photographs.
 
-It turns an uploaded file into a `Photograph`, a picture to be shown, or a `DecodeRefusal`. It also finds the angles
-between photographs and rasterises drawings, which keep the interpreter busy for as long.
+It turns an uploaded file into a `Photograph`, or a picture to be shown. It also finds the angles between photographs
+and rasterises drawings, which keep the interpreter busy for as long.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from lalaloc_core.draw.canvas import rasterise
-from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.film import Film, FilmLimits, read_film
 from lalaloc_core.photograph.photograph import Purpose, open_picture, warm_up
@@ -83,16 +82,8 @@ class RasteriseJob:
     svg: str
 
 
-@dataclass(frozen=True)
-class DecodeRefusal:
-    """Reason why a picture is not a usable photograph, or a film not a usable one."""
-
-    reason: str
-    is_film: bool = False
-
-
 Job = DecodeJob | FilmJob | TurnJob | ShowJob | RasteriseJob
-Result = Photograph | Film | LevelledTurn | np.ndarray | DecodeRefusal | bytes
+Result = Photograph | Film | LevelledTurn | np.ndarray | bytes
 
 
 def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
@@ -115,21 +106,18 @@ def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Ca
         if isinstance(job, TurnJob):
             return LevelledTurn(*level_turn(job.photographs, sizes.patch))
         assert isinstance(job.content, bytes)
-        try:
-            if isinstance(job, FilmJob):
-                return read_film(job.content, stated=job.stated, patch_size=sizes.patch, limits=sizes.film)
-            if isinstance(job, DecodeJob):
-                return open_photograph(
-                    job.content,
-                    sphere_size=sizes.sphere,
-                    stated=job.stated,
-                    patch_size=sizes.patch,
-                    limits=limits,
-                    purpose=job.purpose,
-                )
-            return _shown(job, job.content, limits)
-        except (InvalidPhotographError, InvalidFilmError) as error:
-            return DecodeRefusal(str(error), isinstance(error, InvalidFilmError))
+        if isinstance(job, FilmJob):
+            return read_film(job.content, stated=job.stated, patch_size=sizes.patch, limits=sizes.film)
+        if isinstance(job, DecodeJob):
+            return open_photograph(
+                job.content,
+                sphere_size=sizes.sphere,
+                stated=job.stated,
+                patch_size=sizes.patch,
+                limits=limits,
+                purpose=job.purpose,
+            )
+        return _shown(job, job.content, limits)
 
     return work
 

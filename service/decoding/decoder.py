@@ -24,7 +24,6 @@ from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import (
     DecodeJob,
-    DecodeRefusal,
     DecodeSizes,
     FilmJob,
     Job,
@@ -159,13 +158,11 @@ class Decoder:
     async def _run_job(self, job: Job, deadline: float, client: str) -> Result:
         try:
             pool = self._films if isinstance(job, FilmJob) else self._pool
-            result = await pool.run_job(job, max(deadline - monotonic(), 0.0), client)
+            return await pool.run_job(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
             raise self._error(error, job) from error
-        if isinstance(result, DecodeRefusal):
-            refused = InvalidFilmError if result.is_film else InvalidPhotographError
-            raise refused(f"{result.reason}; see {_HELP}")
-        return result
+        except (InvalidPhotographError, InvalidFilmError) as error:
+            raise type(error)(f"{error}; see {_HELP}") from error
 
     def close(self) -> None:
         """End all workers and wait for them."""

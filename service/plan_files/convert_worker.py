@@ -1,8 +1,7 @@
 """Program of a conversion worker process, the only part of the service that reads drawings and models.
 
-It turns an `ImportJob` into plans, a `RenditionJob` into a `Rendition`, a `ParseJob` into a `PackedPlan`, and
-each into a `ConversionRefusal` if the file cannot be read or written. The libraries of a format are loaded with its
-first file.
+It turns an `ImportJob` into plans, a `RenditionJob` into a `Rendition`, and a `ParseJob` into a `PackedPlan`. The
+libraries of a format are loaded with its first file.
 """
 
 from __future__ import annotations
@@ -10,12 +9,11 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import Literal
 
-from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import (
     ImportedPlan,
     ImportLimits,
@@ -76,43 +74,8 @@ class Imported:
     description: Rendition | None
 
 
-@dataclass(frozen=True)
-class ConversionRefusal:
-    """Reason why a file cannot be read as a plan, or a plan cannot be written.
-
-    Attributes:
-        names: names of levels, or purpose and name of a missing extra.
-    """
-
-    reason: str
-    kind: Literal["invalid", "levels", "extra", "damaged"] = "invalid"
-    room: str | None = None
-    names: tuple[str, ...] = field(default=())
-
-    @classmethod
-    def of(cls, error: InvalidFloorPlanError | MissingExtraError | DamagedDataError) -> ConversionRefusal:
-        """Return the refusal for an error."""
-        if isinstance(error, DamagedDataError):
-            return cls(str(error), "damaged")
-        if isinstance(error, MissingExtraError):
-            return cls(str(error), "extra", names=(error.action, error.extra))
-        if isinstance(error, SeveralLevelsError):
-            return cls(error.reason, "levels", names=error.levels)
-        return cls(error.reason, room=error.room)
-
-    def error(self) -> InvalidFloorPlanError | MissingExtraError | DamagedDataError:
-        """Return the error for the refusal."""
-        if self.kind == "damaged":
-            return DamagedDataError(self.reason)
-        if self.kind == "extra":
-            return MissingExtraError(*self.names)
-        if self.kind == "levels":
-            return SeveralLevelsError(self.names)
-        return InvalidFloorPlanError(self.reason, room=self.room)
-
-
 ConversionJob = ImportJob | RenditionJob | ParseJob
-ConversionResult = tuple[Imported, ...] | Rendition | PackedPlan | ConversionRefusal
+ConversionResult = tuple[Imported, ...] | Rendition | PackedPlan
 
 
 def report_of(imported: ImportedPlan) -> str:
@@ -153,13 +116,11 @@ def _converting(limits: ImportLimits, connection: Connection) -> Callable[[Conve
                     return make_rendition(job)
                 case ParseJob():
                     return _parse(job)
-        except (InvalidFloorPlanError, MissingExtraError, DamagedDataError) as error:
-            return ConversionRefusal.of(error)
         except MemoryError:
-            return ConversionRefusal(
+            raise InvalidFloorPlanError(
                 "reading the file exceeds the memory limit (LALALOC_IMPORT_MEMORY_BYTES): simplify the file, or "
                 "raise the limit"
-            )
+            ) from None
 
     return convert
 

@@ -17,11 +17,16 @@ from typing import NoReturn
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, OnStep
-from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
+from service.errors import (
+    ConverterNotReadyError,
+    DamagedDataError,
+    DeadlineExceededError,
+    OverloadedError,
+    StoppingError,
+)
 from service.plan_documents import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob, RenditionKind
 from service.plan_files.convert_worker import (
     ConversionJob,
-    ConversionRefusal,
     ConversionResult,
     Imported,
     ImportJob,
@@ -94,8 +99,6 @@ class Converter:
             result = self._run(job, limit_s, client, on_step)
         except JobLostError as error:
             self._raise_lost(error)
-        if isinstance(result, ConversionRefusal):
-            raise result.error()
         assert isinstance(result, tuple)
         return result
 
@@ -107,7 +110,10 @@ class Converter:
             result = self._run(ParseJob(document), _PARSE_S)
         except JobLostError:
             return document.plan()
-        return result.plan() if isinstance(result, PackedPlan) else None
+        except DamagedDataError:
+            return None
+        assert isinstance(result, PackedPlan)
+        return result.plan()
 
     def begin_rendition(self, job: RenditionJob, client: str) -> Future[ConversionResult]:
         """Queue a file that is made from a stored plan. Blocks while the plan is copied."""
@@ -129,8 +135,6 @@ class Converter:
             if predicts and lost.reason not in ("not-ready", "closing"):
                 raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
             self._raise_lost(lost)
-        if isinstance(result, ConversionRefusal):
-            raise result.error()
         assert isinstance(result, Rendition)
         return result
 

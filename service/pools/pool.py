@@ -119,8 +119,8 @@ class WorkerPool(Generic[Job, Result]):
 
         `on_news` is called with what the worker tells meanwhile, see `PendingJob`.
 
-        The future has the result or a `JobLostError`, and can be done later than the deadline. A job that cannot be run
-        in time raises that error.
+        The future has the result, the error of the job, or a `JobLostError`, and can be done later than the deadline. A
+        job that cannot be run in time raises that error.
         """
         content = _Parts()
         pickle.Pickler(content, protocol=pickle.HIGHEST_PROTOCOL).dump(job)

@@ -16,6 +16,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
 
+from lalaloc_core.errors import LaLaLocError
 from service.pools.job_queue import JobQueue, PendingJob
 from service.telemetry import LOGGER_NAME
 from service.workers.process import JobNews, JobResult, Ready, WorkerFailure
@@ -231,7 +232,8 @@ class Supervisor:
 
     def _settle(self, pending: PendingJob, answer: object) -> None:
         if isinstance(answer, JobResult):
-            pending.future.set_result(answer.value)
+            is_error = isinstance(answer.value, LaLaLocError)
+            (pending.future.set_exception if is_error else pending.future.set_result)(answer.value)
             return
         reason = answer.reason if isinstance(answer, WorkerFailure) else f"unexpected message {type(answer).__name__}"
         fields = {"pool": self._spec.name, "worker": self._index, "reason": reason}
