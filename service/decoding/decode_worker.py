@@ -1,7 +1,6 @@
 """Program of a decoding worker process, which opens uploaded photographs.
 
-It turns an uploaded file into a `Photograph`, or a picture to be shown. It also finds the angles between photographs
-and rasterises drawings, which keep the interpreter busy for as long.
+It also finds the angles between photographs and rasterises drawings, which keep the interpreter busy for as long.
 """
 
 from __future__ import annotations
@@ -9,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,112 +20,67 @@ from lalaloc_core.photograph.photograph import Purpose, open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import level_turn
-from service.uploaded_file import UploadedFile
 from service.workers.process import limit_memory, serve_jobs
 
 
+class DecodeJob(NamedTuple):
+    """Method of `Decoding` to call, and its arguments; uploaded files arrive as bytes."""
+
+    task: Literal["photograph", "film", "turn", "picture", "drawing"]
+    arguments: tuple[Any, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
-class DecodeSizes:
-    """Sizes of decoded photographs: height and width (pixels) of full spheres, patches of others; limits of films."""
+class Decoding:
+    """What a worker does.
+
+    Attributes:
+        sphere, patch: height and width (pixels) of full spheres, and patches of other photographs.
+    """
 
     sphere: tuple[int, int]
     patch: PatchSize
-    film: FilmLimits
+    limits: PhotographLimits
+    film_limits: FilmLimits
+
+    def photograph(self, content: bytes, stated: StatedCamera, purpose: Purpose) -> Photograph:
+        """Read a photograph for the encoders."""
+        return open_photograph(
+            content, sphere_size=self.sphere, stated=stated, patch_size=self.patch, limits=self.limits, purpose=purpose
+        )
+
+    def film(self, content: bytes, stated: StatedCamera) -> Film:
+        """Read a film of a turn."""
+        return read_film(content, stated=stated, patch_size=self.patch, limits=self.film_limits)
+
+    def turn(self, photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[TurnAngles]]:
+        """Return photographs of one spot with their patches, and their angles to each other."""
+        return level_turn(photographs, self.patch)
+
+    def picture(self, content: bytes, stated: StatedCamera, is_sphere: bool, max_size: tuple[int, int]) -> np.ndarray:
+        """Decode a photograph as a picture to be shown within a width and height, a full sphere levelled."""
+        if not is_sphere:
+            return open_picture(content, max_size=max_size, limits=self.limits)
+        view = open_photograph(content, sphere_size=max_size[::-1], stated=stated, limits=self.limits)
+        assert view.sphere is not None
+        return view.sphere
+
+    def drawing(self, svg: str) -> bytes:
+        """Turn a drawing into a PNG file."""
+        return rasterise(svg)
 
 
-@dataclass(frozen=True)
-class DecodeJob:
-    """Uploaded photograph to read for the encoders; the worker gets it as bytes."""
-
-    content: bytes | UploadedFile
-    stated: StatedCamera
-    purpose: Purpose = "single"
-
-
-@dataclass(frozen=True)
-class FilmJob:
-    """Uploaded film of a turn; the worker gets it as bytes."""
-
-    content: bytes | UploadedFile
-    stated: StatedCamera
-
-
-@dataclass(frozen=True)
-class TurnJob:
-    """Photographs of one spot, decoded for a turn, whose angles to each other are to be found."""
-
-    photographs: Sequence[Photograph]
-
-
-@dataclass(frozen=True)
-class LevelledTurn:
-    """Photographs of one spot with their patches, and their angles."""
-
-    photographs: list[Photograph]
-    angles: list[TurnAngles]
-
-
-@dataclass(frozen=True)
-class ShowJob:
-    """Uploaded photograph to decode as a picture to be shown, a full sphere levelled; sizes are width and height."""
-
-    content: bytes | UploadedFile
-    stated: StatedCamera
-    is_sphere: bool
-    max_size: tuple[int, int]
-
-
-@dataclass(frozen=True)
-class RasteriseJob:
-    """Drawing to turn into a PNG file."""
-
-    svg: str
-
-
-Job = DecodeJob | FilmJob | TurnJob | ShowJob | RasteriseJob
-Result = Photograph | Film | LevelledTurn | np.ndarray | bytes
-
-
-def run_decoder(connection: Connection, sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> None:
-    """Run decoding and rasterising jobs until the pipe closes.
+def run_decoder(connection: Connection, decoding: Decoding, memory_bytes: int) -> None:
+    """Run jobs until the pipe closes.
 
     `memory_bytes` limits decoding, besides what the process uses before its first picture.
     """
-    serve_jobs(connection, lambda: _load(sizes, limits, memory_bytes))
+    serve_jobs(connection, lambda: _load(decoding, memory_bytes))
 
 
-def _load(sizes: DecodeSizes, limits: PhotographLimits, memory_bytes: int) -> Callable[[Job], Result]:
+def _load(decoding: Decoding, memory_bytes: int) -> Callable[[DecodeJob], object]:
     # A worker stands for one core.
     cv2.setNumThreads(1)
-    warm_up(sphere_size=sizes.sphere, patch_size=sizes.patch)
+    warm_up(sphere_size=decoding.sphere, patch_size=decoding.patch)
     limit_memory(memory_bytes)
-
-    def work(job: Job) -> Result:
-        if isinstance(job, RasteriseJob):
-            return rasterise(job.svg)
-        if isinstance(job, TurnJob):
-            return LevelledTurn(*level_turn(job.photographs, sizes.patch))
-        assert isinstance(job.content, bytes)
-        if isinstance(job, FilmJob):
-            return read_film(job.content, stated=job.stated, patch_size=sizes.patch, limits=sizes.film)
-        if isinstance(job, DecodeJob):
-            return open_photograph(
-                job.content,
-                sphere_size=sizes.sphere,
-                stated=job.stated,
-                patch_size=sizes.patch,
-                limits=limits,
-                purpose=job.purpose,
-            )
-        return _shown(job, job.content, limits)
-
-    return work
-
-
-def _shown(job: ShowJob, content: bytes, limits: PhotographLimits) -> np.ndarray:
-    if not job.is_sphere:
-        return open_picture(content, max_size=job.max_size, limits=limits)
-    width, height = job.max_size
-    view = open_photograph(content, sphere_size=(height, width), stated=job.stated, limits=limits)
-    assert view.sphere is not None
-    return view.sphere
+    return lambda job: getattr(decoding, job.task)(*job.arguments)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from time import monotonic
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -22,18 +23,7 @@ from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from service import errors
 from service.capacity.fair_share import FairSemaphore
-from service.decoding.decode_worker import (
-    DecodeJob,
-    DecodeSizes,
-    FilmJob,
-    Job,
-    LevelledTurn,
-    RasteriseJob,
-    Result,
-    ShowJob,
-    TurnJob,
-    run_decoder,
-)
+from service.decoding.decode_worker import DecodeJob, Decoding, run_decoder
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
@@ -52,12 +42,15 @@ class Decoder:
 
     def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, cores: FairSemaphore) -> None:
         self._settings = settings
-        sizes = DecodeSizes(
-            sphere=sphere_size(manifest), patch=patch_size(manifest), film=settings.photographs.film_limits
+        decoding = Decoding(
+            sphere=sphere_size(manifest),
+            patch=patch_size(manifest),
+            limits=settings.photographs.photograph_limits,
+            film_limits=settings.photographs.film_limits,
         )
 
-        def pool(name: str, stall_s: float, workers: int, queue_limit: int) -> WorkerPool[Job, Result]:
-            arguments = sizes, settings.photographs.photograph_limits, settings.decode.memory_bytes
+        def pool(name: str, stall_s: float, workers: int, queue_limit: int) -> WorkerPool[DecodeJob, Any]:
+            arguments = decoding, settings.decode.memory_bytes
             return WorkerPool(
                 WorkerSpec(name, run_decoder, arguments, stall_s=stall_s),
                 workers=workers,
@@ -112,9 +105,7 @@ class Decoder:
         """
         if isinstance(content, Photograph):
             return content
-        result = await self._run_job(DecodeJob(content, stated, purpose), deadline, client)
-        assert isinstance(result, Photograph)
-        return result
+        return await self._run_job(DecodeJob("photograph", (content, stated, purpose)), deadline, client)
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str) -> Film:
         """Read a film of a turn; the first one starts the workers."""
@@ -122,17 +113,13 @@ class Decoder:
             if not self._films_started:
                 self._films.start()
                 self._films_started = True
-        result = await self._run_job(FilmJob(content, stated), deadline, client)
-        assert isinstance(result, Film)
-        return result
+        return await self._run_job(DecodeJob("film", (content, stated)), deadline, client)
 
     async def level_turn(
         self, photographs: Sequence[Photograph], deadline: float, client: str = ""
     ) -> tuple[list[Photograph], list[TurnAngles]]:
         """Return photographs of one spot, decoded for a turn, with the angles that their overlap tells."""
-        result = await self._run_job(TurnJob(photographs), deadline, client)
-        assert isinstance(result, LevelledTurn)
-        return result.photographs, result.angles
+        return await self._run_job(DecodeJob("turn", (photographs,)), deadline, client)
 
     async def picture(
         self,
@@ -145,19 +132,15 @@ class Decoder:
         max_size: tuple[int, int],
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Decode a photograph to show: upright within `max_size` (width, height), spheres level and of that size."""
-        result = await self._run_job(ShowJob(content, stated, is_sphere, max_size), deadline, client)
-        assert isinstance(result, np.ndarray)
-        return result
+        return await self._run_job(DecodeJob("picture", (content, stated, is_sphere, max_size)), deadline, client)
 
     async def rasterise(self, svg: str, deadline: float, client: str = "") -> bytes:
         """Return a drawing as a PNG file, by a deadline (`monotonic`)."""
-        result = await self._run_job(RasteriseJob(svg), deadline, client)
-        assert isinstance(result, bytes)
-        return result
+        return await self._run_job(DecodeJob("drawing", (svg,)), deadline, client)
 
-    async def _run_job(self, job: Job, deadline: float, client: str) -> Result:
+    async def _run_job(self, job: DecodeJob, deadline: float, client: str) -> Any:
         try:
-            pool = self._films if isinstance(job, FilmJob) else self._pool
+            pool = self._films if job.task == "film" else self._pool
             return await pool.run_job(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
             raise self._error(error, job) from error
@@ -172,14 +155,14 @@ class Decoder:
                 self._films.close()
             self._films_started = True
 
-    def _error(self, lost: JobLostError, job: Job) -> Exception:
+    def _error(self, lost: JobLostError, job: DecodeJob) -> Exception:
         """Return the service's error for a lost job."""
-        if isinstance(job, RasteriseJob) and lost.reason in ("poisoned", "fault"):
+        if job.task == "drawing" and lost.reason in ("poisoned", "fault"):
             return errors.DrawingFailedError(lost.reason)
-        if isinstance(job, RasteriseJob) and lost.reason == "stalled":
+        if job.task == "drawing" and lost.reason == "stalled":
             # Drawings have a bounded size, so the machine is slow.
             return errors.DeadlineExceededError(self._settings.decode.stall_s)
-        if isinstance(job, FilmJob) and (fault := self._film_fault(lost)) is not None:
+        if job.task == "film" and (fault := self._film_fault(lost)) is not None:
             return InvalidFilmError(fault)
         match lost.reason:
             case "poisoned":

@@ -1,6 +1,6 @@
 """Groups of settings: fields, defaults, limits and descriptions.
 
-Limits that need no setting stand beside them as constants. Units stand in the names: `_s` seconds, `_m` metres,
+Limits that need no setting stand beside them as constants; `GET /limits` describes them (`schemas/service_state.py`). Units stand in the names: `_s` seconds, `_m` metres,
 `_bytes` bytes.
 """
 
@@ -256,7 +256,6 @@ class RequestSettings(SettingGroup):
     max_waiting_queries: ClassVar[int] = 16
     # Read-only requests in progress, with their answers in memory; further ones get 503.
     max_reads: ClassVar[int] = 64
-    # Open event streams; further ones get 503.
     max_streams: ClassVar[int] = 64
     # Open connections, idle ones included; the limit of file descriptors must allow them.
     max_connections: ClassVar[int] = 1024
@@ -351,32 +350,22 @@ class PlanSettings(SettingGroup):
     # Revisions kept per floor plan; the oldest is deleted first.
     max_revisions: ClassVar[int] = 10
     max_plan_bytes: Count = Field(default=_IMPORT.max_plan_bytes, description="Size of a plan file, in any format.")
-    # Unpacked size of an archive, or of a compressed part of a plan file.
     max_unpacked_bytes: ClassVar[int] = _IMPORT.max_unpacked_bytes
-    # Drawing entities (lines, polygons, texts) of a plan file, vertices included.
     max_entities: ClassVar[int] = _IMPORT.max_entities
-    # Pixels of a floor plan picture.
     max_plan_pixels: ClassVar[int] = _IMPORT.max_plan_pixels
     max_import_s: Seconds = Field(
         default=_IMPORT.max_import_s,
         description="CPU time limit for reading a plan file. The process is replaced 10 s later. With the wait for a "
         "process, an upload can take twice this time.",
     )
-    # Rooms per floor plan.
     max_rooms: ClassVar[int] = _PLAN.max_rooms
-    # Vertices per room.
     max_vertices: ClassVar[int] = _PLAN.max_vertices_per_room
-    # Vertices of all rooms of a floor plan.
     max_plan_vertices: ClassVar[int] = _PLAN.max_plan_vertices
-    # Width or height of a floor plan.
     max_extent_m: ClassVar[float] = _PLAN.max_extent_m
-    # Floor area of all rooms of a floor plan.
     max_area_m2: ClassVar[float] = _PLAN.max_area_m2
     # Area of the bounding boxes of all rooms of a floor plan; its pose grid is laid over them.
     max_bounds_area_m2: ClassVar[float] = _PLAN.max_bounds_area_m2
-    # Doors, windows and passages of a floor plan.
     max_openings: ClassVar[int] = _PLAN.max_openings
-    # Stored venues per tenant.
     max_venues: ClassVar[int] = 1000
     max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
     max_venue_bytes: Count = Field(default=4 * 2**20, description="Size of a venue document.")
@@ -431,9 +420,7 @@ class PhotographSettings(SettingGroup):
     # Scans of a progressive JPEG; encoders write 3 to 12, and each takes as long as the picture.
     max_scans: ClassVar[int] = 20
     max_film_bytes: Count = Field(default=_FILM.max_bytes, description="Size of a film's file.")
-    # Duration of a film.
     max_film_s: ClassVar[float] = _FILM.max_s
-    # Pixels of a film: width times height, of 4K.
     max_film_pixels: ClassVar[int] = _FILM.max_pixels
     # CPU time limit (s) for decoding a film; finding its angles has 40 s more.
     max_film_cpu_s: ClassVar[float] = _FILM.max_cpu_s
