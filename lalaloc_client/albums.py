@@ -93,14 +93,6 @@ class AlbumPhotograph:
 
 
 @dataclass(frozen=True)
-class AlbumPhotographPage:
-    """One page of the photographs of an album."""
-
-    photographs: tuple[AlbumPhotograph, ...]
-    next_cursor: str | None = None
-
-
-@dataclass(frozen=True)
 class AddedPhotograph:
     """Answer to one photograph that was sent to an album.
 
@@ -157,11 +149,3 @@ class Album:
     place_revision: str | None = None
     solution: Mapping[str, Any] | None = None
     etag: str | None = None
-
-
-@dataclass(frozen=True)
-class AlbumPage:
-    """One page of a listing of albums."""
-
-    albums: tuple[Album, ...]
-    next_cursor: str | None = None

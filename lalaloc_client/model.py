@@ -100,14 +100,6 @@ class FloorPlanSummary:
 
 
 @dataclass(frozen=True)
-class FloorPlanPage:
-    """One page of a listing; `next_cursor` leads to the next page and is None on the last."""
-
-    floorplans: tuple[FloorPlanSummary, ...]
-    next_cursor: str | None = None
-
-
-@dataclass(frozen=True)
 class VenueAnchor:
     """Location of the origin of a venue's plans on Earth, WGS84; `north_deg` is the azimuth of true north in them."""
 
@@ -166,22 +158,6 @@ class Venue:
     plans_ready: int | None = None
     plans_failed: int | None = None
     etag: str | None = None
-
-
-@dataclass(frozen=True)
-class VenuePage:
-    """One page of a listing of venues."""
-
-    venues: tuple[Venue, ...]
-    next_cursor: str | None = None
-
-
-@dataclass(frozen=True)
-class VenuePlanPage:
-    """One page of the plans of a venue."""
-
-    plans: tuple[VenuePlan, ...]
-    next_cursor: str | None = None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import make_dataclass
 from functools import cache
 from typing import Any, TypeVar
 
@@ -20,6 +21,12 @@ def parse(kind: type[T], content: bytes | str, name: str = "answer") -> T:
         fault = error.errors(include_url=False)[0]
         field = ".".join([name, *map(str, fault["loc"])])
         raise MalformedAnswerError(f"{field}: {fault['msg']} (got {fault['input']!r:.100})") from error
+
+
+@cache
+def page_of(kind: type[Any], rows: str) -> Any:
+    """Return the class of a page of a listing: its rows, and `next_cursor`, which is None on the last page."""
+    return make_dataclass("Page", [(rows, tuple[kind, ...]), ("next_cursor", str | None, None)], frozen=True)
 
 
 @cache

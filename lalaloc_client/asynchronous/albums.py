@@ -10,15 +10,7 @@ from random import random
 from time import monotonic
 from typing import Any, Unpack
 
-from lalaloc_client.albums import (
-    FORMAT_MEDIA,
-    AddedPhotograph,
-    Album,
-    AlbumFormat,
-    AlbumPage,
-    AlbumPhotograph,
-    AlbumPhotographPage,
-)
+from lalaloc_client.albums import FORMAT_MEDIA, AddedPhotograph, Album, AlbumFormat, AlbumPhotograph
 from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.asynchronous.transport import AsyncTransport
 from lalaloc_client.errors import AlbumFailedError, NotReadyError
@@ -62,11 +54,9 @@ class AsyncAlbums(AsyncTransport):
         """Return an album."""
         return await self._stored(Album, Request("GET", resource_path("albums", album_id)))
 
-    async def albums(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Album]:
+    def albums(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Album]:
         """Yield the albums, newest first, page by page; with `name`, those with this text in their name."""
-        async for page in self._pages(AlbumPage, "/albums", name=name, limit=page_size):
-            for album in page.albums:
-                yield album
+        return self._listed(Album, "/albums", name=name, limit=page_size)
 
     async def delete_album(self, album_id: str, *, if_match: str | None = None) -> None:
         """Delete an album with its photographs."""
@@ -116,12 +106,10 @@ class AsyncAlbums(AsyncTransport):
                 waited_s += wait_s
                 await sleep(wait_s)
 
-    async def album_photographs(self, album_id: str, *, page_size: int = 100) -> AsyncIterator[AlbumPhotograph]:
+    def album_photographs(self, album_id: str, *, page_size: int = 100) -> AsyncIterator[AlbumPhotograph]:
         """Yield the photographs of an album with their pins, in the order in which they were added."""
         path = f"{resource_path('albums', album_id)}/photographs"
-        async for page in self._pages(AlbumPhotographPage, path, limit=page_size):
-            for photograph in page.photographs:
-                yield photograph
+        return self._listed(AlbumPhotograph, path, limit=page_size)
 
     async def album_photograph(self, album_id: str, photograph_id: str) -> AlbumPhotograph:
         """Return a photograph of an album."""

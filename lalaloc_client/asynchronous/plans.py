@@ -17,7 +17,6 @@ from lalaloc_client.asynchronous.backend import run_blocking, sleep
 from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
 from lalaloc_client.model import (
     FloorPlan,
-    FloorPlanPage,
     FloorPlanSummary,
     ImportStep,
     Layout,
@@ -25,9 +24,7 @@ from lalaloc_client.model import (
     PlanEvent,
     Venue,
     VenueAnchor,
-    VenuePage,
     VenuePlan,
-    VenuePlanPage,
 )
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
@@ -101,11 +98,9 @@ class AsyncPlans(AsyncAlbums):
         """Return a stored plan."""
         return await self._stored(FloorPlan, Request("GET", resource_path("floorplans", floorplan_id)))
 
-    async def floorplans(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[FloorPlanSummary]:
+    def floorplans(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[FloorPlanSummary]:
         """Yield the stored plans, newest first, page by page; with `name`, those with this text in their name."""
-        async for page in self._pages(FloorPlanPage, "/floorplans", name=name, limit=page_size):
-            for plan in page.floorplans:
-                yield plan
+        return self._listed(FloorPlanSummary, "/floorplans", name=name, limit=page_size)
 
     async def delete_floorplan(self, floorplan_id: str) -> None:
         """Delete a plan and everything that was derived from it."""
@@ -335,20 +330,16 @@ class AsyncPlans(AsyncAlbums):
         """Return a stored venue."""
         return await self._stored(Venue, Request("GET", resource_path("venues", venue_id)))
 
-    async def venues(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Venue]:
+    def venues(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Venue]:
         """Yield the stored venues, newest first, page by page; with `name`, those with this text in their name."""
-        async for page in self._pages(VenuePage, "/venues", name=name, limit=page_size):
-            for venue in page.venues:
-                yield venue
+        return self._listed(Venue, "/venues", name=name, limit=page_size)
 
-    async def venue_plans(
+    def venue_plans(
         self, venue_id: str, *, level: float | None = None, page_size: int = 100
     ) -> AsyncIterator[VenuePlan]:
         """Yield the plans of a venue, or of one of its levels, from the lowest level up, page by page."""
         path = f"{resource_path('venues', venue_id)}/plans"
-        async for page in self._pages(VenuePlanPage, path, level=level, limit=page_size):
-            for plan in page.plans:
-                yield plan
+        return self._listed(VenuePlan, path, level=level, limit=page_size)
 
     async def delete_venue(self, venue_id: str) -> None:
         """Delete a venue; its plans stay stored."""

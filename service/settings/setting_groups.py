@@ -1,7 +1,7 @@
 """Groups of settings: fields, defaults, limits and descriptions.
 
-Limits that need no setting stand beside them as constants; `GET /limits` describes them (`schemas/service_state.py`). Units stand in the names: `_s` seconds, `_m` metres,
-`_bytes` bytes.
+Limits that need no setting stand beside them as constants; `GET /limits` describes them (`schemas/service_state.py`).
+Units stand in the names: `_s` seconds, `_m` metres, `_bytes` bytes.
 """
 
 from __future__ import annotations
