@@ -10,8 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from benchmarks.neighbours import markdown as markdown_of_neighbours
 from lalaloc_core.conditions import CONDITIONS, parts_of
-from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
-from lalaloc_core.evaluate.reproduce.table import TableResult, markdown
+from lalaloc_core.evaluate.reproduce.paper_tables import TABLES, TableResult, markdown
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"

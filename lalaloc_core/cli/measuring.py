@@ -146,7 +146,7 @@ def _reproduce(arguments: Reproduce) -> None:
             "--data is missing; give the folder of Structured3D or the output of `lalaloc lab synth`"
         )
 
-    from lalaloc_core.evaluate.reproduce.table import markdown
+    from lalaloc_core.evaluate.reproduce.paper_tables import markdown
     from lalaloc_core.evaluate.reproduce.table_maker import TableMaker
 
     table_maker = TableMaker(

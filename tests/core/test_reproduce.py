@@ -16,11 +16,11 @@ from lalaloc_core.cli import main
 from lalaloc_core.errors import CheckpointError, ConfigError, RunError
 from lalaloc_core.evaluate.reproduce import ablations
 from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, Budget, train_ablation
-from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
-from lalaloc_core.evaluate.reproduce.table import (
+from lalaloc_core.evaluate.reproduce.paper_tables import (
     COLUMN_TITLES,
     PAPER_SETTING,
     SHIPPED,
+    TABLES,
     Figure,
     RowQuery,
     RowResult,

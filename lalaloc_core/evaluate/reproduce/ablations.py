@@ -15,7 +15,7 @@ import torch
 
 from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.evaluate.reproduce.table import Budget
+from lalaloc_core.evaluate.reproduce.paper_tables import Budget
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.export.run_export import export_run
 from lalaloc_core.learn.training.checkpoint import Checkpoint

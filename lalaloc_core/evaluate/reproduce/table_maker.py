@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 
 from lalaloc_core.evaluate.reproduce.ablations import train_ablation
-from lalaloc_core.evaluate.reproduce.table import (
+from lalaloc_core.evaluate.reproduce.paper_tables import (
     SHIPPED,
     Budget,
     Column,
