@@ -128,7 +128,7 @@ def _short(arguments: Short) -> None:
 def _reproduce(arguments: Reproduce) -> None:
     check_range(arguments, 1, "limit")
     check_range(arguments, 0, "workers")
-    from lalaloc_core.evaluate.reproduce.paper_tables import TABLES
+    from lalaloc_core.evaluate.reproduce.paper_tables import TABLES, markdown
 
     if arguments.list_:
         for table in TABLES:
@@ -146,7 +146,6 @@ def _reproduce(arguments: Reproduce) -> None:
             "--data is missing; give the folder of Structured3D or the output of `lalaloc lab synth`"
         )
 
-    from lalaloc_core.evaluate.reproduce.paper_tables import markdown
     from lalaloc_core.evaluate.reproduce.table_maker import TableMaker
 
     table_maker = TableMaker(

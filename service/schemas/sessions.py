@@ -138,28 +138,27 @@ class PhotographForm(PhotographFields):
         return Odometry.of_stds(self.forward_m, right_m, turn, (forward_std, right_std, turn_std))
 
 
-class RivalAnswer(ResponseModel):
-    """Possible pose of the last photograph."""
+class PoseInPlan(ResponseModel):
+    """Pose with its probability."""
 
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360)
-    room: str
     room_id: str
     probability: Share
     floorplan_id: str | None = Field(None, description=PLAN_OF_POSE)
     level: float | None = Field(None, description=LEVEL_OF_POSE)
 
 
-class PathPoint(ResponseModel):
+class RivalAnswer(PoseInPlan):
+    """Possible pose of the last photograph."""
+
+    room: str
+
+
+class PathPoint(PoseInPlan):
     """Pose of one photograph of the path."""
 
     number: int = Field(description="Number of the photograph, from 1.")
-    position: Position
-    heading_deg: HeadingDeg = Field(ge=0, lt=360)
-    room_id: str
-    probability: Share
-    floorplan_id: str | None = Field(None, description=PLAN_OF_POSE)
-    level: float | None = Field(None, description=LEVEL_OF_POSE)
 
 
 TrackingMode = Literal["searching", "tracking", "lost"]

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import islice, product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +21,8 @@ from lalaloc_core.bundle import Manifest
 from lalaloc_core.evaluate.bench.albums import galleries, home_album
 from lalaloc_core.evaluate.bench.house import house_albums
 from lalaloc_core.evaluate.bench.measured import Setting
-from lalaloc_core.evaluate.runs.albums import RoomKey, pin_figures
-from lalaloc_core.localise.album.entry import AlbumPhotograph
+from lalaloc_core.evaluate.runs.albums import RoomAlbum
 from lalaloc_core.localise.album.evidence import AlbumMemory
-from lalaloc_core.localise.album.ground import AlbumGround
-from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 # Most albums of a source.
@@ -69,9 +66,9 @@ def bench_album_weights(setting: Setting) -> dict[str, Any]:
         source the one with the best score of the other sources.
     """
     figures: defaultdict[Combination, defaultdict[str, list[Figures]]] = defaultdict(lambda: defaultdict(list))
-    for album in _albums(setting):
+    for source, album in _albums(setting):
         for weights, found in _pinned(setting.model.encoder, album):
-            figures[weights][album.source].append(found)
+            figures[weights][source].append(found)
     rows = {weights: {source: _total(each) for source, each in row.items()} for weights, row in figures.items()}
     sources = sorted({source for row in rows.values() for source in row})
     return {
@@ -81,16 +78,9 @@ def bench_album_weights(setting: Setting) -> dict[str, Any]:
     }
 
 
-class _Album(NamedTuple):
-    source: str
-    ground: AlbumGround
-    photographs: list[AlbumPhotograph]
-    rooms: list[RoomKey]
-
-
-def _albums(setting: Setting) -> Iterator[_Album]:
+def _albums(setting: Setting) -> Iterator[tuple[str, RoomAlbum]]:
     for name, album in house_albums(setting).items():
-        yield _Album("house" if None not in album.rooms else name, *album)
+        yield ("house" if None not in album.rooms else name), album
     homes = range(min(setting.homes, _MOST))
     cases = {
         **galleries(setting),
@@ -99,10 +89,10 @@ def _albums(setting: Setting) -> Iterator[_Album]:
     }
     for name, each in cases.items():
         for case in islice(each, _MOST):
-            yield _Album(name, case.ground, case.photographs, case.rooms)
+            yield name, case.with_rooms
 
 
-def _pinned(encoder: PhotographEncoder, album: _Album) -> Iterator[tuple[Combination, Figures]]:
+def _pinned(encoder: PhotographEncoder, album: RoomAlbum) -> Iterator[tuple[Combination, Figures]]:
     """Yield the figures of an album by combination; its photographs are compared once for each temperature."""
     changed = copy.copy(encoder)
     for temperature in _TEMPERATURES:
@@ -112,8 +102,7 @@ def _pinned(encoder: PhotographEncoder, album: _Album) -> Iterator[tuple[Combina
                 temperature=temperature, weight=weight, recognition=recognition, misread=misread, pairs=pairs
             )
             changed.manifest = weights.changed(encoder.manifest)
-            pins = solve_album(album.ground, changed, album.photographs, memory=memory).pins
-            yield weights, pin_figures(pins, album.rooms)
+            yield weights, album.figures(changed, memory)
 
 
 def _total(albums: list[Figures]) -> Figures:

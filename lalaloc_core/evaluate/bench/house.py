@@ -12,12 +12,12 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lalaloc_core.evaluate.bench.measured import Found, Setting, evaluate, summary
 from lalaloc_core.evaluate.bench.turns import found_in_film, found_in_turns
 from lalaloc_core.evaluate.calibrate.measured_errors import Spot
-from lalaloc_core.evaluate.runs.albums import RoomKey, album_entry, pin_figures
+from lalaloc_core.evaluate.runs.albums import RoomAlbum, RoomKey, album_entry
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.folder import HeldoutScenes
@@ -26,7 +26,6 @@ from lalaloc_core.learn.data.views import ViewScenes
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
-from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.photograph import StatedCamera
@@ -56,13 +55,10 @@ def bench_house(setting: Setting) -> dict[str, Any]:
     rows |= {f"turn_{name}": summary(found) for name, found in found_in_turns(setting.model, _spots(folder)).items()}
     scenes = list(map(PosedSpheres(folder).load, PosedSpheres(folder).scenes("validation")))
     films = [found_in_film(setting.model, scene.plan, camera) for scene in scenes for camera in scene.cameras]
-    pinned = {
-        name: pin_figures(
-            solve_album(album.ground, setting.model.encoder, album.photographs, memory=AlbumMemory()).pins, album.rooms
-        )
-        for name, album in house_albums(setting).items()
+    albums = {
+        name: album.figures(setting.model.encoder, AlbumMemory()) for name, album in house_albums(setting).items()
     }
-    return rows | {"film": summary(films), **pinned}
+    return rows | {"film": summary(films), **albums}
 
 
 def _localised(setting: Setting, folder: Path, views: dict[str, Any] | None, *, known: bool) -> dict[str, float]:
@@ -86,15 +82,7 @@ def _spots(folder: Path) -> Iterator[Spot]:
             yield Spot(scene.plan, scene.cameras[first : first + _TURN_VIEWS])
 
 
-class HouseAlbum(NamedTuple):
-    """An album of the house, with the true room of every photograph."""
-
-    ground: AlbumGround
-    photographs: list[AlbumPhotograph]
-    rooms: list[RoomKey]
-
-
-def house_albums(setting: Setting) -> dict[str, HouseAlbum]:
+def house_albums(setting: Setting) -> dict[str, RoomAlbum]:
     """Return albums by name: see `bench_house`."""
     model, folder = setting.model, setting.house
     if folder is None:
@@ -109,10 +97,10 @@ def house_albums(setting: Setting) -> dict[str, HouseAlbum]:
     ]
     rooms: list[RoomKey] = [*plain.values(), *[None] * len(outside)]
     return {
-        "album": HouseAlbum(own, list(plain), list(plain.values())),
-        "album_walk": HouseAlbum(own, list(walk), list(walk.values())),
-        "album_with_elsewhere": HouseAlbum(own, [*plain, *outside], rooms),
-        "album_in_foreign_plan": HouseAlbum(foreign, list(plain), [None] * len(plain)),
+        "album": RoomAlbum(own, list(plain), list(plain.values())),
+        "album_walk": RoomAlbum(own, list(walk), list(walk.values())),
+        "album_with_elsewhere": RoomAlbum(own, [*plain, *outside], rooms),
+        "album_in_foreign_plan": RoomAlbum(foreign, list(plain), [None] * len(plain)),
     }
 
 

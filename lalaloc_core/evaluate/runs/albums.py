@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.pins import Pin, PinPose
 from lalaloc_core.localise.album.solve import solve_album
-from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
 from lalaloc_core.photograph import StatedCamera, open_photograph
 from lalaloc_core.photograph.exif import Taken
@@ -57,9 +58,10 @@ class AlbumCase:
         return cls(AlbumGround.of_plan(PLAN_ID, plan, grid), photographs, truth)
 
     @property
-    def rooms(self) -> list[RoomKey]:
-        """The room of every photograph."""
-        return [(PLAN_ID, self.ground.plan.rooms[pose.room_index].id) for pose in self.truth]
+    def with_rooms(self) -> RoomAlbum:
+        """The album with the room of every photograph."""
+        rooms: list[RoomKey] = [(PLAN_ID, self.ground.plan.rooms[pose.room_index].id) for pose in self.truth]
+        return RoomAlbum(self.ground, self.photographs, rooms)
 
     def solve(self, model: LocalModel, memory: AlbumMemory, *, by_time: bool = True) -> Sequence[Pin]:
         """Return a pin for every photograph."""
@@ -72,23 +74,35 @@ class AlbumCase:
 
     def clicks(self, model: LocalModel, memory: AlbumMemory) -> int:
         """Return how many pins must be corrected, the least sure wrong one first, until all rooms are right."""
-        rooms = [room for room in self.rooms if room is not None]
+        rooms = [self.ground.plan.rooms[truth.room_index].id for truth in self.truth]
         case = self
         for count in range(len(rooms)):
             pins = case.solve(model, memory)
             wrong = [
                 (pin.confidence, number)
                 for number, (pin, room) in enumerate(zip(pins, rooms, strict=True))
-                if pin.pose is None or pin.pose.room_id != room[1]
+                if pin.pose is None or pin.pose.room_id != room
             ]
             if not wrong:
                 return count
             number = min(wrong)[1]
-            stated = Correction(kind="room", plan_id=PLAN_ID, room_id=rooms[number][1])
+            stated = Correction(kind="room", plan_id=PLAN_ID, room_id=rooms[number])
             corrected = replace(case.photographs[number], correction=stated)
             photographs = [*case.photographs[:number], corrected, *case.photographs[number + 1 :]]
             case = replace(case, photographs=photographs)
         return len(rooms)
+
+
+class RoomAlbum(NamedTuple):
+    """An album with the true room of every photograph."""
+
+    ground: AlbumGround
+    photographs: list[AlbumPhotograph]
+    rooms: list[RoomKey]
+
+    def figures(self, encoder: PhotographEncoder, memory: AlbumMemory) -> dict[str, float]:
+        """Return counts of pins, see `pin_figures`."""
+        return pin_figures(solve_album(self.ground, encoder, self.photographs, memory=memory).pins, self.rooms)
 
 
 def pin_figures(pins: Sequence[Pin], truth: Sequence[RoomKey]) -> dict[str, float]:
