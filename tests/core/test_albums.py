@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFilter
 
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
+from lalaloc_core.evaluate.runs.albums import pin_figures
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.entry import (
     MAX_ENTRY_BYTES,
@@ -24,9 +25,9 @@ from lalaloc_core.localise.album.entry import (
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.links import pair_odds
-from lalaloc_core.localise.album.pins import Pin, PinPose, moved_pins
+from lalaloc_core.localise.album.pins import Pin, PinPose, RoomShare, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
-from lalaloc_core.localise.album.solve import MAX_ROOMS, solve_album
+from lalaloc_core.localise.album.solve import MAX_ROOMS, misread_share, solve_album
 from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
@@ -300,6 +301,26 @@ def test_evidence_of_photographs_of_one_spot_counts_once() -> None:
     np.testing.assert_allclose(of_rooms.sum(axis=0), total, atol=0.3)
     # What a photograph says against a room is bounded by its being misread.
     assert turned[0].evidence(0.2).min() >= math.log(0.2)
+
+
+def test_share_of_misread_photographs_is_found_in_the_album() -> None:
+    assert misread_share([np.full(6, 4.0)] * 40, 0.2) < 0.1
+    assert misread_share([np.full(6, -4.0)] * 40, 0.2) > 0.5
+    # Photographs that tell nothing leave it as it is.
+    assert misread_share([np.zeros(6)] * 40, 0.2) == pytest.approx(0.2)
+
+
+def test_figures_of_pins_count_rooms_and_elsewhere() -> None:
+    share = RoomShare(plan_id="p", room_id="a", room="A", probability=0.9)
+    pose = PinPose(plan_id="p", room_id="a", room="A", x_m=0.0, y_m=0.0, heading=None)
+    pins = [replace(_pin(str(number), pose), rooms=(share,)) for number in range(3)]
+    pins.append(replace(_pin("4", None), state="set_aside"))
+    figures = pin_figures(pins, [("p", "a"), ("p", "b"), None, None])
+    assert figures == {
+        "n": 2, "right_room": 1, "set_aside": 0, "sure": 2, "sure_and_wrong": 1,
+        "elsewhere": 2, "elsewhere_sure": 1, "elsewhere_set_aside": 1,
+        "mean_log_probability": pytest.approx((math.log(0.9) + math.log(1e-3) + math.log(0.1)) / 4),
+    }  # fmt: skip
 
 
 def test_pairs_of_many_photographs_of_a_room_weigh_no_more_than_those_of_few(
