@@ -8,16 +8,18 @@ albums. The score is the mean log probability of the right room.
 
 from __future__ import annotations
 
-import copy
+import multiprocessing
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import islice, product
 from typing import Any
 
 import numpy as np
 
-from lalaloc_core.bundle import Manifest
+from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.evaluate.bench.albums import galleries, home_album
 from lalaloc_core.evaluate.bench.house import house_albums
 from lalaloc_core.evaluate.bench.measured import Setting
@@ -66,9 +68,10 @@ def bench_album_weights(setting: Setting) -> dict[str, Any]:
         source the one with the best score of the other sources.
     """
     figures: defaultdict[Combination, defaultdict[str, list[Figures]]] = defaultdict(lambda: defaultdict(list))
-    for source, album in _albums(setting):
-        for weights, found in _pinned(setting.model.encoder, album):
-            figures[weights][source].append(found)
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        for source, found in pool.map(partial(_pinned, setting.bundle), _albums(setting)):
+            for weights, row in found.items():
+                figures[weights][source].append(row)
     rows = {weights: {source: _total(each) for source, each in row.items()} for weights, row in figures.items()}
     sources = sorted({source for row in rows.values() for source in row})
     return {
@@ -92,17 +95,20 @@ def _albums(setting: Setting) -> Iterator[tuple[str, RoomAlbum]]:
             yield name, case.with_rooms
 
 
-def _pinned(encoder: PhotographEncoder, album: RoomAlbum) -> Iterator[tuple[Combination, Figures]]:
-    """Yield the figures of an album by combination; its photographs are compared once for each temperature."""
-    changed = copy.copy(encoder)
+def _pinned(bundle: Bundle, named: tuple[str, RoomAlbum]) -> tuple[str, dict[Combination, Figures]]:
+    """Return the figures of an album by combination; its photographs are compared once for each temperature."""
+    source, album = named
+    encoder = PhotographEncoder(bundle, threads=1)
+    found = dict[Combination, Figures]()
     for temperature in _TEMPERATURES:
         memory = AlbumMemory()
         for (weight, recognition), misread, pairs in product(_OBJECTS, _MISREAD, _PAIRS):
             weights = Combination(
                 temperature=temperature, weight=weight, recognition=recognition, misread=misread, pairs=pairs
             )
-            changed.manifest = weights.changed(encoder.manifest)
-            yield weights, album.figures(changed, memory)
+            encoder.manifest = weights.changed(bundle.manifest)
+            found[weights] = album.figures(encoder, memory)
+    return source, found
 
 
 def _total(albums: list[Figures]) -> Figures:
