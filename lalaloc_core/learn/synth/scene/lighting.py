@@ -171,9 +171,7 @@ def _lamps(
 def _hanging(
     spot_m: np.ndarray, radius_m: float, z_m: tuple[float, float], finish: Finish, *, is_round: bool = True
 ) -> Prism:
-    return Prism.upright(
-        spot_m, (1.0, 0.0), (radius_m, radius_m), z_m, finish=finish, piece=_NO_PIECE, is_round=is_round
-    )
+    return Prism(spot_m, np.array([1.0, 0.0]), (radius_m, radius_m), z_m, finish, _NO_PIECE, is_round)
 
 
 def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Prism]:
@@ -195,7 +193,7 @@ def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.ran
     at, z = foot + inwards * 0.06, rng.uniform(1.6, 1.95)
     power = math.exp(rng.uniform(math.log(0.15), math.log(0.8)))
     light = Lights.row(xy_m=foot + inwards * 0.2 - origin_m, z_m=z, colour=power * lighting.lamp_colour)
-    lamp = Prism.upright(at, along, (0.06, 0.04), (z - 0.1, z + 0.1), finish="glow", piece=_NO_PIECE)
+    lamp = Prism(at, along, (0.06, 0.04), (z - 0.1, z + 0.1), "glow", _NO_PIECE)
     return light, lamp
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -77,18 +77,15 @@ class SceneTables:
         depth_m: float = 0.0,
     ) -> None:
         """Add a rectangle on a wall; with a `slot` it is a hole of some depth that shows that room."""
-        decal = Decal(
-            wall=wall, s0_m=s_m[0], s1_m=s_m[1], z0_m=z_m[0], z1_m=z_m[1], surface=surface, slot=slot, depth_m=depth_m
-        )
-        self.decals.append(decal)
+        self.decals.append(Decal(wall, *s_m, *z_m, surface, slot, depth_m))
 
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
         """Add a box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
         self.add_box(
-            np.array([prism.x, prism.y]),
-            (prism.axis_x, prism.axis_y),
-            half_m=(prism.half_a, prism.half_b),
-            z_m=(prism.z0, prism.z1),
+            prism.centre_m,
+            prism.axis,
+            half_m=prism.half_m,
+            z_m=prism.z_m,
             surface=surface,
             is_round=prism.is_round,
             opaque=opaque,
@@ -97,7 +94,7 @@ class SceneTables:
     def add_box(
         self,
         centre_m: Float[np.ndarray, "2"],
-        axis: Sequence[float] | np.ndarray,
+        axis: Float[np.ndarray, "2"],
         *,
         half_m: tuple[float, float],
         z_m: tuple[float, float],

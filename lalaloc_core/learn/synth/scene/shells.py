@@ -233,7 +233,7 @@ def _box(
     centre = 0.5 * (low + high)
     middle = along * centre[0] + across * centre[1]
     half_a, half_b = (0.5 * (high - low)).tolist()
-    return Prism.upright(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish=finish, piece=-1)
+    return Prism(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish, piece=-1)
 
 
 _HALF_DEPTH_M = 0.05
