@@ -48,16 +48,14 @@ class ViewEncoderConfig(TrunkEncoderConfig):
         """Return the azimuths (radians) that the patch spans."""
         return TWO_PI * self.sectors / ring.sectors
 
-    def column_azimuths(self, ring: RingConfig, rays: int = 1) -> Float[np.ndarray, "columns"]:
-        """Return the azimuth (radians, relative to the patch's centre) of column centres, `rays` per pixel."""
-        columns = self.image_width * rays
-        return ((np.arange(columns) + 0.5) / columns - 0.5) * self.width_rad(ring)
+    def column_azimuths(self, ring: RingConfig) -> Float[np.ndarray, "columns"]:
+        """Return the azimuth (radians, relative to the patch's centre) of column centres."""
+        return ((np.arange(self.image_width) + 0.5) / self.image_width - 0.5) * self.width_rad(ring)
 
-    def row_elevations(self, ring: RingConfig, rays: int = 1) -> Float[np.ndarray, "rows"]:
-        """Return the elevation (radians) of row centres, `rays` per pixel."""
-        rows = self.image_height * rays
+    def row_elevations(self, ring: RingConfig) -> Float[np.ndarray, "rows"]:
+        """Return the elevation (radians) of row centres."""
         pixel = self.width_rad(ring) / self.image_width
-        return np.radians(self.top_deg) - (np.arange(rows) + 0.5) * pixel / rays
+        return np.radians(self.top_deg) - (np.arange(self.image_height) + 0.5) * pixel
 
 
 @dataclass(frozen=True)
