@@ -54,14 +54,9 @@ class ImageStage(TrainingStage[ImageStageConfig]):
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield sphere batches."""
         self._first_step, self._generators = first_step, {}
-        return sphere_batches(
-            self.config,
-            self.source,
-            neighbours=bool(self.settings.log_ratio_weight or self.settings.kd_weight),
-            first_step=first_step,
-            workers=workers,
-            device=next(self.encoder.parameters()).device,
-        )
+        device = next(self.encoder.parameters()).device
+        neighbours = bool(self.settings.log_ratio_weight or self.settings.kd_weight)
+        return sphere_batches(self.config, self.source, first_step, workers, device, neighbours=neighbours)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name."""

@@ -80,10 +80,10 @@ def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
 def sphere_batches(
     config: TrainConfig,
     source: Source,
-    *,
     first_step: int,
     workers: int,
     device: torch.device,
+    *,
     neighbours: bool = False,
     views: bool = False,
 ) -> Iterator[Batch]:

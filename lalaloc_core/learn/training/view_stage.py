@@ -69,9 +69,7 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         device = next(self.encoder.parameters()).device
         seed = int(np.random.default_rng([10, self.config.seed, first_step]).integers(1 << 62))
         self._generator = torch.Generator(device).manual_seed(seed)
-        return sphere_batches(
-            self.config, self.source, first_step=first_step, workers=workers, device=device, views=True
-        )
+        return sphere_batches(self.config, self.source, first_step, workers, device, views=True)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name; azimuths that are not seen do not count."""
