@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import shapely
@@ -41,14 +41,6 @@ _SKY_TINTS: dict[Mood, tuple[float, float, float]] = {
 }
 
 
-class RoomLight(NamedTuple):
-    """Position (m) and colour of the one lamp of a room seen through a door, and its ambient light."""
-
-    position_m: Float[np.ndarray, "3"]
-    colour: Float[np.ndarray, "3"]
-    ambient: Float[np.ndarray, "3"]
-
-
 class Lighting:
     """Mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
 
@@ -74,8 +66,8 @@ class Lighting:
         """Make it night: only lamps give light."""
         self.daylight, self.lamps_on = 0.0, True
 
-    def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> RoomLight:
-        """Return the one lamp of a neighbouring room, and its ambient light."""
+    def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> dict[str, Float[np.ndarray, "3"]]:
+        """Return the columns of `VisibleRooms` about the one lamp of a neighbouring room, and its ambient light."""
         rng = self.rng
         centre = np.array(room.shape.representative_point().coords[0]) - origin_m
         strength = math.exp(rng.uniform(math.log(0.1), math.log(3.5)))
@@ -83,7 +75,8 @@ class Lighting:
         # The next room can be dark or very bright.
         low, high = (-0.7, 0.6) if self._bright else (-2.4, 1.1)
         ambient = self.ambient * math.exp(rng.uniform(low, high)) * (0.5 + 0.5 * tint)
-        return RoomLight(np.append(centre, room.ceiling_height_m - 0.3), strength * tint, ambient)
+        light_m = np.append(centre, room.ceiling_height_m - 0.3)
+        return {"light_m": light_m, "light_colour": strength * tint, "ambient": ambient}
 
 
 def light_room(

@@ -49,16 +49,10 @@ class Shells:
         ceiling = tables.surfaces.add_ceiling(np.clip(ceiling_colour, 0.01, 0.92))
         floor = self._floor_of(room_index, room, colour)
         streams.begin(ScenePart.ACCENT, room_index)
-        lamp = lighting.of_room_beyond(room, tables.camera_m)
-        room_row = VisibleRooms.row(
-            ceiling_m=room.ceiling_height_m,
-            floor_surface=floor,
-            ceiling_surface=ceiling,
-            light_m=lamp.position_m,
-            light_colour=lamp.colour,
-            ambient=lamp.ambient,
+        light = lighting.of_room_beyond(room, tables.camera_m)
+        tables.rooms.append(
+            VisibleRooms.row(ceiling_m=room.ceiling_height_m, floor_surface=floor, ceiling_surface=ceiling, **light)
         )
-        tables.rooms.append(room_row)
         accented = int(rng.integers(len(room.walls_m)))
         streams.begin(ScenePart.TRIM, room_index)
         first = len(tables.walls_m)
