@@ -15,9 +15,8 @@ import re
 import shutil
 import signal
 import threading
-from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -230,14 +229,8 @@ def _write_in_processes(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
-    waiting: deque[Future[int]] = deque()
     try:
-        for job in jobs:
-            waiting.append(pool.submit(_work, job))
-            if len(waiting) > 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        yield from pool.map(_work, jobs)
     except BrokenProcessPool as error:
         raise DatasetError(
             "a worker process died; use fewer --workers if memory is short", path=jobs[0].settings.root
