@@ -28,15 +28,7 @@ from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.runs.albums import predict_album
 from lalaloc_core.evaluate.runs.factories import build_dataset, build_method, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.learn.data.dataset import (
-    Appearance,
-    Camera,
-    Dataset,
-    Scene,
-    collect_error,
-    load_scenes,
-    photograph_facts,
-)
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, collect_error, load_scenes
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
@@ -207,7 +199,7 @@ class _SceneEvaluator:
             heading_confidence=answer.heading_confidence,
             found_height_m=answer.camera_height_m,
             timings_ms=answer.timings_ms,
-            facts=tuple(sorted(photograph_facts(question.photograph))),
+            facts=tuple(sorted(getattr(question.photograph, "facts", ()))),
         )
 
     def _layout_hit(self, question: Question, answer: Answer) -> bool | None:

@@ -36,7 +36,10 @@ class Appearance:
 
 @runtime_checkable
 class DatasetPhotograph(Protocol):
-    """Sphere that is read on demand."""
+    """Sphere that is read on demand.
+
+    It can have `facts`, names of what makes it hard to localise, such as "open_door" or "near_wall".
+    """
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size."""
@@ -45,21 +48,6 @@ class DatasetPhotograph(Protocol):
     def depth_m(self) -> Float[np.ndarray, "h w"]:
         """Return the distance (m) along each pixel's ray, furniture included; NaN without a reading."""
         ...
-
-
-@runtime_checkable
-class Described(Protocol):
-    """DatasetPhotograph with known facts that make it hard to localise, besides its appearance."""
-
-    @property
-    def facts(self) -> frozenset[str]:
-        """Names of the facts, such as "open_door" or "near_wall"; computed on demand."""
-        ...
-
-
-def photograph_facts(photograph: DatasetPhotograph | None) -> frozenset[str]:
-    """Return the facts of a photograph; empty if they are unknown."""
-    return photograph.facts if isinstance(photograph, Described) else frozenset()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
