@@ -14,7 +14,6 @@ import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -121,38 +120,29 @@ def _localise_scenes(
         pool.shutdown(cancel_futures=True)
 
 
-@dataclass(frozen=True)
-class _Session:
-    """State of a worker process between scenes; a `LocalModel` solves albums."""
-
-    info: RunInfo
-    dataset: Dataset
-    method: Method | LocalModel
-
-
 @lru_cache(maxsize=1)
-def _session(description: str) -> _Session:
+def _session(description: str) -> tuple[RunInfo, Dataset, Method | LocalModel]:
+    """Return the state of a worker process between scenes; a `LocalModel` solves albums."""
     torch.set_num_threads(1)
     info = build_config(RunInfo, json.loads(description))
     method = LocalModel(require_bundle(info)) if info.albums else build_method(info)
-    return _Session(info, build_dataset(info), method)
+    return info, build_dataset(info), method
 
 
 def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list[DatasetError]]:
     """Return the predictions of one scene and, with `skip_bad`, the errors of unusable scenes and cameras."""
-    session = _session(description)
-    info = session.info
+    info, dataset, method = _session(description)
     problems: list[DatasetError] | None = [] if info.skip_bad else None
     predictions: list[Prediction] = []
-    for scene in load_scenes(session.dataset, [name], problems):
-        if isinstance(session.method, LocalModel):
+    for scene in load_scenes(dataset, [name], problems):
+        if isinstance(method, LocalModel):
             with collect_error(problems):
-                predictions += predict_album(scene, info, session.method, problems)
+                predictions += predict_album(scene, info, method, problems)
             continue
         evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
             with collect_error(problems):
-                predictions.append(evaluator.predict(camera, session.method))
+                predictions.append(evaluator.predict(camera, method))
     return predictions, problems or []
 
 
