@@ -113,14 +113,11 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         features = self.encoder(images, heights, styles)
         assert features.structure is not None
         assert isinstance(self.encoder, TrunkImageEncoder)
-        openings, log_distance = (
-            target.to(image.device) for target in (photographs.openings, photographs.log_distance)
-        )
         rows = slice(len(image), None)
         logits = features.structure.opening_logits[rows]
         known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
         weight = opening_weight(settings, self.encoder, self.photographs)
-        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, openings, log_distance, weight)
+        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, photographs, weight)
         return first_rows(features, len(image)), {"photographs": loss}
 
     def _structure_losses(

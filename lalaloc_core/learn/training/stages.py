@@ -106,11 +106,12 @@ def photograph_loss(
     walls: WallModes,
     opening_logits: Float[Tensor, "n w c"],
     seen: Bool[Tensor, "n w"],
-    openings: Float[Tensor, "n w 3"],
-    log_distance: Float[Tensor, "n w"],
+    targets: Photographs,
     class_weight: Float[Tensor, "c"],
+    columns: slice = slice(None),
 ) -> Tensor:
-    """Return the weighted loss of predictions for photographs, against their targets where seen."""
+    """Return the weighted loss of predictions for photographs, against those columns of their targets that are seen."""
+    openings, log_distance = (part[:, columns].to(seen.device) for part in (targets.openings, targets.log_distance))
     agreement = losses.teacher_openings(opening_logits[seen][None], openings[seen][None], class_weight)
     known = losses.visible_walls(torch.where(seen, log_distance, torch.nan), openings, opening_logits)
     target = log_distance.nan_to_num()

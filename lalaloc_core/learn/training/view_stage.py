@@ -91,15 +91,10 @@ class ViewStage(TrainingStage[ImageStageConfig]):
             edges, visible = batch["edges"][:, middle(self.config)], walls * (shown[rendered, ..., 3] > 0.0)
             terms["edges"] = edges_loss(settings, features.structure.rows(rendered), edges, visible, seen[rendered])
         if self.photographs is not None and photographs is not None:
-            rows, part = slice(len(image) - count, None), middle(self.config)
-            openings, log_distance = (
-                target[:, part].to(seen.device) for target in (photographs.openings, photographs.log_distance)
-            )
-            logits = features.structure.opening_logits[rows]
-            weight = opening_weight(settings, self.encoder, self.photographs)
-            terms["photographs"] = photograph_loss(
-                settings, features.walls.rows(rows), logits, seen[rows], openings, log_distance, weight
-            )
+            rows = slice(len(image) - count, None)
+            modes, logits = features.walls.rows(rows), features.structure.opening_logits[rows]
+            weight, columns = opening_weight(settings, self.encoder, self.photographs), middle(self.config)
+            terms["photographs"] = photograph_loss(settings, modes, logits, seen[rows], photographs, weight, columns)
             if self._objects is not None and features.objects is not None:
                 taught, _ = self._objects.to(shown.device)(shown[rows, ..., :3])
                 codes = photographs.room_type.to(taught.device)
