@@ -92,9 +92,6 @@ class LaLaLoc:
             refiner=self._refiner,
             config=self._config,
         )
-        signals: dict[str, dict[str, float]] = {
-            stage: dataclasses.asdict(values) for stage, values in found.signals.items()
-        }
         # The confidence model is fitted on photographs and the default matching cost.
         calibrated = question.kind == "photograph" and self._config.matching == MatchingConfig()
         confidence = found.confidence(self.encoders.manifest.confidence_for(view=query.is_view)) if calibrated else None
@@ -107,7 +104,7 @@ class LaLaLoc:
                 for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
             ),
             retrieved=grid_index(grid, found.best["retrieval"]),
-            signals=signals,
+            signals={stage: dataclasses.asdict(values) for stage, values in found.signals.items()},
             information=found.best[found.stage].information,
             confidence=None if confidence is None else confidence.position,
             heading_confidence=None if confidence is None else confidence.heading,
