@@ -23,7 +23,7 @@ from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_o
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
-from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene, Sun
+from lalaloc_core.learn.synth.scene.render_scene import Fact, Sun
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 
 _DEPTH_HEIGHT = 256
@@ -161,7 +161,7 @@ class RenderedPhotograph:
     @cached_property
     def facts(self) -> frozenset[str]:
         """Facts that make the shot hard, see `synth.scene.facts`."""
-        return frozenset(facts_of(self.shot))
+        return facts_of(self.shot)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Render RGB pixels at the given size."""
@@ -190,10 +190,6 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
     """
     # Facts do not depend on the pictures of materials.
     scene = build_scene(shot, _blank_materials())
-    return frozenset({*_facts_of_place(shot), *scene.facts, *_facts_of_picture(shot, scene)})
-
-
-def _facts_of_place(shot: Shot) -> set[Fact]:
     room, here = shot.home.plan.rooms[shot.room_index], shapely.Point(shot.position_m)
     own = [opening for opening in shot.home.openings if opening.room == shot.room_index]
     see_through = [opening for opening in own if opening.is_see_through]
@@ -210,13 +206,10 @@ def _facts_of_place(shot: Shot) -> set[Fact]:
         "large_room": room.area_m2 > _LARGE_M2,
         "near_wall": room.shape.exterior.distance(here) < _NEAR_M,
         "threshold": any(_segment(shot, opening).distance(here) < _THRESHOLD_M for opening in see_through),
+        "nadir_patch": bool(scene.exposure.nadir > 0.0),
+        "sun_patch": _sees_sun(shot, scene.sun),
     }
-    return {fact for fact, true in holds.items() if true}
-
-
-def _facts_of_picture(shot: Shot, scene: RenderScene) -> set[Fact]:
-    holds: dict[Fact, bool] = {"nadir_patch": bool(scene.exposure.nadir > 0.0), "sun_patch": _sees_sun(shot, scene.sun)}
-    return {fact for fact, true in holds.items() if true}
+    return scene.facts | {fact for fact, true in holds.items() if true}
 
 
 def _has_stub(shot: Shot, opening: Opening) -> bool:
