@@ -74,7 +74,7 @@ def build_image_encoder(config: TrainConfig) -> ImageEncoder:
 
 def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
     """Build an untrained layout decoder; None if the decoding loss is off."""
-    return LayoutDecoder(config.latent_size) if config.layout.decode_weight else None
+    return LayoutDecoder(config.layout_sizes.latent_size) if config.layout.decode_weight else None
 
 
 def sphere_batches(
