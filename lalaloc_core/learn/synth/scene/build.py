@@ -52,7 +52,7 @@ class _Builder:
         self._is_bare = shot.furniture == "empty"
         # Homes for sale: bare, pale, in daylight.
         self._is_bright = self._is_bare and not self._streams.is_staged and self._rng.random() < 0.6
-        surfaces = SurfaceTable(materials, materials.mean_colours, self._streams.materials)
+        surfaces = SurfaceTable(materials, self._streams.materials)
         self._tables = SceneTables(shot.position_m, surfaces)
         self._style = sample_style(surfaces, self._rng)
         if shot.is_night:
