@@ -30,7 +30,7 @@ from lalaloc_core.learn.training.batches import (
 )
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
-from lalaloc_core.learn.training.sources import Group, Source, SphereSample
+from lalaloc_core.learn.training.sources import Group, Source, SphereSample, group_around
 from lalaloc_core.render.profile import render_layout
 from lalaloc_core.render.sweep import profiles_at
 
@@ -188,7 +188,7 @@ class SphereBatches(Stream):
     def _row(self, sample: SphereSample, turn: Rotation, rng: np.random.Generator) -> Row | None:
         position, room = sample.position_m[None], np.array([sample.room_index])
         if self.neighbours:
-            group = sample.group(self.config.layout.triplets, rng)
+            group = group_around(sample, sample.plan, self.config.layout.triplets, rng)
             if group is None:
                 return None
             position, room = group.position_m, group.room_index

@@ -68,10 +68,6 @@ class SphereSample:
     camera_height_m: float
     image: np.ndarray | DeferredScene
 
-    def group(self, sampling: TripletSampling, rng: np.random.Generator) -> Group | None:
-        """Return the pose with sampled neighbours; None if the plan is too small for them."""
-        return _group_around(self, self.plan, sampling, rng)
-
 
 @dataclass(eq=False)
 class GeneratedSource:
@@ -207,7 +203,7 @@ class SceneSource:
         groups: list[Group] = []
         if scene is not None:
             for index in rng.permutation(len(scene.cameras)):
-                group = _group_around(scene.cameras[index], scene.plan, stage.triplets, rng)
+                group = group_around(scene.cameras[index], scene.plan, stage.triplets, rng)
                 groups += [group] if group is not None else []
                 if len(groups) == stage.anchors_per_home:
                     break
@@ -279,9 +275,10 @@ def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | Deferred
     )
 
 
-def _group_around(
+def group_around(
     anchor: Camera | SphereSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
 ) -> Group | None:
+    """Return a pose with sampled neighbours; None if the plan is too small for them."""
     pose = PoseSet(np.asarray(anchor.position_m)[None], np.array([anchor.room_index]))
     near = sample_neighbours(plan, pose, sampling, rng, anchor.camera_height_m + _HEADROOM_M)
     if near is None:
