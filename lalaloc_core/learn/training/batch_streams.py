@@ -164,7 +164,7 @@ class SphereBatches(Stream):
                 if row is None:
                     batcher.drop(sample.image)
                 else:
-                    rows.append(DeferredRow(sample.image, turn, row))
+                    rows.append((sample.image, turn, row))
             return rows or None
 
         if self.source.deferred:

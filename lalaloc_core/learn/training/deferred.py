@@ -30,13 +30,8 @@ class DeferredScene:
     scene: RenderScene
 
 
-@dataclass(frozen=True, eq=False)
-class DeferredRow:
-    """A row of a batch: the sphere to render, its rotation, and the other values."""
-
-    deferred: DeferredScene
-    turn: Rotation
-    rest: Row
+# A row of a batch: the sphere to render, its rotation, and the other values.
+DeferredRow = tuple[DeferredScene, Rotation, Row]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,16 +61,16 @@ class DeferredBatcher:
 
     def pack(self, rows: list[DeferredRow]) -> DeferredBatch:
         """Pack rows into a batch, with the scenes that it uses for the first time."""
-        scenes = {row.deferred.number: row.deferred.scene for row in rows if row.deferred.number not in self._sent}
+        scenes = {sphere.number: sphere.scene for sphere, _, _ in rows if sphere.number not in self._sent}
         self._sent |= scenes.keys()
-        for row in rows:
-            self._use(row.deferred.number)
+        for sphere, _, _ in rows:
+            self._use(sphere.number)
         evicted, self._evicted = tuple(self._evicted), []
         return DeferredBatch(
-            rest=stack_rows([row.rest for row in rows]),
-            number=tuple(row.deferred.number for row in rows),
-            shift=torch.tensor([row.turn.shift for row in rows]),
-            mirrored=torch.tensor([row.turn.mirrored for row in rows]),
+            rest=stack_rows([rest for _, _, rest in rows]),
+            number=tuple(sphere.number for sphere, _, _ in rows),
+            shift=torch.tensor([turn.shift for _, turn, _ in rows]),
+            mirrored=torch.tensor([turn.mirrored for _, turn, _ in rows]),
             scenes=scenes,
             evicted=evicted,
         )
