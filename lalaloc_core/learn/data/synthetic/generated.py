@@ -17,7 +17,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.synth.furniture.furnish import wall_frame
+from lalaloc_core.learn.synth.furniture.furnish import opening_ends_m
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
@@ -196,6 +196,7 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
     wide = [
         opening for opening in see_through if opening.kind == "opening" and opening.end_m - opening.start_m >= _WIDE_M
     ]
+    segments = [shapely.LineString(opening_ends_m(room, opening)) for opening in see_through]
     inscribed_m = 2.0 * shapely.maximum_inscribed_circle(room.shape, 0.02).length
     holds: dict[Fact, bool] = {
         "open_door": any(opening.kind == "door_open" for opening in see_through),
@@ -205,7 +206,7 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
         "closet": room.area_m2 < _CLOSET_M2,
         "large_room": room.area_m2 > _LARGE_M2,
         "near_wall": room.shape.exterior.distance(here) < _NEAR_M,
-        "threshold": any(_segment(shot, opening).distance(here) < _THRESHOLD_M for opening in see_through),
+        "threshold": any(segment.distance(here) < _THRESHOLD_M for segment in segments),
         "nadir_patch": bool(scene.exposure.nadir > 0.0),
         "sun_patch": _sees_sun(shot, scene.sun),
     }
@@ -216,11 +217,6 @@ def _has_stub(shot: Shot, opening: Opening) -> bool:
     x0, y0, x1, y1 = shot.home.plan.rooms[opening.room].walls_m[opening.wall]
     rest = (opening.start_m, float(np.hypot(x1 - x0, y1 - y0)) - opening.end_m)
     return any(_STUB_M[0] <= left <= _STUB_M[1] for left in rest)
-
-
-def _segment(shot: Shot, opening: Opening) -> shapely.LineString:
-    start, along, _ = wall_frame(shot.home.plan.rooms[opening.room], opening.wall)
-    return shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
 
 
 def _sees_sun(shot: Shot, sun: Sun) -> bool:

@@ -312,6 +312,12 @@ def wall_frame(room: Room, wall: int) -> tuple[Float[np.ndarray, "2"], Float[np.
     return np.array([x0, y0]), along, np.array([-along[1], along[0]])
 
 
+def opening_ends_m(room: Room, opening: Opening) -> Float[np.ndarray, "2 2"]:
+    """Return the ends of an opening on its wall."""
+    start, along, _ = wall_frame(room, opening.wall)
+    return start + np.array([[opening.start_m], [opening.end_m]]) * along
+
+
 def _rugs(floor: _Floor, rng: np.random.Generator, first_number: int) -> list[Prism]:
     prisms = []
     for number in range(int(rng.choice(3, p=[0.5, 0.4, 0.1]))):
