@@ -174,22 +174,15 @@ def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> t
     trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
     slow = {id(p) for trunk in trunks for p in trunk.parameters()}
     parameters = [p for module in modules.values() for p in module.parameters() if p.requires_grad]
+    decayed = [p for p in parameters if config.kind == "sgd" or p.ndim > 1]
+    others = [p for p in parameters if config.kind != "sgd" and p.ndim <= 1]
+    # By decay, and by the factor that multiplies the learning rate.
+    groups = [
+        {"params": members, "weight_decay": decay, "factor": factor}
+        for part, decay in ((decayed, config.weight_decay), (others, 0.0))
+        for factor, is_slow in ((1.0, False), (config.trunk_factor, True))
+        if (members := [p for p in part if (id(p) in slow) == is_slow])
+    ]
     if config.kind == "sgd":
-        groups = _groups_by_rate(parameters, slow, config, weight_decay=config.weight_decay)
         return torch.optim.SGD(groups, config.learning_rate, momentum=config.momentum)
-    groups = _groups_by_rate([p for p in parameters if p.ndim > 1], slow, config, weight_decay=config.weight_decay)
-    groups += _groups_by_rate([p for p in parameters if p.ndim <= 1], slow, config, weight_decay=0.0)
     return torch.optim.AdamW(groups, config.learning_rate)
-
-
-def _groups_by_rate(
-    parameters: list[nn.Parameter], slow: set[int], config: OptimiserConfig, *, weight_decay: float
-) -> list[dict[str, Any]]:
-    """Split parameters by the factor that multiplies their learning rate."""
-    groups = []
-    for factor, members in (
-        (1.0, [p for p in parameters if id(p) not in slow]),
-        (config.trunk_factor, [p for p in parameters if id(p) in slow]),
-    ):
-        groups += [{"params": members, "weight_decay": weight_decay, "factor": factor}] if members else []
-    return groups
