@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, collect_error, load_scenes
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
@@ -233,13 +233,7 @@ class SceneSource:
 
     @cachedmethod(attrgetter("_scenes"))
     def _load(self, name: str) -> Scene | None:
-        if not self.skip_bad:
-            return self.dataset.load(name)
-        try:
-            return self.dataset.load(name, self.problems)
-        except DatasetError as error:
-            self.problems.append(error)
-            return None
+        return next(load_scenes(self.dataset, [name], self.problems if self.skip_bad else None), None)
 
     def _picture(
         self, scene: Scene, camera: Camera, rng: np.random.Generator, height: int, width: int
@@ -248,13 +242,9 @@ class SceneSource:
         if not looks:
             return None
         look = looks[rng.integers(len(looks))]
-        try:
+        with collect_error(self.problems if self.skip_bad else None):
             return self._read(scene, camera, look, height, width)
-        except DatasetError as error:
-            if not self.skip_bad:
-                raise
-            self.problems.append(error)
-            return None
+        return None
 
     @cachedmethod(attrgetter("_pictures"), key=_picture_key)
     def _read(self, scene: Scene, camera: Camera, look: Appearance, height: int, width: int) -> np.ndarray:
