@@ -82,23 +82,17 @@ class SceneTables:
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
         """Add a box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
         self.add_box(
-            prism.centre_m,
-            prism.axis,
-            half_m=prism.half_m,
-            z_m=prism.z_m,
-            surface=surface,
-            is_round=prism.is_round,
-            opaque=opaque,
+            prism.centre_m, prism.axis, prism.half_m, prism.z_m, surface, is_round=prism.is_round, opaque=opaque
         )
 
     def add_box(
         self,
         centre_m: Float[np.ndarray, "2"],
         axis: Float[np.ndarray, "2"],
-        *,
         half_m: tuple[float, float],
         z_m: tuple[float, float],
         surface: int,
+        *,
         is_round: bool = False,
         opaque: bool = True,
     ) -> None:
@@ -106,10 +100,8 @@ class SceneTables:
         row = Prisms.row(
             centre_m=centre_m - self.camera_m,
             axis=axis,
-            half_a_m=half_m[0],
-            half_b_m=half_m[1],
-            z0_m=z_m[0],
-            z1_m=z_m[1],
+            half_m=half_m,
+            z_m=z_m,
             is_round=is_round,
             surface=surface,
             is_opaque=opaque,
