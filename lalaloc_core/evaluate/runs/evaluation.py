@@ -172,6 +172,7 @@ class _SceneEvaluator:
         info, scene = self._info, self._scene
         question = question_of(scene, camera, info, self._grid)
         answer = method.locate(question)
+        layout_hit, pose_hit = self._hits(question, answer)
         return Prediction(
             scene=scene.name,
             camera=camera.name,
@@ -179,8 +180,8 @@ class _SceneEvaluator:
             camera_height_m=camera.camera_height_m,
             truth=Pose.at(camera.position_m, camera.room_index, camera.heading),
             stages=answer.stages,
-            layout_hit=self._layout_hit(question, answer),
-            pose_hit=self._pose_hit(camera, answer),
+            layout_hit=layout_hit,
+            pose_hit=pose_hit,
             room_rank=answer.rank_of_room(camera.room_index),
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
@@ -192,18 +193,14 @@ class _SceneEvaluator:
             facts=tuple(sorted(getattr(question.photograph, "facts", ()))),
         )
 
-    def _layout_hit(self, question: Question, answer: Answer) -> bool | None:
-        """Return whether retrieval chose the grid pose with the nearest layout, the first of equals."""
+    def _hits(self, question: Question, answer: Answer) -> tuple[bool | None, bool | None]:
+        """Return whether retrieval chose the pose with the nearest layout, the first of equals, and the nearest one."""
         if answer.retrieved is None:
-            return None
+            return None, None
         height = question.camera.camera_height_m
         if height not in self._layouts:
             self._layouts[height] = ChamferGrid(self._scene.plan, self._grid, height)
         layouts = self._layouts[height]
-        return layouts.nearest(true_layout(question, layouts.columns)) == answer.retrieved
-
-    def _pose_hit(self, camera: Camera, answer: Answer) -> bool | None:
-        if answer.retrieved is None:
-            return None
-        distance = np.linalg.norm(self._grid.position_m - camera.position_m, axis=1)
-        return int(distance.argmin()) == answer.retrieved
+        layout = layouts.nearest(true_layout(question, layouts.columns))
+        pose = int(np.linalg.norm(self._grid.position_m - question.camera.position_m, axis=1).argmin())
+        return layout == answer.retrieved, pose == answer.retrieved
