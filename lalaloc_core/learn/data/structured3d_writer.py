@@ -38,11 +38,6 @@ _SAME_ROOM_TYPES = (
 )
 
 
-def room_id(room_index: int) -> str:
-    """Return the semantic's ID, which is also the name of the room's panorama folder."""
-    return str(room_index)
-
-
 def room_type(name: str) -> str:
     """Return Structured3D's type of a room from its name, such as "bedroom 2"."""
     kind = name.rstrip("0123456789 ")
@@ -57,7 +52,7 @@ def write_annotation(scene: Path, plan: FloorPlan, openings: Sequence[Opening]) 
 
 
 def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, Any]:
-    """Build the annotation of a home; the semantic with ID k is room k of the plan."""
+    """Build the annotation of a home; the semantic with ID k is room k of the plan, whose panoramas are in folder k."""
     drawing = _Drawing()
     rooms = []
     for room in plan.rooms:

@@ -37,13 +37,7 @@ from lalaloc_core.learn.data.structured3d import (
     scene_name,
     scene_numbers,
 )
-from lalaloc_core.learn.data.structured3d_writer import (
-    room_id,
-    write_annotation,
-    write_camera,
-    write_depth,
-    write_picture,
-)
+from lalaloc_core.learn.data.structured3d_writer import write_annotation, write_camera, write_depth, write_picture
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.dataset_names import SPLITS, Split
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
@@ -164,7 +158,7 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
             for shot in shots:
                 if stop is not None and stop.is_set():
                     return 0
-                _write_room(job.part / RENDERING_FOLDER / room_id(shot.room_index) / "panorama", shot, renderer)
+                _write_room(job.part / RENDERING_FOLDER / str(shot.room_index) / "panorama", shot, renderer)
             job.part.rename(job.folder)
     finally:
         # No effect after the rename.
