@@ -50,14 +50,6 @@ class GeneratedScenes:
         """Return the names of a split's scenes."""
         return [f"{split}-{index:05d}" for index in range(self.homes)]
 
-    def home_number(self, name: str) -> tuple[int, int]:
-        """Return the numbers of a scene's split and home."""
-        split, _, index = name.partition("-")
-        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
-        if number is None or not index.isdecimal():
-            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
-        return number, int(index)
-
     @property
     def description(self) -> str:
         """Name of the data set in results."""
@@ -65,8 +57,11 @@ class GeneratedScenes:
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Generate a scene from its name."""
-        number, index = self.home_number(name)
-        home, rng = home_of(number, self.seed, index)
+        split, _, index = name.partition("-")
+        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
+        if number is None or not index.isdecimal():
+            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
+        home, rng = home_of(number, self.seed, int(index))
         renderers = split_renderer_cache(number, self.seed, self.textures)
         shots = sample_shots(home, self.shots_per_home, rng, self.furniture)
         cameras = tuple(
@@ -160,7 +155,7 @@ class RenderedPhotograph:
 
     @cached_property
     def facts(self) -> frozenset[str]:
-        """Facts that make the shot hard, see `synth.scene.facts`."""
+        """Facts that make the shot hard, see `facts_of`."""
         return facts_of(self.shot)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
