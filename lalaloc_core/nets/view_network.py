@@ -48,14 +48,12 @@ class ViewEncoderConfig(TrunkEncoderConfig):
         """Return the azimuths (radians) that the patch spans."""
         return TWO_PI * self.sectors / ring.sectors
 
-    def column_azimuths(self, ring: RingConfig) -> Float[np.ndarray, "columns"]:
-        """Return the azimuth (radians, relative to the patch's centre) of column centres."""
-        return ((np.arange(self.image_width) + 0.5) / self.image_width - 0.5) * self.width_rad(ring)
-
-    def row_elevations(self, ring: RingConfig) -> Float[np.ndarray, "rows"]:
-        """Return the elevation (radians) of row centres."""
+    def directions(self, ring: RingConfig) -> tuple[Float[Tensor, "columns"], Float[Tensor, "rows"]]:
+        """Return azimuths of columns, relative to the patch's centre, and elevations of rows (radians) at centres."""
+        azimuths = ((np.arange(self.image_width) + 0.5) / self.image_width - 0.5) * self.width_rad(ring)
         pixel = self.width_rad(ring) / self.image_width
-        return np.radians(self.top_deg) - (np.arange(self.image_height) + 0.5) * pixel
+        elevations = np.radians(self.top_deg) - (np.arange(self.image_height) + 0.5) * pixel
+        return torch.from_numpy(azimuths).float(), torch.from_numpy(elevations).float()
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,8 @@ class ViewNetwork(HorizonEncoder):
         columns = config.sectors * self.columns_per_sector
         self.register_buffer("pooling", _pooling(config.image_width, columns), persistent=False)
         self.pooling: Tensor
-        self.row_elevations = config.row_elevations(ring)
+        # Not a tensor, which an export would take for a constant of the network.
+        self._elevations = config.directions(ring)[1].numpy()
         self.to_objects: nn.Module | None = None
         if config.objects:
             width, inputs = config.mixer_width, 2 * config.trunk.widths[-1]
@@ -106,7 +105,7 @@ class ViewNetwork(HorizonEncoder):
         }
         taken["join.weight"] = torch.zeros_like(own["join.weight"])
         taken["join.weight"][:, : sphere.join.in_features] = theirs["join.weight"]
-        elevations = torch.from_numpy(self.row_elevations).float()
+        elevations = torch.from_numpy(self._elevations)
         for number, stride in enumerate(TAP_STRIDES):
             weight = theirs[f"squeezes.{number}.weight"]
             rows, own_rows = sphere.config.image_height // stride, self.config.image_height // stride

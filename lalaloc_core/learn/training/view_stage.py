@@ -54,10 +54,7 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
         self.encoder = ViewNetwork(config.view, config.ring)
         self.modules: dict[str, nn.Module] = {"view_encoder": self.encoder}
-        self._azimuths, self._elevations = (
-            torch.from_numpy(angles).float()
-            for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
-        )
+        self._azimuths, self._elevations = config.view.directions(config.ring)
         self._generator = torch.Generator()
         # Teacher of household objects in photographs.
         self._objects = None
@@ -202,11 +199,7 @@ class ViewValidation:
 
     def _measure(self, encoder: ViewNetwork, field_deg: float) -> dict[str, float]:
         config = self._config
-        azimuths, elevations = (
-            torch.from_numpy(angles).float()
-            for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
-        )
-        seen = seen_by(azimuths, elevations, field_deg, field_deg / _ASPECT)
+        seen = seen_by(*config.view.directions(config.ring), field_deg, field_deg / _ASPECT)
         opacity = 255 * seen.to(torch.uint8)[None, :, :, None]
         nll, errors, confusion = [], [], np.zeros((len(OPENING_CLASSES),) * 2, dtype=int)
         for first in range(0, len(self._images), _BATCH):
