@@ -162,7 +162,7 @@ class SphereBatches(Stream):
             for sample, turn, row in self._draw(visit, replay):
                 assert isinstance(sample.image, DeferredScene)
                 if row is None:
-                    batcher.drop(sample.image)
+                    batcher.use(sample.image)
                 else:
                     rows.append((sample.image, turn, row))
             return rows or None
