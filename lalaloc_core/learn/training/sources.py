@@ -57,15 +57,12 @@ class Group:
     camera_height_m: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class SphereSample:
     """A sphere and its pose; `image` is (h, w, 3) RGB bytes, (h, w, 4) with walls, or a scene to be rendered later."""
 
     plan: FloorPlan
-    position_m: Float[np.ndarray, "2"]
-    room_index: int
-    heading: float
-    camera_height_m: float
+    camera: Camera | Shot
     image: np.ndarray | DeferredScene
 
 
@@ -144,7 +141,7 @@ class GeneratedSource:
         else:
             renderer = self._renderers.renderer(height, width, stage.supersample, self.window)
             images = list(renderer.render_scenes(scenes, walls=True).numpy())
-        return [_sample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
+        return [SphereSample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
 
     def renderer(self, device: torch.device, height: int, width: int) -> SphereRenderer:
         """Create the renderer of deferred spheres; its pixels are those of `samples`."""
@@ -220,7 +217,7 @@ class SceneSource:
             camera = scene.cameras[index]
             image = self._picture(scene, camera, rng, height, width)
             if image is not None:
-                samples.append(_sample(scene.plan, camera, image))
+                samples.append(SphereSample(scene.plan, camera, image))
         return samples
 
     def _scene(self, visit: int) -> Scene | None:
@@ -254,19 +251,8 @@ class SceneSource:
 Source = GeneratedSource | SceneSource
 
 
-def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | DeferredScene) -> SphereSample:
-    return SphereSample(
-        plan=plan,
-        position_m=camera.position_m,
-        room_index=camera.room_index,
-        heading=camera.heading,
-        camera_height_m=camera.camera_height_m,
-        image=image,
-    )
-
-
 def group_around(
-    anchor: Camera | SphereSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
+    anchor: Camera | Shot, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
 ) -> Group | None:
     """Return a pose with sampled neighbours; None if the plan is too small for them."""
     pose = PoseSet(np.asarray(anchor.position_m)[None], np.array([anchor.room_index]))
