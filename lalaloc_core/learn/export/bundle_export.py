@@ -136,8 +136,10 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
 
 
-def add_object_network(bundle: Bundle) -> Bundle:
-    """Add the classifier of objects to a bundle, or replace it; no other network changes."""
+def add_objects(folder: Path) -> Bundle:
+    """Add the pretrained classifier of objects to the bundle in `folder`, or replace it; no other network changes."""
+    bundle = Bundle.open(folder)
+    bundle.check()
     network = ObjectNetwork()
     _freeze(network)
     generator = torch.Generator().manual_seed(0)
