@@ -244,7 +244,7 @@ def _export_again(arguments: ExportAgain) -> None:
 
 
 def _add_objects(arguments: AddObjects) -> None:
-    from lalaloc_core.learn.export.run_export import add_objects
+    from lalaloc_core.learn.export.bundle_export import add_objects
 
     bundle = add_objects(arguments.bundle)
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})

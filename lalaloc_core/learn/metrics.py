@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -47,10 +47,6 @@ class Accuracy:
             within_10cm=float(np.mean(error < 0.10)),
             within_1m=float(np.mean(error < 1.0)),
         )
-
-    def to_dict(self) -> dict[str, int | float]:
-        """Return the metrics by name."""
-        return asdict(self)
 
 
 # Quantiles of the predicted Laplace distributions at which the share of errors is reported.

@@ -9,7 +9,6 @@ change it.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -193,18 +192,11 @@ class Trunk(nn.Module):
                 inputs = outputs
             self._ends.append(len(blocks))
         self._blocks = nn.ModuleList(blocks)
-        for parameter in self._frozen():
-            parameter.requires_grad_(False)
-
-    def _frozen(self) -> Iterator[nn.Parameter]:
-        if self.config.frozen_stages >= 0:
-            yield from self._conv_stem.parameters()
-            for block in list(self._blocks)[: self._frozen_blocks]:
-                yield from block.parameters()
-
-    @property
-    def _frozen_blocks(self) -> int:
-        return self._ends[self.config.frozen_stages - 1] if self.config.frozen_stages > 0 else 0
+        if config.frozen_stages >= 0:
+            self._conv_stem.requires_grad_(False)
+            frozen = self._ends[config.frozen_stages - 1] if config.frozen_stages else 0
+            for block in blocks[:frozen]:
+                block.requires_grad_(False)
 
     def forward(self, image: Float[Tensor, "b 3 h w"], styles: StyleMixing | None = None) -> list[Tensor]:
         """Return maps (b, c, h / stride, w / stride) for the strides of `TAP_STRIDES`."""

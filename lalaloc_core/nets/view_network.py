@@ -48,16 +48,12 @@ class ViewEncoderConfig(TrunkEncoderConfig):
         """Return the azimuths (radians) that the patch spans."""
         return TWO_PI * self.sectors / ring.sectors
 
-    def column_azimuths(self, ring: RingConfig, rays: int = 1) -> Float[np.ndarray, "columns"]:
-        """Return the azimuth (radians, relative to the patch's centre) of column centres, `rays` per pixel."""
-        columns = self.image_width * rays
-        return ((np.arange(columns) + 0.5) / columns - 0.5) * self.width_rad(ring)
-
-    def row_elevations(self, ring: RingConfig, rays: int = 1) -> Float[np.ndarray, "rows"]:
-        """Return the elevation (radians) of row centres, `rays` per pixel."""
-        rows = self.image_height * rays
+    def directions(self, ring: RingConfig) -> tuple[Float[Tensor, "columns"], Float[Tensor, "rows"]]:
+        """Return azimuths of columns, relative to the patch's centre, and elevations of rows (radians) at centres."""
+        azimuths = ((np.arange(self.image_width) + 0.5) / self.image_width - 0.5) * self.width_rad(ring)
         pixel = self.width_rad(ring) / self.image_width
-        return np.radians(self.top_deg) - (np.arange(rows) + 0.5) * pixel / rays
+        elevations = np.radians(self.top_deg) - (np.arange(self.image_height) + 0.5) * pixel
+        return torch.from_numpy(azimuths).float(), torch.from_numpy(elevations).float()
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,8 @@ class ViewNetwork(HorizonEncoder):
         columns = config.sectors * self.columns_per_sector
         self.register_buffer("pooling", _pooling(config.image_width, columns), persistent=False)
         self.pooling: Tensor
-        self.row_elevations = config.row_elevations(ring)
+        # Not a tensor, which an export would take for a constant of the network.
+        self._elevations = config.directions(ring)[1].numpy()
         self.to_objects: nn.Module | None = None
         if config.objects:
             width, inputs = config.mixer_width, 2 * config.trunk.widths[-1]
@@ -108,7 +105,7 @@ class ViewNetwork(HorizonEncoder):
         }
         taken["join.weight"] = torch.zeros_like(own["join.weight"])
         taken["join.weight"][:, : sphere.join.in_features] = theirs["join.weight"]
-        elevations = torch.from_numpy(self.row_elevations).float()
+        elevations = torch.from_numpy(self._elevations)
         for number, stride in enumerate(TAP_STRIDES):
             weight = theirs[f"squeezes.{number}.weight"]
             rows, own_rows = sphere.config.image_height // stride, self.config.image_height // stride

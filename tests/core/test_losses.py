@@ -267,7 +267,7 @@ class TestAccuracy:
 
     @given(st.lists(st.floats(0.0, 10.0) | st.just(float("nan")), min_size=1, max_size=30))
     def test_shares_grow_with_the_limit(self, errors: list[float]) -> None:
-        figures = Accuracy.from_errors(np.array(errors)).to_dict()
+        figures = vars(Accuracy.from_errors(np.array(errors)))
         shares = [figures[f"within_{limit}"] for limit in ("1cm", "5cm", "10cm", "1m")]
         assert shares == sorted(shares)
         assert shares[0] >= 0.0

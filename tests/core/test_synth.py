@@ -266,12 +266,12 @@ def test_furniture_stays_in_its_room_clear_of_the_camera(seed: int) -> None:
         openings = [opening for opening in home.openings if opening.room == shot.room_index]
         roomy = room.shape.buffer(0.05)
         for prism in furnish(room, openings, "full", rng, shot.position_m):
-            assert shapely.contains_xy(roomy, prism.x, prism.y)
-            assert prism.z0 < prism.z1 < room.ceiling_height_m
-            if prism.z1 < 0.05:
+            assert shapely.contains_xy(roomy, *prism.centre_m)
+            z0, z1 = prism.z_m
+            assert z0 < z1 < room.ceiling_height_m
+            if z1 < 0.05:
                 continue
-            axis = np.array([prism.axis_x, prism.axis_y])
-            footprint = rectangle(np.array([prism.x, prism.y]), axis, prism.half_a, prism.half_b)
+            footprint = rectangle(prism.centre_m, prism.axis, *prism.half_m)
             assert shapely.distance(footprint, shapely.Point(shot.position_m)) > CAMERA_CLEARANCE_M - 0.1
 
 

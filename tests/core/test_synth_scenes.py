@@ -152,11 +152,9 @@ def test_built_in_furniture_stays_in_its_room_clear_of_doors(seed: int, fitted: 
     for index, room in enumerate(home.plan.rooms):
         openings = [opening for opening in home.openings if opening.room == index]
         for prism in furnish(room, openings, "empty", rng, built_in=True, fitted=fitted):
-            footprint = rectangle(
-                np.array([prism.x, prism.y]), np.array([prism.axis_x, prism.axis_y]), prism.half_a, prism.half_b
-            )
+            footprint = rectangle(prism.centre_m, prism.axis, *prism.half_m)
             assert room.shape.buffer(0.03).contains(footprint)
-            assert prism.z1 < room.ceiling_height_m
+            assert prism.z_m[1] < room.ceiling_height_m
             for opening in openings:
                 start, along, inwards = wall_frame(room, opening.wall)
                 before = start + along * 0.5 * (opening.start_m + opening.end_m) + inwards * 0.1
@@ -172,9 +170,8 @@ def test_ceiling_boxes_stay_in_their_room_above_camera_and_openings(seed: int) -
         openings = [opening for opening in home.openings if opening.room == index]
         camera_m = rng.uniform(0.5, room.ceiling_height_m - 0.3)
         for prism in ceiling_boxes(room, openings, camera_m, rng):
-            assert camera_m < prism.z0 < prism.z1 == room.ceiling_height_m
-            axis = np.array([prism.axis_x, prism.axis_y])
-            footprint = rectangle(np.array([prism.x, prism.y]), axis, prism.half_a, prism.half_b)
+            assert camera_m < prism.z_m[0] < prism.z_m[1] == room.ceiling_height_m
+            footprint = rectangle(prism.centre_m, prism.axis, *prism.half_m)
             assert footprint.difference(room.shape.buffer(0.01)).area <= 0.01 * footprint.area
             if prism.finish != "paint":
                 continue
@@ -182,8 +179,8 @@ def test_ceiling_boxes_stay_in_their_room_above_camera_and_openings(seed: int) -
             for opening in openings:
                 start, along, inwards = wall_frame(room, opening.wall)
                 before = start + along * 0.5 * (opening.start_m + opening.end_m) + inwards * 0.05
-                parallel = abs(float(axis @ along)) > 0.99
-                assert not parallel or prism.z0 > opening.head_m or not footprint.contains(shapely.Point(before))
+                parallel = abs(float(prism.axis @ along)) > 0.99
+                assert not parallel or prism.z_m[0] > opening.head_m or not footprint.contains(shapely.Point(before))
 
 
 @pytest.mark.slow

@@ -28,20 +28,18 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import BundleError, InvalidInputError
 from lalaloc_core.evaluate.calibrate.parameter_fits import (
     Answers,
-    cross_validate,
     fit_confidence,
     fit_matching_weights,
+    validation_figures,
     with_heading_doubt,
 )
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.factories import build_dataset, describe_model
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.data.synthetic import training_plans
-from lalaloc_core.learn.metrics import Accuracy
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import Cohort, cohort_of, layouts_at
 from lalaloc_core.localise.query import CameraHeight
@@ -178,10 +176,7 @@ def store_confidence(
 ) -> Bundle:
     """Fit the confidence of spheres or of views, and store it with the validation figures in the manifest."""
     prefix = "view_validation" if views else "validation"
-    metrics = {**bundle.manifest.metrics, f"{prefix}_queries": description}
-    for name, answers in ((prefix, known), (f"{prefix}_heading_searched", searched)):
-        metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
-        metrics[f"{name}_confidence"] = cross_validate(answers)
+    metrics = {**bundle.manifest.metrics, **validation_figures(prefix, description, known, searched)}
     manifest = _with_calibration(bundle.manifest, views, confidence=fit_confidence(known, searched))
     return write_manifest(bundle.folder, replace(manifest, metrics=metrics))
 

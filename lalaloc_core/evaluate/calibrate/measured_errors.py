@@ -87,21 +87,18 @@ class Outcome(NamedTuple):
     found: dict[str, bool]
 
 
-def outcome_of(spot: Spot, model: LocalModel) -> Outcome:
-    """Localise the photographs of a spot."""
-    grid = model.grid(spot.plan, spot.views[0].camera_height_m)
-    queries, found = queries_of(spot, model.encoder), dict[str, bool]()
-    for name, query in queries.items():
-        answer = model.localise(spot.plan, grid, query).candidates[0]
-        found[name] = bool(np.linalg.norm(answer.position_m - spot.views[0].position_m) < RIGHT_WITHIN_M)
-    compared = {name: _compared(spot, queries[f"{name}_known_heading"]) for name in ("sphere", "phone")}
-    return Outcome(spot, compared, found)
-
-
 def outcomes_of(bundle: Bundle, homes: int, split: Split, textures: Path | None) -> list[Outcome]:
     """Localise the photographs of generated homes, 4 spots in each."""
-    model = LocalModel(bundle)
-    return [outcome_of(spot, model) for spot in spots(homes, split, textures)]
+    model, outcomes = LocalModel(bundle), list[Outcome]()
+    for spot in spots(homes, split, textures):
+        grid = model.grid(spot.plan, spot.views[0].camera_height_m)
+        queries, found = queries_of(spot, model.encoder), dict[str, bool]()
+        for name, query in queries.items():
+            answer = model.localise(spot.plan, grid, query).candidates[0]
+            found[name] = bool(np.linalg.norm(answer.position_m - spot.views[0].position_m) < RIGHT_WITHIN_M)
+        compared = {name: _compared(spot, queries[f"{name}_known_heading"]) for name in ("sphere", "phone")}
+        outcomes.append(Outcome(spot, compared, found))
+    return outcomes
 
 
 def predicted_shares(

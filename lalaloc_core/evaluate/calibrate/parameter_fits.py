@@ -11,7 +11,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -21,7 +22,8 @@ from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import Prediction
-from lalaloc_core.evaluate.runs.score import expected_calibration_error
+from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
+from lalaloc_core.learn.metrics import Accuracy
 from lalaloc_core.localise.belief import HEADING_SEPARATION, RIGHT_WITHIN_M, marginal_information
 
 # Weight of unknown places in the fit, chosen on annotated photographs among 0.25, 0.4, 0.5 and 0.6: the lowest with
@@ -62,11 +64,8 @@ class Answers:
 
     def among(self, homes: Collection[str]) -> Answers:
         """Return the predictions for some homes."""
-        own, disturbed, mismatched = (
-            [prediction for prediction in part if prediction.scene in homes]
-            for part in (self.own, self.disturbed, self.mismatched)
-        )
-        return Answers(own=own, disturbed=disturbed, mismatched=mismatched)
+        parts = vars(self).items()
+        return Answers(**{name: [answer for answer in part if answer.scene in homes] for name, part in parts})
 
 
 def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
@@ -154,6 +153,15 @@ def _own(answers: Answers) -> list[tuple[Prediction, str]]:
 def _grid_cost(answer: Prediction) -> float | None:
     """Return the cost of the best grid pose; None without an answer."""
     return answer.signals["retrieval"]["cost"] if "retrieval" in answer.signals else None
+
+
+def validation_figures(prefix: str, queries: str, known: Answers, searched: Answers) -> dict[str, Any]:
+    """Return the entries of a manifest's `metrics` about predictions for some queries, named after `prefix`."""
+    figures: dict[str, Any] = {f"{prefix}_queries": queries}
+    for name, answers in ((prefix, known), (f"{prefix}_heading_searched", searched)):
+        figures[name] = asdict(Accuracy.from_errors(position_errors_m(answers.own)))
+        figures[f"{name}_confidence"] = cross_validate(answers)
+    return figures
 
 
 def cross_validate(answers: Answers) -> dict[str, float]:

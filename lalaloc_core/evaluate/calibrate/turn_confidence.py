@@ -25,17 +25,15 @@ from tqdm import tqdm
 from lalaloc_core.bundle import Bundle, write_manifest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.calibrate.parameter_fits import Answers, cross_validate, fit_confidence
+from lalaloc_core.evaluate.calibrate.parameter_fits import Answers, fit_confidence, validation_figures
 from lalaloc_core.evaluate.methods.lalaloc import found_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import Prediction
-from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.data.synthetic.turned import Phone, photographs_of_turn
 from lalaloc_core.learn.data.views import encode_jpeg
-from lalaloc_core.learn.metrics import Accuracy
 from lalaloc_core.learn.synth.augmentation import jittered, optics
 from lalaloc_core.learn.synth.homes.plans import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
@@ -80,46 +78,30 @@ class _Taken(NamedTuple):
     hfov_deg: float
 
 
-class TurnPredictions(NamedTuple):
-    """Predictions for turns, with a known and with a searched heading."""
-
-    known: Answers
-    searched: Answers
-
-
 def calibrate_turns(folder: Path, settings: TurnSettings) -> Bundle:
-    """Fit the confidence of turns, and store it in the bundle's manifest with its validation figures."""
+    """Fit the confidence of turns, and store it in the bundle's manifest with its validation figures.
+
+    Turns are localised in their own plans, disturbed, and in plans of other buildings.
+    """
     bundle = Bundle.open(folder)
-    if bundle.manifest.view is None:
-        raise InvalidInputError(f"model '{bundle.manifest.name}' has no encoder of views; leave out --turns")
-    return store_turn_confidence(bundle, turn_predictions(bundle, settings))
-
-
-def store_turn_confidence(bundle: Bundle, found: TurnPredictions) -> Bundle:
-    """Fit the confidence of turns on predictions, and store it in the bundle's manifest with validation figures."""
-    view, metrics = bundle.manifest.view, dict(bundle.manifest.metrics)
-    assert view is not None, "the bundle has no encoder of views"
-    homes = len({prediction.scene for prediction in found.searched.own})
-    metrics["turn_validation_queries"] = (
-        f"{len(found.searched.own)} turns of {_FEWEST} to {_PHOTOGRAPHS} photographs of 53° and 67° in {homes} "
-        f"generated validation homes, with an arm of {_UPRIGHT.arm_m:g} m; confidence besides on the same disturbed, "
-        f"and on {len(found.searched.mismatched)} turns in other buildings"
-    )
-    for name, answers in (("turn_validation", found.known), ("turn_validation_heading_searched", found.searched)):
-        metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
-        metrics[f"{name}_confidence"] = cross_validate(answers)
-    view = replace(view, turn_confidence=fit_confidence(found.known, found.searched))
-    return write_manifest(bundle.folder, replace(bundle.manifest, view=view, metrics=metrics))
-
-
-def turn_predictions(bundle: Bundle, settings: TurnSettings) -> TurnPredictions:
-    """Localise turns in their own plans, disturbed, and in plans of other buildings."""
+    manifest, view = bundle.manifest, bundle.manifest.view
+    if view is None:
+        raise InvalidInputError(f"model '{manifest.name}' has no encoder of views; leave out --turns")
     model = LocalModel(bundle)
-    lists: dict[bool, dict[str, list[Prediction]]] = {known: defaultdict(list) for known in (True, False)}
+    lists: dict[bool, dict[str, list[Prediction]]] = {is_known: defaultdict(list) for is_known in (True, False)}
     for index in tqdm(range(settings.homes), desc="turns of homes", disable=None, leave=False):
-        for known, part, prediction in _predictions(model, settings, index):
-            lists[known][part].append(prediction)
-    return TurnPredictions(*(Answers(**lists[known]) for known in (True, False)))
+        for is_known, part, prediction in _predictions(model, settings, index):
+            lists[is_known][part].append(prediction)
+    known, searched = (Answers(**lists[is_known]) for is_known in (True, False))
+    homes = len({prediction.scene for prediction in searched.own})
+    description = (
+        f"{len(searched.own)} turns of {_FEWEST} to {_PHOTOGRAPHS} photographs of 53° and 67° in {homes} generated "
+        f"validation homes, with an arm of {_UPRIGHT.arm_m:g} m; confidence besides on the same disturbed, and on "
+        f"{len(searched.mismatched)} turns in other buildings"
+    )
+    metrics = {**manifest.metrics, **validation_figures("turn_validation", description, known, searched)}
+    view = replace(view, turn_confidence=fit_confidence(known, searched))
+    return write_manifest(bundle.folder, replace(manifest, view=view, metrics=metrics))
 
 
 def _predictions(

@@ -65,11 +65,9 @@ class LaLaLoc:
         refiner: Refiner | None = None,
         config: LocaliseConfig | None = None,
         stated: StatedHeight = StatedHeight(),
-        photograph_encoder: PhotographEncoder | None = None,
         heading_error_deg: float = 0.0,
     ) -> None:
         self.encoders = encoders
-        self._photograph_encoder = photograph_encoder
         self._heading_error = math.radians(heading_error_deg)
         self._stated = stated
         self._refine: Refine = refine
@@ -94,9 +92,6 @@ class LaLaLoc:
             refiner=self._refiner,
             config=self._config,
         )
-        signals: dict[str, dict[str, float]] = {
-            stage: dataclasses.asdict(values) for stage, values in found.signals.items()
-        }
         # The confidence model is fitted on photographs and the default matching cost.
         calibrated = question.kind == "photograph" and self._config.matching == MatchingConfig()
         confidence = found.confidence(self.encoders.manifest.confidence_for(view=query.is_view)) if calibrated else None
@@ -109,7 +104,7 @@ class LaLaLoc:
                 for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
             ),
             retrieved=grid_index(grid, found.best["retrieval"]),
-            signals=signals,
+            signals={stage: dataclasses.asdict(values) for stage, values in found.signals.items()},
             information=found.best[found.stage].information,
             confidence=None if confidence is None else confidence.position,
             heading_confidence=None if confidence is None else confidence.heading,
@@ -123,16 +118,13 @@ class LaLaLoc:
             image = read_image(self.encoders, question)
             with clock.stage("encode"):
                 return encode(self.encoders, question, image, self._stated)
-        assert self._photograph_encoder is not None, "views need an encoder of photographs"
         view = photograph.open(patch_size(self.encoders.manifest))
         heading = None
         if question.heading_known:
             rng = np.random.default_rng(zlib.crc32(camera.position_m.tobytes()))
             heading = camera.heading + float(rng.uniform(-self._heading_error, self._heading_error))
         with clock.stage("encode"):
-            return self._photograph_encoder.query(
-                view, heading, self._stated.of(question), heading_tolerance=self._heading_error
-            )
+            return self.encoders.query(view, heading, self._stated.of(question), heading_tolerance=self._heading_error)
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
     def grid(self, question: Question) -> PoseGrid:

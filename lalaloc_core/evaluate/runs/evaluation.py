@@ -14,7 +14,6 @@ import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -28,15 +27,7 @@ from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.runs.albums import predict_album
 from lalaloc_core.evaluate.runs.factories import build_dataset, build_method, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.learn.data.dataset import (
-    Appearance,
-    Camera,
-    Dataset,
-    Scene,
-    collect_error,
-    load_scenes,
-    photograph_facts,
-)
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, collect_error, load_scenes
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
@@ -129,38 +120,29 @@ def _localise_scenes(
         pool.shutdown(cancel_futures=True)
 
 
-@dataclass(frozen=True)
-class _Session:
-    """State of a worker process between scenes; a `LocalModel` solves albums."""
-
-    info: RunInfo
-    dataset: Dataset
-    method: Method | LocalModel
-
-
 @lru_cache(maxsize=1)
-def _session(description: str) -> _Session:
+def _session(description: str) -> tuple[RunInfo, Dataset, Method | LocalModel]:
+    """Return the state of a worker process between scenes; a `LocalModel` solves albums."""
     torch.set_num_threads(1)
     info = build_config(RunInfo, json.loads(description))
     method = LocalModel(require_bundle(info)) if info.albums else build_method(info)
-    return _Session(info, build_dataset(info), method)
+    return info, build_dataset(info), method
 
 
 def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list[DatasetError]]:
     """Return the predictions of one scene and, with `skip_bad`, the errors of unusable scenes and cameras."""
-    session = _session(description)
-    info = session.info
+    info, dataset, method = _session(description)
     problems: list[DatasetError] | None = [] if info.skip_bad else None
     predictions: list[Prediction] = []
-    for scene in load_scenes(session.dataset, [name], problems):
-        if isinstance(session.method, LocalModel):
+    for scene in load_scenes(dataset, [name], problems):
+        if isinstance(method, LocalModel):
             with collect_error(problems):
-                predictions += predict_album(scene, info, session.method, problems)
+                predictions += predict_album(scene, info, method, problems)
             continue
         evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
             with collect_error(problems):
-                predictions.append(evaluator.predict(camera, session.method))
+                predictions.append(evaluator.predict(camera, method))
     return predictions, problems or []
 
 
@@ -190,6 +172,7 @@ class _SceneEvaluator:
         info, scene = self._info, self._scene
         question = question_of(scene, camera, info, self._grid)
         answer = method.locate(question)
+        layout_hit, pose_hit = self._hits(question, answer)
         return Prediction(
             scene=scene.name,
             camera=camera.name,
@@ -197,8 +180,8 @@ class _SceneEvaluator:
             camera_height_m=camera.camera_height_m,
             truth=Pose.at(camera.position_m, camera.room_index, camera.heading),
             stages=answer.stages,
-            layout_hit=self._layout_hit(question, answer),
-            pose_hit=self._pose_hit(camera, answer),
+            layout_hit=layout_hit,
+            pose_hit=pose_hit,
             room_rank=answer.rank_of_room(camera.room_index),
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
@@ -207,21 +190,17 @@ class _SceneEvaluator:
             heading_confidence=answer.heading_confidence,
             found_height_m=answer.camera_height_m,
             timings_ms=answer.timings_ms,
-            facts=tuple(sorted(photograph_facts(question.photograph))),
+            facts=tuple(sorted(getattr(question.photograph, "facts", ()))),
         )
 
-    def _layout_hit(self, question: Question, answer: Answer) -> bool | None:
-        """Return whether retrieval chose the grid pose with the nearest layout, the first of equals."""
+    def _hits(self, question: Question, answer: Answer) -> tuple[bool | None, bool | None]:
+        """Return whether retrieval chose the pose with the nearest layout, the first of equals, and the nearest one."""
         if answer.retrieved is None:
-            return None
+            return None, None
         height = question.camera.camera_height_m
         if height not in self._layouts:
             self._layouts[height] = ChamferGrid(self._scene.plan, self._grid, height)
         layouts = self._layouts[height]
-        return layouts.nearest(true_layout(question, layouts.columns)) == answer.retrieved
-
-    def _pose_hit(self, camera: Camera, answer: Answer) -> bool | None:
-        if answer.retrieved is None:
-            return None
-        distance = np.linalg.norm(self._grid.position_m - camera.position_m, axis=1)
-        return int(distance.argmin()) == answer.retrieved
+        layout = layouts.nearest(true_layout(question, layouts.columns))
+        pose = int(np.linalg.norm(self._grid.position_m - question.camera.position_m, axis=1).argmin())
+        return layout == answer.retrieved, pose == answer.retrieved

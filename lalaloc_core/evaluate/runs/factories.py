@@ -121,8 +121,7 @@ def build_method(info: RunInfo) -> Method:
     if info.method == "icp":
         return Icp()
     bundle = require_bundle(info)
-    photographs = PhotographEncoder(bundle, threads=1)
-    encoders = photographs
+    encoders = PhotographEncoder(bundle, threads=1)
     # Tensors of a few poses are too small for several threads.
     torch.set_num_threads(1)
     if info.method == "explicit":
@@ -130,10 +129,10 @@ def build_method(info: RunInfo) -> Method:
     if info.method == "decode":
         return VdrDecode(encoders, load_decoder(bundle))
     assert isinstance(settings, LaLaLocSettings)
-    return _lalaloc(bundle, photographs, settings)
+    return _lalaloc(bundle, encoders, settings)
 
 
-def _lalaloc(bundle: Bundle, photographs: PhotographEncoder, settings: LaLaLocSettings) -> LaLaLoc:
+def _lalaloc(bundle: Bundle, encoders: PhotographEncoder, settings: LaLaLocSettings) -> LaLaLoc:
     refiner = None
     if settings.refine == "lpo":
         refiner = local_refiner(bundle, LpoConfig(method=settings.optimiser))
@@ -157,12 +156,11 @@ def _lalaloc(bundle: Bundle, photographs: PhotographEncoder, settings: LaLaLocSe
         std_m=settings.camera_height_std_m,
     )
     return LaLaLoc(
-        photographs,
+        encoders,
         refine=settings.refine,
         refiner=refiner,
         config=config,
         stated=stated,
-        photograph_encoder=photographs,
         heading_error_deg=settings.heading_error_deg,
     )
 

@@ -28,7 +28,7 @@ from lalaloc_core.floorplan import FloorPlan
 
 _RESAMPLES = 1000
 _COVERAGE = 0.95
-RELIABILITY_BINS = 10
+_BINS = 10
 # Fewer queries say too little for an interval to be printed.
 MIN_QUERIES = 20
 
@@ -170,20 +170,18 @@ def _errors(
     return np.array([np.nan if pose is None else error(pose, truth) for pose, truth in poses], dtype=float)
 
 
-def reliability_bins(
-    confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"], bins: int = RELIABILITY_BINS
-) -> tuple[ReliabilityBin, ...]:
+def reliability_bins(confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"]) -> tuple[ReliabilityBin, ...]:
     """Return the non-empty bins of the reliability diagram, equally wide in confidence."""
-    index: Int[np.ndarray, "n"] = np.minimum((confidence * bins).astype(int), bins - 1)
+    index: Int[np.ndarray, "n"] = np.minimum((confidence * _BINS).astype(int), _BINS - 1)
     return tuple(
         ReliabilityBin(
-            low=b / bins,
-            high=(b + 1) / bins,
+            low=b / _BINS,
+            high=(b + 1) / _BINS,
             count=int((index == b).sum()),
             confidence=float(confidence[index == b].mean()),
             frequency=float(correct[index == b].mean()),
         )
-        for b in range(bins)
+        for b in range(_BINS)
         if (index == b).any()
     )
 

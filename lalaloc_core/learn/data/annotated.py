@@ -94,16 +94,17 @@ class AnnotatedPhotographs:
         others = [other.outlines[0] for other in self.photographs if other is not photograph]
         rng = np.random.default_rng([zlib.crc32(photograph.name.encode()), key.gallery])
         own = photograph.outlines[key.outline]
-        gallery = build_gallery(own, others, CAMERA_HEIGHT_M, rng, like=photograph.outlines[0])
+        first = photograph.outlines[0]
+        plan, room_index, position_m, heading = build_gallery(own, others, CAMERA_HEIGHT_M, rng, like=first)
         camera = Camera(
             name=photograph.name,
-            position_m=gallery.position_m,
-            room_index=gallery.room_index,
-            heading=gallery.heading,
+            position_m=position_m,
+            room_index=room_index,
+            heading=heading,
             camera_height_m=CAMERA_HEIGHT_M,
             photographs={Appearance(): photograph.photograph},
         )
-        return Scene(name=name, plan=gallery.plan, cameras=(camera,))
+        return Scene(name=name, plan=plan, cameras=(camera,))
 
 
 def annotation_files(root: Path) -> list[Path]:
@@ -126,24 +127,16 @@ _PER_ROW = 5
 _GAP_M = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class RoomGallery:
-    """Plan of `GALLERY_ROOMS` rooms, and the pose of the own room's frame in it: origin, and heading of its +y."""
-
-    plan: FloorPlan
-    room_index: int
-    position_m: Float[np.ndarray, "2"]
-    heading: float
-
-
 def build_gallery(
     own: DrawnRoom,
     others: Sequence[DrawnRoom],
     camera_height_m: float,
     rng: np.random.Generator,
     like: DrawnRoom | None = None,
-) -> RoomGallery:
+) -> tuple[FloorPlan, int, Float[np.ndarray, "2"], float]:
     """Place a room among similar ones, all aligned with the axes and randomly rotated by quarter turns.
+
+    Returns the plan of `GALLERY_ROOMS` rooms, the index of the own room, the origin of its frame and the heading of +y.
 
     `own` has the camera at its origin, looking along +y. Of the `others`, those most similar to `like` (default: `own`)
     in size and shape are used, up to `_MAX_DRAWN`, rescaled within `_RESCALED`; the rest are generated rooms of similar
@@ -166,7 +159,7 @@ def build_gallery(
     room_index = int(np.flatnonzero(order == 0)[0])
     plan = plan_of_rooms(f"gallery of {own.name}", placed, camera_height_m)
     # Azimuth grows clockwise, angles counter-clockwise.
-    return RoomGallery(plan, room_index, places[room_index], float(wrap_angle(-turns[0])))
+    return plan, room_index, places[room_index], float(wrap_angle(-turns[0]))
 
 
 @lru_cache(maxsize=1)

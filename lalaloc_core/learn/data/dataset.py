@@ -36,7 +36,10 @@ class Appearance:
 
 @runtime_checkable
 class DatasetPhotograph(Protocol):
-    """Sphere that is read on demand."""
+    """Sphere that is read on demand.
+
+    It can have `facts`, names of what makes it hard to localise, such as "open_door" or "near_wall".
+    """
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size."""
@@ -45,21 +48,6 @@ class DatasetPhotograph(Protocol):
     def depth_m(self) -> Float[np.ndarray, "h w"]:
         """Return the distance (m) along each pixel's ray, furniture included; NaN without a reading."""
         ...
-
-
-@runtime_checkable
-class Described(Protocol):
-    """DatasetPhotograph with known facts that make it hard to localise, besides its appearance."""
-
-    @property
-    def facts(self) -> frozenset[str]:
-        """Names of the facts, such as "open_door" or "near_wall"; computed on demand."""
-        ...
-
-
-def photograph_facts(photograph: DatasetPhotograph | None) -> frozenset[str]:
-    """Return the facts of a photograph; empty if they are unknown."""
-    return photograph.facts if isinstance(photograph, Described) else frozenset()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -170,10 +158,7 @@ class FilePhotograph:
 
     def content(self) -> bytes:
         """Return the file."""
-        content = self._read(self.path)
-        if self.size is not None:
-            self._check_size(self.path, content)
-        return content
+        return self._read(self.path)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Return RGB pixels at the given size."""
@@ -189,8 +174,6 @@ class FilePhotograph:
         if self.depth_path is None:
             raise self._error("the data set has no depth", self.path)
         content = self._read(self.depth_path)
-        if self.size is not None:
-            self._check_size(self.depth_path, content)
         try:
             with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
                 if not image.mode.startswith("I"):
@@ -203,13 +186,13 @@ class FilePhotograph:
         return np.where(depth_mm == 0, np.nan, depth_mm / _MM_PER_M)
 
     def _read(self, path: Path) -> bytes:
+        """Return a file of the required size, which its header tells before any pixel is decoded."""
         try:
-            return path.read_bytes()
+            content = path.read_bytes()
         except OSError as error:
             raise self._error(f"cannot be read: {error.strerror}", path) from error
-
-    def _check_size(self, path: Path, content: bytes) -> None:
-        """Check the size in the file's header before any pixel is decoded."""
+        if self.size is None:
+            return content
         try:
             with Image.open(io.BytesIO(content)) as image:
                 width, height = image.size
@@ -217,10 +200,11 @@ class FilePhotograph:
             raise self._error("not a readable picture", path) from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise self._error(f"damaged: {error}", path) from error
-        if (height, width) != self.size and self.size is not None:
+        if (height, width) != self.size:
             raise self._error(
                 f"the picture is {width} x {height}; this data set requires {self.size[1]} x {self.size[0]}", path
             )
+        return content
 
     def _error(self, reason: str, path: Path) -> DatasetError:
         return DatasetError(reason, scene=self.scene, room=self.room, path=path)

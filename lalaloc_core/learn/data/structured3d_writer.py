@@ -20,6 +20,7 @@ from PIL import Image
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.learn.data.structured3d import ANNOTATION_FILE, SPHERE_SIZE
+from lalaloc_core.learn.synth.furniture.furnish import opening_ends_m
 from lalaloc_core.learn.synth.homes.openings import Opening
 
 _MM_PER_M = 1000.0
@@ -37,11 +38,6 @@ _SAME_ROOM_TYPES = (
 )
 
 
-def room_id(room_index: int) -> str:
-    """Return the semantic's ID, which is also the name of the room's panorama folder."""
-    return str(room_index)
-
-
 def room_type(name: str) -> str:
     """Return Structured3D's type of a room from its name, such as "bedroom 2"."""
     kind = name.rstrip("0123456789 ")
@@ -56,7 +52,7 @@ def write_annotation(scene: Path, plan: FloorPlan, openings: Sequence[Opening]) 
 
 
 def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, Any]:
-    """Build the annotation of a home; the semantic with ID k is room k of the plan."""
+    """Build the annotation of a home; the semantic with ID k is room k of the plan, whose panoramas are in folder k."""
     drawing = _Drawing()
     rooms = []
     for room in plan.rooms:
@@ -67,7 +63,7 @@ def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, 
         twin = _twin(plan, openings, opening)
         if twin is not None and twin.room < opening.room:
             continue
-        near, far = _ends_m(plan, opening), _far_side_m(plan, opening, twin)
+        near, far = opening_ends_m(plan.rooms[opening.room], opening), _far_side_m(plan, opening, twin)
         box = drawing.prism(np.stack([near[0], far[0], far[1], near[1]]), opening.sill_m, opening.head_m)
         # The box makes a hole in its wall, and one in the wall of the room behind it.
         drawing.add_hole(rooms[opening.room].walls[opening.wall], box.walls[3])
@@ -207,24 +203,21 @@ class _Drawing:
         return len(self.planes) - 1
 
 
-def _ends_m(plan: FloorPlan, opening: Opening) -> Float[np.ndarray, "2 2"]:
-    wall = plan.rooms[opening.room].walls_m[opening.wall]
-    along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
-    return wall[:2] + np.array([[opening.start_m], [opening.end_m]]) * along
-
-
 def _twin(plan: FloorPlan, openings: Sequence[Opening], opening: Opening) -> Opening | None:
     """Return the same door in the room behind it; None if there is no room behind it."""
     facing = [twin for twin in openings if (twin.room, twin.neighbour) == (opening.neighbour, opening.room)]
-    middle = _ends_m(plan, opening).mean(axis=0)
-    return min(facing, key=lambda twin: float(np.hypot(*(_ends_m(plan, twin).mean(axis=0) - middle))), default=None)
+
+    def middle(opening: Opening) -> np.ndarray:
+        return opening_ends_m(plan.rooms[opening.room], opening).mean(axis=0)
+
+    return min(facing, key=lambda twin: float(np.hypot(*(middle(twin) - middle(opening)))), default=None)
 
 
 def _far_side_m(plan: FloorPlan, opening: Opening, twin: Opening | None) -> Float[np.ndarray, "2 2"]:
     """Return the far ends of an opening's box, in the order of the near ends."""
     if twin is not None:
-        return _ends_m(plan, twin)[::-1]
-    near = _ends_m(plan, opening)
+        return opening_ends_m(plan.rooms[twin.room], twin)[::-1]
+    near = opening_ends_m(plan.rooms[opening.room], opening)
     along = (near[1] - near[0]) / np.hypot(*(near[1] - near[0]))
     outward = np.array([along[1], -along[0]])
     far = near + outward * _OUTER_WALL_M

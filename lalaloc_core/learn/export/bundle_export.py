@@ -84,8 +84,16 @@ def export_bundle(
         parity = _export_networks(work, config, layout_encoder, image_encoder)
         if image_encoder is not None:
             _save_weights(image_encoder, work / IMAGE_WEIGHTS, beside=work / IMAGE_ONNX)
-        training = {**(training or {}), "parity_max_abs_difference": parity}
-        manifest = _manifest(config, image_encoder, name, version, training)
+        manifest = Manifest(
+            name=name,
+            version=version,
+            layout_config=dataclasses.asdict(config.layout_sizes),
+            profile_columns=config.profile_columns,
+            latent_size=config.layout_sizes.latent_size,
+            ring_sectors=config.ring.sectors if config.has_ring else 0,
+            **_image_entries(config, image_encoder),
+            training={**(training or {}), "parity_max_abs_difference": parity, "config": config.to_dict()},
+        )
         folder.mkdir(parents=True, exist_ok=True)
         # The manifest goes first, so that an interrupted export leaves no valid bundle; files of another architecture
         # go too.
@@ -128,8 +136,10 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
 
 
-def add_object_network(bundle: Bundle) -> Bundle:
-    """Add the classifier of objects to a bundle, or replace it; no other network changes."""
+def add_objects(folder: Path) -> Bundle:
+    """Add the pretrained classifier of objects to the bundle in `folder`, or replace it; no other network changes."""
+    bundle = Bundle.open(folder)
+    bundle.check()
     network = ObjectNetwork()
     _freeze(network)
     generator = torch.Generator().manual_seed(0)
@@ -346,22 +356,6 @@ def _store_in_half(model: onnx.ModelProto) -> None:
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
-
-
-def _manifest(
-    config: TrainConfig, image_encoder: ImageEncoder | None, name: str, version: str, training: dict[str, Any]
-) -> Manifest:
-    sizes = config.layout_sizes
-    return Manifest(
-        name=name,
-        version=version,
-        layout_config=dataclasses.asdict(sizes),
-        profile_columns=config.profile_columns,
-        latent_size=sizes.latent_size,
-        ring_sectors=config.ring.sectors if config.has_ring else 0,
-        **_image_entries(config, image_encoder),
-        training={**training, "config": config.to_dict()},
-    )
 
 
 def _image_entries(config: TrainConfig, encoder: ImageEncoder | None) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from typing import Any
 from lalaloc_core.bundle import IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import CheckpointError
 from lalaloc_core.learn.export.bundle_export import (
-    add_object_network,
     add_view_encoder,
     export_bundle,
     reexport_networks,
@@ -120,13 +119,6 @@ def reexport_bundle(folder: Path) -> Bundle:
         start.load_into({"image_encoder": image_encoder})
     layout_encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))
     return reexport_networks(bundle, start.checkpoint.config, layout_encoder, image_encoder)
-
-
-def add_objects(folder: Path) -> Bundle:
-    """Add the pretrained classifier of objects to the bundle in `folder`."""
-    bundle = Bundle.open(folder)
-    bundle.check()
-    return add_object_network(bundle)
 
 
 def _image_encoder(checkpoint: Checkpoint) -> ImageEncoder:

@@ -30,7 +30,7 @@ from lalaloc_core.learn.training.batches import (
 )
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
-from lalaloc_core.learn.training.sources import Group, Source, SphereSample
+from lalaloc_core.learn.training.sources import Group, Source, SphereSample, group_around
 from lalaloc_core.render.profile import render_layout
 from lalaloc_core.render.sweep import profiles_at
 
@@ -162,9 +162,9 @@ class SphereBatches(Stream):
             for sample, turn, row in self._draw(visit, replay):
                 assert isinstance(sample.image, DeferredScene)
                 if row is None:
-                    batcher.drop(sample.image)
+                    batcher.use(sample.image)
                 else:
-                    rows.append(DeferredRow(sample.image, turn, row))
+                    rows.append((sample.image, turn, row))
             return rows or None
 
         if self.source.deferred:
@@ -179,16 +179,16 @@ class SphereBatches(Stream):
         for new in self.source.samples(visit, sizes.image_height, sizes.image_width):
             for sample in replay.add_and_sample(new, rng):
                 if self.views:
-                    turn = Rotation(shift=0, heading=sample.heading, mirrored=bool(rng.random() < 0.5))
+                    turn = Rotation(shift=0, heading=sample.camera.heading, mirrored=bool(rng.random() < 0.5))
                 else:
-                    turn = sample_rotation(self.config.turns, sample.heading, sizes.image_width, rng)
+                    turn = sample_rotation(self.config.turns, sample.camera.heading, sizes.image_width, rng)
                 drawn.append((sample, turn, self._row(sample, turn, rng)))
         return drawn
 
     def _row(self, sample: SphereSample, turn: Rotation, rng: np.random.Generator) -> Row | None:
-        position, room = sample.position_m[None], np.array([sample.room_index])
+        position, room = sample.camera.position_m[None], np.array([sample.camera.room_index])
         if self.neighbours:
-            group = sample.group(self.config.layout.triplets, rng)
+            group = group_around(sample.camera, sample.plan, self.config.layout.triplets, rng)
             if group is None:
                 return None
             position, room = group.position_m, group.room_index
@@ -198,7 +198,7 @@ class SphereBatches(Stream):
         ceiling = sample.plan.ceiling_heights_m[room].astype(np.float32)
         row = {
             "profile_m": profile[0],
-            "camera_height_m": np.float32(sample.camera_height_m + self._height_error_m(rng)),
+            "camera_height_m": np.float32(sample.camera.camera_height_m + self._height_error_m(rng)),
             "ceiling_height_m": ceiling[0],
         }
         if self.config.architecture == "trunk":
@@ -208,8 +208,8 @@ class SphereBatches(Stream):
         return row
 
     def _classes(self, sample: SphereSample, turn: Rotation) -> Row:
-        room = sample.plan.rooms[sample.room_index]
-        kind, edges = seen_openings(sample.plan, sample, turn.heading, self.config.profile_columns)
+        room = sample.plan.rooms[sample.camera.room_index]
+        kind, edges = seen_openings(sample.plan, sample.camera, turn.heading, self.config.profile_columns)
         type_code = ROOM_TYPES.index(room.type)
         # Code 0 stands for rooms without a type in the plan.
         return {
@@ -224,7 +224,7 @@ class SphereBatches(Stream):
 
 
 def seen_openings(
-    plan: FloorPlan, camera: Camera | Shot | SphereSample, heading: float, columns: int
+    plan: FloorPlan, camera: Camera | Shot, heading: float, columns: int
 ) -> tuple[Int[np.ndarray, "{columns}"], Float[np.ndarray, "2 {columns}"]]:
     """Return the code seen at each azimuth at eye height, and the elevations (radians) of both edges of openings.
 

@@ -6,7 +6,7 @@ import atexit
 import itertools
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
@@ -71,12 +71,8 @@ def load_batches(stream: Stream, workers: int) -> Iterator[Any]:
     options: dict[str, Any] = {}
     if workers:
         options = {"multiprocessing_context": "spawn", "worker_init_fn": _single_thread, "prefetch_factor": 6}
-    yield from _without_failures(DataLoader(stream, batch_size=None, num_workers=workers, **options))
-
-
-def _without_failures(items: Iterable[Any]) -> Iterator[Any]:
     skipped: set[str] = set()
-    for item in items:
+    for item in DataLoader(stream, batch_size=None, num_workers=workers, **options):
         if not isinstance(item, LoadFailure):
             yield item
         elif item.fatal:

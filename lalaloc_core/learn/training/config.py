@@ -285,11 +285,6 @@ class TrainConfig:
         return self.trunk if self.architecture == "trunk" else self.layout_sizes
 
     @property
-    def latent_size(self) -> int:
-        """Dimensions of the latent."""
-        return self.layout_sizes.latent_size
-
-    @property
     def profile_columns(self) -> int:
         """Azimuth columns that the layout encoder expects."""
         return self.layout_sizes.profile_columns

@@ -30,13 +30,8 @@ class DeferredScene:
     scene: RenderScene
 
 
-@dataclass(frozen=True, eq=False)
-class DeferredRow:
-    """A row of a batch: the sphere to render, its rotation, and the other values."""
-
-    deferred: DeferredScene
-    turn: Rotation
-    rest: Row
+# A row of a batch: the sphere to render, its rotation, and the other values.
+DeferredRow = tuple[DeferredScene, Rotation, Row]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,33 +55,30 @@ class DeferredBatcher:
         self._sent: set[int] = set()
         self._evicted: list[int] = []
 
-    def drop(self, deferred: DeferredScene) -> None:
-        """Count one use of a scene that yields no row."""
-        self._use(deferred.number)
-
     def pack(self, rows: list[DeferredRow]) -> DeferredBatch:
         """Pack rows into a batch, with the scenes that it uses for the first time."""
-        scenes = {row.deferred.number: row.deferred.scene for row in rows if row.deferred.number not in self._sent}
+        scenes = {sphere.number: sphere.scene for sphere, _, _ in rows if sphere.number not in self._sent}
         self._sent |= scenes.keys()
-        for row in rows:
-            self._use(row.deferred.number)
+        for sphere, _, _ in rows:
+            self.use(sphere)
         evicted, self._evicted = tuple(self._evicted), []
         return DeferredBatch(
-            rest=stack_rows([row.rest for row in rows]),
-            number=tuple(row.deferred.number for row in rows),
-            shift=torch.tensor([row.turn.shift for row in rows]),
-            mirrored=torch.tensor([row.turn.mirrored for row in rows]),
+            rest=stack_rows([rest for _, _, rest in rows]),
+            number=tuple(sphere.number for sphere, _, _ in rows),
+            shift=torch.tensor([turn.shift for _, turn, _ in rows]),
+            mirrored=torch.tensor([turn.mirrored for _, turn, _ in rows]),
             scenes=scenes,
             evicted=evicted,
         )
 
-    def _use(self, number: int) -> None:
-        left = self._left.pop(number, self._uses) - 1
+    def use(self, sphere: DeferredScene) -> None:
+        """Count one use of a scene, also of one that yields no row."""
+        left = self._left.pop(sphere.number, self._uses) - 1
         if left:
-            self._left[number] = left
-        elif number in self._sent:
-            self._sent.remove(number)
-            self._evicted.append(number)
+            self._left[sphere.number] = left
+        elif sphere.number in self._sent:
+            self._sent.remove(sphere.number)
+            self._evicted.append(sphere.number)
 
 
 class DeferredRenderer:
@@ -102,16 +94,13 @@ class DeferredRenderer:
     def render_batches(self, batches: Iterable[DeferredBatch]) -> Iterator[Batch]:
         """Yield each batch with `image` (b, h, w, 4) uint8 on the device; the last channel tells walls."""
         for batch in batches:
-            yield self._render(batch)
-
-    def _render(self, batch: DeferredBatch) -> Batch:
-        if batch.scenes:
-            images = self._renderer.render_scenes(list(batch.scenes.values()), walls=True)
-            self._images.update(zip(batch.scenes, images, strict=True))
-        shown = torch.stack([self._images[number] for number in batch.number])
-        for number in batch.evicted:
-            del self._images[number]
-        return batch.rest | {"image": rotate_images(shown, batch.shift, batch.mirrored)}
+            if batch.scenes:
+                images = self._renderer.render_scenes(list(batch.scenes.values()), walls=True)
+                self._images.update(zip(batch.scenes, images, strict=True))
+            shown = torch.stack([self._images[number] for number in batch.number])
+            for number in batch.evicted:
+                del self._images[number]
+            yield batch.rest | {"image": rotate_images(shown, batch.shift, batch.mirrored)}
 
 
 def rotate_images(

@@ -54,14 +54,9 @@ class ImageStage(TrainingStage[ImageStageConfig]):
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield sphere batches."""
         self._first_step, self._generators = first_step, {}
-        return sphere_batches(
-            self.config,
-            self.source,
-            neighbours=bool(self.settings.log_ratio_weight or self.settings.kd_weight),
-            first_step=first_step,
-            workers=workers,
-            device=next(self.encoder.parameters()).device,
-        )
+        device = next(self.encoder.parameters()).device
+        neighbours = bool(self.settings.log_ratio_weight or self.settings.kd_weight)
+        return sphere_batches(self.config, self.source, first_step, workers, device, neighbours=neighbours)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name."""
@@ -118,14 +113,11 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         features = self.encoder(images, heights, styles)
         assert features.structure is not None
         assert isinstance(self.encoder, TrunkImageEncoder)
-        openings, log_distance = (
-            target.to(image.device) for target in (photographs.openings, photographs.log_distance)
-        )
         rows = slice(len(image), None)
         logits = features.structure.opening_logits[rows]
         known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
         weight = opening_weight(settings, self.encoder, self.photographs)
-        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, openings, log_distance, weight)
+        loss = photograph_loss(settings, features.walls.rows(rows), logits, known, photographs, weight)
         return first_rows(features, len(image)), {"photographs": loss}
 
     def _structure_losses(

@@ -160,14 +160,8 @@ class EndToEndStage(TrainingStage[ImageStageConfig]):
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Yield sphere batches with neighbours."""
-        return sphere_batches(
-            self.config,
-            self.source,
-            neighbours=True,
-            first_step=first_step,
-            workers=workers,
-            device=next(self.encoder.parameters()).device,
-        )
+        device = next(self.encoder.parameters()).device
+        return sphere_batches(self.config, self.source, first_step, workers, device, neighbours=True)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name."""

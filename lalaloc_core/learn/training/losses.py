@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, WALL_CODE
+from lalaloc_core.conventions import PASSAGE_CODE, WALL_CODE
 from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 
 # Keeps log and its gradient finite when two latents coincide.
@@ -70,11 +70,6 @@ def laplace_mixture(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[
     return (loss * known).sum() / known.sum().clamp_min(1)
 
 
-def is_passage(opening_logits: Float[Tensor, "b w c"]) -> Bool[Tensor, "b w"]:
-    """Return the azimuths where a network predicts a passage."""
-    return torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")] >= 0.5
-
-
 def wall_shape(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[Tensor, "b w"]) -> Tensor:
     """Return the mean absolute error of log distances where known, without each picture's median error, its scale."""
     mean = (walls.log_share.exp() * walls.log_profile).sum(dim=2)
@@ -91,7 +86,8 @@ def visible_walls(
     Where it cannot tell passages (their probability is NaN) and the student predicts one, the teacher sees the wall of
     the next room, but a room ends in the plane of its own wall.
     """
-    return torch.isfinite(log_distance) & ~(openings[..., 2].isnan() & is_passage(opening_logits))
+    is_passage = torch.softmax(opening_logits.detach(), dim=2)[..., PASSAGE_CODE] >= 0.5
+    return torch.isfinite(log_distance) & ~(openings[..., 2].isnan() & is_passage)
 
 
 def opening(

@@ -98,7 +98,8 @@ def _taught(paths: Sequence[Path], teachers: Sequence[Path], height: int, width:
         targets.append((openings, distance))
     for path in bundles:
         encoder = _load_encoder(path)
-        targets.append(read_by_encoder(encoder, _read(paths, *_size(encoder)), width))
+        spheres = _read(paths, encoder.config.image_height, encoder.config.image_width)
+        targets.append(read_by_encoder(encoder, spheres, width))
     openings, log_distance = targets[-1]
     if len(targets) == 2:
         shared = 0.5 * (targets[0][0][..., :2] + openings[..., :2])
@@ -139,10 +140,6 @@ def _load_encoder(folder: Path) -> TrunkImageEncoder:
     encoder = TrunkImageEncoder(config.trunk, config.ring)
     start.load_into({"image_encoder": encoder})
     return encoder.eval()
-
-
-def _size(encoder: TrunkImageEncoder) -> tuple[int, int]:
-    return encoder.config.image_height, encoder.config.image_width
 
 
 def _read(paths: Sequence[Path], height: int, width: int) -> UInt8[Tensor, "n h w 3"]:

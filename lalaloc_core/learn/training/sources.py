@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, collect_error, load_scenes
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.plans import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
@@ -57,20 +57,13 @@ class Group:
     camera_height_m: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class SphereSample:
     """A sphere and its pose; `image` is (h, w, 3) RGB bytes, (h, w, 4) with walls, or a scene to be rendered later."""
 
     plan: FloorPlan
-    position_m: Float[np.ndarray, "2"]
-    room_index: int
-    heading: float
-    camera_height_m: float
+    camera: Camera | Shot
     image: np.ndarray | DeferredScene
-
-    def group(self, sampling: TripletSampling, rng: np.random.Generator) -> Group | None:
-        """Return the pose with sampled neighbours; None if the plan is too small for them."""
-        return _group_around(self, self.plan, sampling, rng)
 
 
 @dataclass(eq=False)
@@ -148,7 +141,7 @@ class GeneratedSource:
         else:
             renderer = self._renderers.renderer(height, width, stage.supersample, self.window)
             images = list(renderer.render_scenes(scenes, walls=True).numpy())
-        return [_sample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
+        return [SphereSample(home.plan, shot, image) for shot, image in zip(shots, images, strict=True)]
 
     def renderer(self, device: torch.device, height: int, width: int) -> SphereRenderer:
         """Create the renderer of deferred spheres; its pixels are those of `samples`."""
@@ -207,7 +200,7 @@ class SceneSource:
         groups: list[Group] = []
         if scene is not None:
             for index in rng.permutation(len(scene.cameras)):
-                group = _group_around(scene.cameras[index], scene.plan, stage.triplets, rng)
+                group = group_around(scene.cameras[index], scene.plan, stage.triplets, rng)
                 groups += [group] if group is not None else []
                 if len(groups) == stage.anchors_per_home:
                     break
@@ -224,7 +217,7 @@ class SceneSource:
             camera = scene.cameras[index]
             image = self._picture(scene, camera, rng, height, width)
             if image is not None:
-                samples.append(_sample(scene.plan, camera, image))
+                samples.append(SphereSample(scene.plan, camera, image))
         return samples
 
     def _scene(self, visit: int) -> Scene | None:
@@ -237,13 +230,7 @@ class SceneSource:
 
     @cachedmethod(attrgetter("_scenes"))
     def _load(self, name: str) -> Scene | None:
-        if not self.skip_bad:
-            return self.dataset.load(name)
-        try:
-            return self.dataset.load(name, self.problems)
-        except DatasetError as error:
-            self.problems.append(error)
-            return None
+        return next(load_scenes(self.dataset, [name], self.problems if self.skip_bad else None), None)
 
     def _picture(
         self, scene: Scene, camera: Camera, rng: np.random.Generator, height: int, width: int
@@ -252,13 +239,9 @@ class SceneSource:
         if not looks:
             return None
         look = looks[rng.integers(len(looks))]
-        try:
+        with collect_error(self.problems if self.skip_bad else None):
             return self._read(scene, camera, look, height, width)
-        except DatasetError as error:
-            if not self.skip_bad:
-                raise
-            self.problems.append(error)
-            return None
+        return None
 
     @cachedmethod(attrgetter("_pictures"), key=_picture_key)
     def _read(self, scene: Scene, camera: Camera, look: Appearance, height: int, width: int) -> np.ndarray:
@@ -268,20 +251,10 @@ class SceneSource:
 Source = GeneratedSource | SceneSource
 
 
-def _sample(plan: FloorPlan, camera: Camera | Shot, image: np.ndarray | DeferredScene) -> SphereSample:
-    return SphereSample(
-        plan=plan,
-        position_m=camera.position_m,
-        room_index=camera.room_index,
-        heading=camera.heading,
-        camera_height_m=camera.camera_height_m,
-        image=image,
-    )
-
-
-def _group_around(
-    anchor: Camera | SphereSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
+def group_around(
+    anchor: Camera | Shot, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
 ) -> Group | None:
+    """Return a pose with sampled neighbours; None if the plan is too small for them."""
     pose = PoseSet(np.asarray(anchor.position_m)[None], np.array([anchor.room_index]))
     near = sample_neighbours(plan, pose, sampling, rng, anchor.camera_height_m + _HEADROOM_M)
     if near is None:

@@ -74,16 +74,16 @@ def build_image_encoder(config: TrainConfig) -> ImageEncoder:
 
 def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
     """Build an untrained layout decoder; None if the decoding loss is off."""
-    return LayoutDecoder(config.latent_size) if config.layout.decode_weight else None
+    return LayoutDecoder(config.layout_sizes.latent_size) if config.layout.decode_weight else None
 
 
 def sphere_batches(
     config: TrainConfig,
     source: Source,
-    *,
     first_step: int,
     workers: int,
     device: torch.device,
+    *,
     neighbours: bool = False,
     views: bool = False,
 ) -> Iterator[Batch]:
@@ -106,11 +106,12 @@ def photograph_loss(
     walls: WallModes,
     opening_logits: Float[Tensor, "n w c"],
     seen: Bool[Tensor, "n w"],
-    openings: Float[Tensor, "n w 3"],
-    log_distance: Float[Tensor, "n w"],
+    targets: Photographs,
     class_weight: Float[Tensor, "c"],
+    columns: slice = slice(None),
 ) -> Tensor:
-    """Return the weighted loss of predictions for photographs, against their targets where seen."""
+    """Return the weighted loss of predictions for photographs, against those columns of their targets that are seen."""
+    openings, log_distance = (part[:, columns].to(seen.device) for part in (targets.openings, targets.log_distance))
     agreement = losses.teacher_openings(opening_logits[seen][None], openings[seen][None], class_weight)
     known = losses.visible_walls(torch.where(seen, log_distance, torch.nan), openings, opening_logits)
     target = log_distance.nan_to_num()
@@ -173,22 +174,15 @@ def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> t
     trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
     slow = {id(p) for trunk in trunks for p in trunk.parameters()}
     parameters = [p for module in modules.values() for p in module.parameters() if p.requires_grad]
+    decayed = [p for p in parameters if config.kind == "sgd" or p.ndim > 1]
+    others = [p for p in parameters if config.kind != "sgd" and p.ndim <= 1]
+    # By decay, and by the factor that multiplies the learning rate.
+    groups = [
+        {"params": members, "weight_decay": decay, "factor": factor}
+        for part, decay in ((decayed, config.weight_decay), (others, 0.0))
+        for factor, is_slow in ((1.0, False), (config.trunk_factor, True))
+        if (members := [p for p in part if (id(p) in slow) == is_slow])
+    ]
     if config.kind == "sgd":
-        groups = _groups_by_rate(parameters, slow, config, weight_decay=config.weight_decay)
         return torch.optim.SGD(groups, config.learning_rate, momentum=config.momentum)
-    groups = _groups_by_rate([p for p in parameters if p.ndim > 1], slow, config, weight_decay=config.weight_decay)
-    groups += _groups_by_rate([p for p in parameters if p.ndim <= 1], slow, config, weight_decay=0.0)
     return torch.optim.AdamW(groups, config.learning_rate)
-
-
-def _groups_by_rate(
-    parameters: list[nn.Parameter], slow: set[int], config: OptimiserConfig, *, weight_decay: float
-) -> list[dict[str, Any]]:
-    """Split parameters by the factor that multiplies their learning rate."""
-    groups = []
-    for factor, members in (
-        (1.0, [p for p in parameters if id(p) not in slow]),
-        (config.trunk_factor, [p for p in parameters if id(p) in slow]),
-    ):
-        groups += [{"params": members, "weight_decay": weight_decay, "factor": factor}] if members else []
-    return groups

@@ -54,10 +54,7 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         self.config, self.settings, self.source, self.photographs = config, config.image, source, photographs
         self.encoder = ViewNetwork(config.view, config.ring)
         self.modules: dict[str, nn.Module] = {"view_encoder": self.encoder}
-        self._azimuths, self._elevations = (
-            torch.from_numpy(angles).float()
-            for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
-        )
+        self._azimuths, self._elevations = config.view.directions(config.ring)
         self._generator = torch.Generator()
         # Teacher of household objects in photographs.
         self._objects = None
@@ -69,9 +66,7 @@ class ViewStage(TrainingStage[ImageStageConfig]):
         device = next(self.encoder.parameters()).device
         seed = int(np.random.default_rng([10, self.config.seed, first_step]).integers(1 << 62))
         self._generator = torch.Generator(device).manual_seed(seed)
-        return sphere_batches(
-            self.config, self.source, first_step=first_step, workers=workers, device=device, views=True
-        )
+        return sphere_batches(self.config, self.source, first_step, workers, device, views=True)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of a batch by name; azimuths that are not seen do not count."""
@@ -93,15 +88,10 @@ class ViewStage(TrainingStage[ImageStageConfig]):
             edges, visible = batch["edges"][:, middle(self.config)], walls * (shown[rendered, ..., 3] > 0.0)
             terms["edges"] = edges_loss(settings, features.structure.rows(rendered), edges, visible, seen[rendered])
         if self.photographs is not None and photographs is not None:
-            rows, part = slice(len(image) - count, None), middle(self.config)
-            openings, log_distance = (
-                target[:, part].to(seen.device) for target in (photographs.openings, photographs.log_distance)
-            )
-            logits = features.structure.opening_logits[rows]
-            weight = opening_weight(settings, self.encoder, self.photographs)
-            terms["photographs"] = photograph_loss(
-                settings, features.walls.rows(rows), logits, seen[rows], openings, log_distance, weight
-            )
+            rows = slice(len(image) - count, None)
+            modes, logits = features.walls.rows(rows), features.structure.opening_logits[rows]
+            weight, columns = opening_weight(settings, self.encoder, self.photographs), middle(self.config)
+            terms["photographs"] = photograph_loss(settings, modes, logits, seen[rows], photographs, weight, columns)
             if self._objects is not None and features.objects is not None:
                 taught, _ = self._objects.to(shown.device)(shown[rows, ..., :3])
                 codes = photographs.room_type.to(taught.device)
@@ -209,11 +199,7 @@ class ViewValidation:
 
     def _measure(self, encoder: ViewNetwork, field_deg: float) -> dict[str, float]:
         config = self._config
-        azimuths, elevations = (
-            torch.from_numpy(angles).float()
-            for angles in (config.view.column_azimuths(config.ring), config.view.row_elevations(config.ring))
-        )
-        seen = seen_by(azimuths, elevations, field_deg, field_deg / _ASPECT)
+        seen = seen_by(*config.view.directions(config.ring), field_deg, field_deg / _ASPECT)
         opacity = 255 * seen.to(torch.uint8)[None, :, :, None]
         nll, errors, confusion = [], [], np.zeros((len(OPENING_CLASSES),) * 2, dtype=int)
         for first in range(0, len(self._images), _BATCH):

@@ -223,6 +223,6 @@ def load_trained_decoder(folder: Path, *, last: bool = False) -> LayoutDecoder |
     checkpoint = find_checkpoint("layout", folder, last=last)
     if "decoder" not in checkpoint.inference_weights:
         return None
-    decoder = LayoutDecoder(checkpoint.config.latent_size)
+    decoder = LayoutDecoder(checkpoint.config.layout_sizes.latent_size)
     decoder.load_state_dict(checkpoint.inference_weights["decoder"])
     return decoder

@@ -6,7 +6,7 @@ import dataclasses
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,8 +17,8 @@ from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes
 from lalaloc_core.render.profile import render_layout
 
-# Gap between two copies (m), not a multiple of the grid step, so that the grid has another offset in each copy.
-_APART_M = 3.17
+# Copies, and their gap (m), not a multiple of the grid step, so that the grid has another offset in each copy.
+_COPIES, _APART_M = 4, 3.17
 # Share of the doors seen by a camera that are moved in the other copies, besides one per camera.
 _MOVED_SHARE = 0.5
 # Minimum number of azimuths, of all azimuths, of a visible door: about 6°.
@@ -36,25 +36,20 @@ class CopiedScenes(DerivedScenes):
     photograph identifies its copy. Doors without a free position are removed. Cameras that see no door are left out.
     """
 
-    copies: int = 4
-
-    @property
-    def description(self) -> str:
-        """Name of the data set in results."""
-        return f"{self.homes.description}, {self.copies} copies that differ in their doors"
+    variant: ClassVar[str] = f"{_COPIES} copies that differ in their doors"
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Generate a scene and copy it."""
         scene = self.homes.load(name, problems)
         rng = np.random.default_rng([self.homes.seed, zlib.crc32(name.encode())])
-        own = int(rng.integers(self.copies))
+        own = int(rng.integers(_COPIES))
         x_min, _, x_max, _ = scene.plan.bounds_m
         step_m = x_max - x_min + _APART_M
         document = scene.plan.to_dict()
         seen = [(camera, _seen_doors(scene.plan, camera)) for camera in scene.cameras]
         seen = [(camera, doors) for camera, doors in seen if doors]
         rooms, openings = [], []
-        for copy in range(self.copies):
+        for copy in range(_COPIES):
             by_m = copy * step_m
             rooms += [_moved_room(room, copy, by_m) for room in document["rooms"]]
             kept = document.get("openings", [])
@@ -64,7 +59,13 @@ class CopiedScenes(DerivedScenes):
         plan = FloorPlan.from_dict(
             {**document, "rooms": rooms, "openings": openings, "opening_kinds": sorted(scene.plan.opening_kinds)}
         )
-        cameras = tuple(_moved_camera(camera, own * step_m, own * len(scene.plan.rooms)) for camera, _ in seen)
+        shift_m, first_room = np.array([own * step_m, 0.0]), own * len(scene.plan.rooms)
+        cameras = tuple(
+            dataclasses.replace(
+                camera, position_m=camera.position_m + shift_m, room_index=camera.room_index + first_room
+            )
+            for camera, _ in seen
+        )
         return dataclasses.replace(scene, plan=plan, cameras=cameras)
 
 
@@ -137,9 +138,3 @@ def _moved_opening(opening: dict[str, Any], copy: int, by_m: float) -> dict[str,
 
 def _moved(points: list[list[float]], by_m: float) -> list[list[float]]:
     return [[x + by_m, y] for x, y in points]
-
-
-def _moved_camera(camera: Camera, by_m: float, rooms: int) -> Camera:
-    return dataclasses.replace(
-        camera, position_m=camera.position_m + np.array([by_m, 0.0]), room_index=camera.room_index + rooms
-    )

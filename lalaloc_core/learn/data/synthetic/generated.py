@@ -17,13 +17,13 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.learn.synth.furniture.furnish import wall_frame
+from lalaloc_core.learn.synth.furniture.furnish import opening_ends_m
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.homes.plans import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer, Window
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
-from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene, Sun
+from lalaloc_core.learn.synth.scene.render_scene import Fact, Sun
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 
 _DEPTH_HEIGHT = 256
@@ -50,14 +50,6 @@ class GeneratedScenes:
         """Return the names of a split's scenes."""
         return [f"{split}-{index:05d}" for index in range(self.homes)]
 
-    def home_number(self, name: str) -> tuple[int, int]:
-        """Return the numbers of a scene's split and home."""
-        split, _, index = name.partition("-")
-        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
-        if number is None or not index.isdecimal():
-            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
-        return number, int(index)
-
     @property
     def description(self) -> str:
         """Name of the data set in results."""
@@ -65,8 +57,11 @@ class GeneratedScenes:
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Generate a scene from its name."""
-        number, index = self.home_number(name)
-        home, rng = home_of(number, self.seed, index)
+        split, _, index = name.partition("-")
+        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
+        if number is None or not index.isdecimal():
+            raise DatasetError("unknown generated scene; names have the form 'test-00042'", scene=name)
+        home, rng = home_of(number, self.seed, int(index))
         renderers = split_renderer_cache(number, self.seed, self.textures)
         shots = sample_shots(home, self.shots_per_home, rng, self.furniture)
         cameras = tuple(
@@ -160,8 +155,8 @@ class RenderedPhotograph:
 
     @cached_property
     def facts(self) -> frozenset[str]:
-        """Facts that make the shot hard, see `synth.scene.facts`."""
-        return frozenset(facts_of(self.shot))
+        """Facts that make the shot hard, see `facts_of`."""
+        return facts_of(self.shot)
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         """Render RGB pixels at the given size."""
@@ -190,16 +185,13 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
     """
     # Facts do not depend on the pictures of materials.
     scene = build_scene(shot, _blank_materials())
-    return frozenset({*_facts_of_place(shot), *scene.facts, *_facts_of_picture(shot, scene)})
-
-
-def _facts_of_place(shot: Shot) -> set[Fact]:
     room, here = shot.home.plan.rooms[shot.room_index], shapely.Point(shot.position_m)
     own = [opening for opening in shot.home.openings if opening.room == shot.room_index]
     see_through = [opening for opening in own if opening.is_see_through]
     wide = [
         opening for opening in see_through if opening.kind == "opening" and opening.end_m - opening.start_m >= _WIDE_M
     ]
+    segments = [shapely.LineString(opening_ends_m(room, opening)) for opening in see_through]
     inscribed_m = 2.0 * shapely.maximum_inscribed_circle(room.shape, 0.02).length
     holds: dict[Fact, bool] = {
         "open_door": any(opening.kind == "door_open" for opening in see_through),
@@ -209,25 +201,17 @@ def _facts_of_place(shot: Shot) -> set[Fact]:
         "closet": room.area_m2 < _CLOSET_M2,
         "large_room": room.area_m2 > _LARGE_M2,
         "near_wall": room.shape.exterior.distance(here) < _NEAR_M,
-        "threshold": any(_segment(shot, opening).distance(here) < _THRESHOLD_M for opening in see_through),
+        "threshold": any(segment.distance(here) < _THRESHOLD_M for segment in segments),
+        "nadir_patch": bool(scene.exposure.nadir > 0.0),
+        "sun_patch": _sees_sun(shot, scene.sun),
     }
-    return {fact for fact, true in holds.items() if true}
-
-
-def _facts_of_picture(shot: Shot, scene: RenderScene) -> set[Fact]:
-    holds: dict[Fact, bool] = {"nadir_patch": bool(scene.exposure.nadir > 0.0), "sun_patch": _sees_sun(shot, scene.sun)}
-    return {fact for fact, true in holds.items() if true}
+    return scene.facts | {fact for fact, true in holds.items() if true}
 
 
 def _has_stub(shot: Shot, opening: Opening) -> bool:
     x0, y0, x1, y1 = shot.home.plan.rooms[opening.room].walls_m[opening.wall]
     rest = (opening.start_m, float(np.hypot(x1 - x0, y1 - y0)) - opening.end_m)
     return any(_STUB_M[0] <= left <= _STUB_M[1] for left in rest)
-
-
-def _segment(shot: Shot, opening: Opening) -> shapely.LineString:
-    start, along, _ = wall_frame(shot.home.plan.rooms[opening.room], opening.wall)
-    return shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
 
 
 def _sees_sun(shot: Shot, sun: Sun) -> bool:

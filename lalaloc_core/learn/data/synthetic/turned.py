@@ -115,12 +115,10 @@ class Phone:
 
 
 class Frame(NamedTuple):
-    """Picture of a turn with its true heading, pitch and roll (radians)."""
+    """Picture of a turn with its true heading (radians)."""
 
     pixels: UInt8[np.ndarray, "h w 3"]
     heading: float
-    pitch: float
-    roll: float
 
 
 def photographs_of_turn(
@@ -129,23 +127,11 @@ def photographs_of_turn(
     """Return photographs taken at about equal angles once around, each tilted as a hand tilts it."""
     headings = shot.heading + TWO_PI * np.arange(count) / count + np.radians(rng.normal(0.0, 2.0, count))
     headings[0] = shot.heading
-    tilts = [tilt_by_hand(rng) for _ in range(count)]
-    return list(_frames(shot, renderers, phone, list(zip(headings.tolist(), *zip(*tilts, strict=True), strict=True))))
-
-
-def arm_within(shot: Shot, arm_m: float) -> float:
-    """Return the length of an arm, shortened so that the camera stays in its room."""
-    walls_m = shot.home.plan.rooms[shot.room_index].shape.exterior.distance(shapely.Point(shot.position_m))
-    return min(arm_m, max(walls_m - POSE_MARGIN_M, 0.0))
-
-
-def _frames(
-    shot: Shot, renderers: RendererCache, phone: Phone, poses: Sequence[tuple[float, float, float]]
-) -> Iterator[Frame]:
-    """Yield the picture of each pose: heading, pitch and roll."""
-    for heading, pitch, roll in poses:
-        sphere = _seen_from(shot, renderers, phone, heading)
-        yield Frame(cut_view(sphere, phone.camera, azimuth=0.0, pitch=pitch, roll=roll), heading, pitch, roll)
+    frames = []
+    for heading in headings.tolist():
+        (pitch, roll), sphere = tilt_by_hand(rng), _seen_from(shot, renderers, phone, heading)
+        frames.append(Frame(cut_view(sphere, phone.camera, azimuth=0.0, pitch=pitch, roll=roll), heading))
+    return frames
 
 
 def film_of_turn(
@@ -161,6 +147,9 @@ def _seen_from(shot: Shot, renderers: RendererCache, phone: Phone, heading: floa
     """Render a part of the sphere at the end of the arm; the rest is grey."""
     is_coarse = phone.camera.fx <= _COARSE
     window, size = (_COARSE_WINDOW, _COARSE_WINDOW_SIZE) if is_coarse else (_WINDOW, _WINDOW_SIZE)
-    place = shot.position_m + arm_within(shot, phone.arm_m) * np.array([math.sin(heading), math.cos(heading)])
+    # The arm is shorter where the camera would leave its room.
+    walls_m = shot.home.plan.rooms[shot.room_index].shape.exterior.distance(shapely.Point(shot.position_m))
+    arm_m = min(phone.arm_m, max(walls_m - POSE_MARGIN_M, 0.0))
+    place = shot.position_m + arm_m * np.array([math.sin(heading), math.cos(heading)])
     turned = dataclasses.replace(shot, position_m=place, heading=heading % TWO_PI)
     return renderers.part_of_sphere(turned, window, size)

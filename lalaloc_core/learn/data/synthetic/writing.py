@@ -15,9 +15,8 @@ import re
 import shutil
 import signal
 import threading
-from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -38,13 +37,7 @@ from lalaloc_core.learn.data.structured3d import (
     scene_name,
     scene_numbers,
 )
-from lalaloc_core.learn.data.structured3d_writer import (
-    room_id,
-    write_annotation,
-    write_camera,
-    write_depth,
-    write_picture,
-)
+from lalaloc_core.learn.data.structured3d_writer import write_annotation, write_camera, write_depth, write_picture
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.dataset_names import SPLITS, Split
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
@@ -165,7 +158,7 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
             for shot in shots:
                 if stop is not None and stop.is_set():
                     return 0
-                _write_room(job.part / RENDERING_FOLDER / room_id(shot.room_index) / "panorama", shot, renderer)
+                _write_room(job.part / RENDERING_FOLDER / str(shot.room_index) / "panorama", shot, renderer)
             job.part.rename(job.folder)
     finally:
         # No effect after the rename.
@@ -230,14 +223,8 @@ def _write_in_processes(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
-    waiting: deque[Future[int]] = deque()
     try:
-        for job in jobs:
-            waiting.append(pool.submit(_work, job))
-            if len(waiting) > 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        yield from pool.map(_work, jobs)
     except BrokenProcessPool as error:
         raise DatasetError(
             "a worker process died; use fewer --workers if memory is short", path=jobs[0].settings.root

@@ -91,13 +91,8 @@ def kitchen(
         at_start = rng.random() < 0.5
         placed.append(Placed(tall, main.wall, start + 0.3 if at_start else start + length - 0.3))
         start, length = start + (_TALL_UNIT_M if at_start else 0.0), length - _TALL_UNIT_M
-    placed.append(
-        Placed(
-            counter_run(rng, length, height, body, wall_units=has_wall_units, ceiling_m=ceiling_m if fitted else None),
-            main.wall,
-            start + 0.5 * length,
-        )
-    )
+    run = counter_run(rng, length, height, body, wall_units=has_wall_units, ceiling_m=ceiling_m if fitted else None)
+    placed.append(Placed(run, main.wall, start + 0.5 * length))
     placed += _around_the_corner(stretches, lengths_m, main, (start, start + length), height, body, rng)
     kind = rng.random()
     if kind < 0.25:

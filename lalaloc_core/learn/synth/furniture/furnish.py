@@ -91,37 +91,19 @@ Pose = tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n 2"]]
 
 
 class Prism(NamedTuple):
-    """A vertical box or elliptic cylinder in the plan frame (m); the second axis is the first turned by +90°."""
+    """A vertical box or elliptic cylinder in the plan frame (m).
 
-    x: float
-    y: float
-    axis_x: float
-    axis_y: float
-    half_a: float
-    half_b: float
-    z0: float
-    z1: float
+    `half_m` are half extents along the unit vector `axis` and across it, `z_m` are the lower and the upper end.
+    """
+
+    centre_m: Float[np.ndarray, "2"]
+    axis: Float[np.ndarray, "2"]
+    half_m: tuple[float, float]
+    z_m: tuple[float, float]
     finish: Finish
     piece: int
-    is_round: bool
+    is_round: bool = False
     label: Label = ""
-
-    @classmethod
-    def upright(
-        cls,
-        centre_m: Sequence[float] | np.ndarray,
-        axis: Sequence[float] | np.ndarray,
-        half_m: tuple[float, float],
-        z_m: tuple[float, float],
-        *,
-        finish: Finish,
-        piece: int,
-        is_round: bool = False,
-        label: Label = "",
-    ) -> Prism:
-        """Return a prism: its centre, its first axis, half extents along it and across, lower and upper end."""
-        (x, y), (ax, ay) = centre_m, axis
-        return cls(float(x), float(y), float(ax), float(ay), *half_m, *z_m, finish, piece, is_round, label)
 
 
 class _Floor:
@@ -283,17 +265,17 @@ def _build_in(floor: _Floor, room: Room, rng: np.random.Generator, *, fitted: bo
 
 def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray, "2"], number: int) -> list[Prism]:
     """Return the parts of a piece whose width lies along the unit vector `axis`, its back to the right of it."""
-    (ax, ay), (cx, cy) = map(float, axis), map(float, centre_m)
+    across = np.array([-axis[1], axis[0]])
     return [
-        Prism.upright(
-            (cx + ax * part.x - ay * part.y, cy + ay * part.x + ax * part.y),
+        Prism(
+            centre_m + axis * part.x + across * part.y,
             axis,
             (part.half_x, part.half_y),
             (part.z0, part.z1),
-            finish=part.finish,
-            piece=number,
-            is_round=part.is_round,
-            label=piece.label,
+            part.finish,
+            number,
+            part.is_round,
+            piece.label,
         )
         for part in piece.parts
     ]
@@ -328,6 +310,12 @@ def wall_frame(room: Room, wall: int) -> tuple[Float[np.ndarray, "2"], Float[np.
     along = np.array([x1 - x0, y1 - y0])
     along /= np.hypot(*along)
     return np.array([x0, y0]), along, np.array([-along[1], along[0]])
+
+
+def opening_ends_m(room: Room, opening: Opening) -> Float[np.ndarray, "2 2"]:
+    """Return the ends of an opening on its wall."""
+    start, along, _ = wall_frame(room, opening.wall)
+    return start + np.array([[opening.start_m], [opening.end_m]]) * along
 
 
 def _rugs(floor: _Floor, rng: np.random.Generator, first_number: int) -> list[Prism]:

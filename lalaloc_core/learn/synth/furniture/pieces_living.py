@@ -72,14 +72,8 @@ def dining_table(rng: np.random.Generator) -> Piece:
             if rng.random() < 0.85:
                 parts += _chair_parts(float(x), side * (hy + reach - 0.1), side, finish)
     if rng.random() < 0.5:
-        parts.append(
-            cylinder(
-                at=(rng.uniform(-0.3, 0.3), 0.0),
-                half=(0.08, 0.08),
-                z=(height, height + rng.uniform(0.1, 0.35)),
-                finish="accent",
-            )
-        )
+        x, top = rng.uniform(-0.3, 0.3), height + rng.uniform(0.1, 0.35)
+        parts.append(cylinder(at=(x, 0.0), half=(0.08, 0.08), z=(height, top), finish="accent"))
     return Piece(width + 0.1, depth + 2 * reach + 0.3, tuple(parts), against_wall=False)
 
 
@@ -93,12 +87,8 @@ def low_table(rng: np.random.Generator) -> Piece:
         if is_round
         else square_legs(hx, hy, 0.05, height, "wood")
     )
-    thing = box(
-        at=(rng.uniform(-0.15, 0.15), 0.0),
-        half=(0.12, 0.08),
-        z=(height, height + rng.uniform(0.02, 0.2)),
-        finish="accent",
-    )
+    x, thing_top = rng.uniform(-0.15, 0.15), height + rng.uniform(0.02, 0.2)
+    thing = box(at=(x, 0.0), half=(0.12, 0.08), z=(height, thing_top), finish="accent")
     return Piece(width, depth, (top, *legs, thing), against_wall=False)
 
 
@@ -135,16 +125,9 @@ def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece
     for k in range(doors):
         x = -0.5 * width + (k + 0.5) * pitch
         parts.append(box(at=(x, front - 0.01), half=(0.5 * pitch - 0.008, 0.01), z=(0.06, height - 0.03), finish=body))
-        side = 1 if k % 2 == 0 else -1
         if has_handles:
-            parts.append(
-                box(
-                    at=(x + side * (0.5 * pitch - 0.06), front + 0.015),
-                    half=(0.01, 0.012),
-                    z=(0.95, 1.15),
-                    finish="metal",
-                )
-            )
+            handle = x + (1 if k % 2 == 0 else -1) * (0.5 * pitch - 0.06), front + 0.015
+            parts.append(box(at=handle, half=(0.01, 0.012), z=(0.95, 1.15), finish="metal"))
     return Piece(width, depth, tuple(parts))
 
 
@@ -187,14 +170,8 @@ def bookcase(rng: np.random.Generator) -> Piece:
             span = rng.uniform(0.3, 0.95) * (hx - 0.04)
             x = rng.uniform(-1, 1) * (hx - 0.04 - span)
             top = z + 0.025 + rng.uniform(0.4, 0.8) * (height / levels - 0.03)
-            parts.append(
-                box(
-                    at=(x, -0.03),
-                    half=(span, hy - 0.05),
-                    z=(z + 0.025, top),
-                    finish=("accent", "dark", "fabric", "paint")[k % 4],
-                )
-            )
+            books: Finish = ("accent", "dark", "fabric", "paint")[k % 4]
+            parts.append(box(at=(x, -0.03), half=(span, hy - 0.05), z=(z + 0.025, top), finish=books))
     return Piece(width, depth, tuple(parts))
 
 
@@ -208,19 +185,14 @@ def sideboard(rng: np.random.Generator) -> Piece:
     for k in range(drawers):
         z0, z1 = 0.04 + k * (height - 0.06) / drawers, 0.02 + (k + 1) * (height - 0.06) / drawers
         parts.append(box(at=(0.0, hy - 0.01), half=(0.5 * width - 0.015, 0.01), z=(z0, z1), finish=finish))
-        parts.append(
-            box(at=(0.0, hy + 0.01), half=(0.06, 0.01), z=(0.5 * (z0 + z1), 0.5 * (z0 + z1) + 0.02), finish="metal")
-        )
+        middle = 0.5 * (z0 + z1)
+        parts.append(box(at=(0.0, hy + 0.01), half=(0.06, 0.01), z=(middle, middle + 0.02), finish="metal"))
     if height < 0.75 and rng.random() < 0.6:
-        half = min(rng.uniform(0.35, 0.7), 0.5 * width + 0.05)
-        parts.append(
-            box(at=(0.0, -hy + 0.1), half=(half, 0.02), z=(height + 0.06, height + 0.06 + 1.15 * half), finish="dark")
-        )
+        half, bottom = min(rng.uniform(0.35, 0.7), 0.5 * width + 0.05), height + 0.06
+        parts.append(box(at=(0.0, -hy + 0.1), half=(half, 0.02), z=(bottom, bottom + 1.15 * half), finish="dark"))
     elif rng.random() < 0.7:
-        x = rng.uniform(-0.3, 0.3) * width
-        parts.append(
-            cylinder(at=(x, 0.0), half=(0.08, 0.08), z=(height, height + rng.uniform(0.1, 0.45)), finish="accent")
-        )
+        x, top = rng.uniform(-0.3, 0.3) * width, height + rng.uniform(0.1, 0.45)
+        parts.append(cylinder(at=(x, 0.0), half=(0.08, 0.08), z=(height, top), finish="accent"))
     return Piece(width, depth, tuple(parts))
 
 
@@ -245,11 +217,9 @@ def plant(rng: np.random.Generator) -> Piece:
         cylinder(at=(0.0, 0.0), half=(0.02, 0.02), z=(1.6 * pot, height - 0.1), finish="wood"),
     ]
     for _ in range(int(rng.integers(3, 7))):
-        x, y = rng.uniform(-0.8 * pot, 0.8 * pot, 2)
+        x, y = rng.uniform(-0.8 * pot, 0.8 * pot, 2).tolist()
         z, radius = rng.uniform(0.35, 1.0) * height, rng.uniform(0.4, 1.0) * pot
-        parts.append(
-            cylinder(at=(float(x), float(y)), half=(radius, 0.7 * radius), z=(z - 0.12, z + 0.06), finish="leaf")
-        )
+        parts.append(cylinder(at=(x, y), half=(radius, 0.7 * radius), z=(z - 0.12, z + 0.06), finish="leaf"))
     return Piece(3.6 * pot, 3.2 * pot, tuple(parts))
 
 
@@ -271,14 +241,8 @@ def carton(rng: np.random.Generator) -> Piece:
     shape = cylinder if rng.random() < 0.2 else box
     parts = [shape(at=(0.0, 0.0), half=(0.5 * width, 0.5 * depth), z=(0.0, height), finish=finish)]
     if rng.random() < 0.4:
-        parts.append(
-            box(
-                at=(0.0, 0.0),
-                half=(0.3 * width, 0.35 * depth),
-                z=(height, height + rng.uniform(0.1, 0.4)),
-                finish="accent",
-            )
-        )
+        top = height + rng.uniform(0.1, 0.4)
+        parts.append(box(at=(0.0, 0.0), half=(0.3 * width, 0.35 * depth), z=(height, top), finish="accent"))
     return Piece(width, depth, tuple(parts), against_wall=bool(rng.random() < 0.7))
 
 

@@ -37,20 +37,13 @@ def counter_run(
         box(at=(0.0, -hy + 0.01), half=(hx, 0.01), z=(height, height + rng.uniform(0.1, 0.35)), finish="ceramic"),
     ]
     if width > 3 * _UNIT_M:
-        parts.append(
-            box(at=(rng.uniform(-0.3, 0.0) * width, 0.0), half=(0.25, 0.22), z=(height, height + 0.01), finish="dark")
-        )
-        parts.append(
-            cylinder(
-                at=(rng.uniform(0.1, 0.3) * width, -0.1), half=(0.02, 0.02), z=(height, height + 0.3), finish="metal"
-            )
-        )
+        hob, tap = rng.uniform(-0.3, 0.0) * width, rng.uniform(0.1, 0.3) * width
+        parts.append(box(at=(hob, 0.0), half=(0.25, 0.22), z=(height, height + 0.01), finish="dark"))
+        parts.append(cylinder(at=(tap, -0.1), half=(0.02, 0.02), z=(height, height + 0.3), finish="metal"))
     for k in range(units):
         x = -hx + unit * (k + 0.5)
-        oven = rng.random() < 0.15
-        parts.append(
-            box(at=(x, hy - 0.03), half=(0.49 * unit, 0.01), z=(0.11, height - 0.06), finish="dark" if oven else body)
-        )
+        front: Finish = "dark" if rng.random() < 0.15 else body
+        parts.append(box(at=(x, hy - 0.03), half=(0.49 * unit, 0.01), z=(0.11, height - 0.06), finish=front))
         parts.append(box(at=(x, hy - 0.01), half=(0.25 * unit, 0.01), z=(height - 0.14, height - 0.12), finish="metal"))
     if wall_units:
         bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.15)
@@ -128,12 +121,11 @@ def bathtub(rng: np.random.Generator) -> Piece:
 
 def toilet(rng: np.random.Generator) -> Piece:
     """Return bowl, seat and cistern."""
+    cistern_z = 0.36 * rng.integers(0, 2), rng.uniform(0.7, 0.85)
     parts = (
         cylinder(at=(0.0, 0.1), half=(0.13, 0.2), z=(0.0, 0.36), finish="ceramic"),
         cylinder(at=(0.0, 0.08), half=(0.19, 0.25), z=(0.36, 0.41), finish="white"),
-        box(
-            at=(0.0, -0.24), half=(0.19, 0.09), z=(0.36 * rng.integers(0, 2), rng.uniform(0.7, 0.85)), finish="ceramic"
-        ),
+        box(at=(0.0, -0.24), half=(0.19, 0.09), z=cistern_z, finish="ceramic"),
     )
     return Piece(0.4, 0.66, parts)
 

@@ -128,36 +128,20 @@ def _trace_shell(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Fl
     surface = torch.where(is_wall, own.surface[:, :, None], horizontal[:, None])
     vertical = torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0))
     surface, hole = _paint(batch, _decals_at(batch, own.wall, own.along_m), z, is_wall, surface)
-    slot, is_beyond = torch.zeros_like(surface), torch.zeros_like(surface)
     shell = _ShellHits(
         distance_m=distance,
         surface=surface,
-        slot=slot,
+        slot=torch.zeros_like(surface),
         vertical=vertical,
-        is_beyond=is_beyond,
+        is_beyond=torch.zeros_like(surface),
         own=own,
         beyond_normal=own.normal.clone(),
         end_m=own.distance_m.clone(),
     )
     item, column = (hole >= 0).any(dim=2).nonzero(as_tuple=True)
-    columns = (item, column)
     if len(item):
-        _put_beyond(shell, columns, _look_through(batch, columns, crossings, direction, slope, own, hole[columns]))
+        _look_through(batch, shell, (item, column), crossings, direction, slope, hole[item, column])
     return shell
-
-
-def _put_beyond(shell: _ShellHits, columns: tuple[Tensor, Tensor], beyond: _Beyond) -> None:
-    """Replace the hits of columns by those seen through their holes, in place."""
-    for whole, part in (
-        (shell.distance_m, beyond.distance_m),
-        (shell.surface, beyond.surface),
-        (shell.vertical, beyond.vertical),
-        (shell.slot, beyond.slot),
-        (shell.is_beyond, torch.ones_like(beyond.slot)),
-    ):
-        whole[columns] = torch.where(beyond.hole, part.to(whole.dtype), whole[columns])
-    shell.end_m[columns] = torch.maximum(shell.end_m[columns], beyond.wall_m)
-    shell.beyond_normal[columns] = beyond.normal
 
 
 def _before(
@@ -253,36 +237,24 @@ def _paint(
     return surface, hole
 
 
-@dataclass(frozen=True, eq=False)
-class _Beyond:
-    """Hits of the columns with a hole through it, (m, h) unless noted."""
-
-    hole: Tensor
-    distance_m: Tensor
-    surface: Tensor
-    vertical: Tensor
-    slot: Tensor
-    wall_m: Tensor  # (m,) horizontal distance at which the column ends
-    normal: Tensor  # (m, 2)
-
-
 def _look_through(
     batch: SceneBatch,
+    shell: _ShellHits,
     columns: tuple[Tensor, Tensor],
     crossings: _Crossings,
     direction: Tensor,
     slope: Tensor,
-    own: _WallHits,
     hole: Int[Tensor, "m h"],
-) -> _Beyond:
+) -> None:
+    """Replace the hits of m columns by those seen through their holes, in place."""
     item, _ = columns
     decal = hole.max(dim=1).values
     opening = batch.decals[item, decal]
     slot = opening.slot.long()
     room = batch.rooms[item, slot]
     eye = batch.camera_height_m[item]
-    near = own.distance_m[columns]
-    incidence = (own.normal[columns] * direction[columns]).sum(dim=-1).abs().clamp(min=1e-3)
+    near = shell.own.distance_m[columns]
+    incidence = (shell.own.normal[columns] * direction[columns]).sum(dim=-1).abs().clamp(min=1e-3)
     far = near + opening.depth_m / incidence
 
     owner = batch.wall_owner[item]
@@ -312,12 +284,14 @@ def _look_through(
     along = crossings.along_m[columns].gather(1, wall[:, None])
     painted = _decals_at(sub, wall[:, None], along)
     surface, _ = _paint(sub, painted, z[:, None], is_wall[:, None], surface[:, None])
-    return _Beyond(
-        hole=hole >= 0,
-        distance_m=hit,
-        surface=surface[:, 0],
-        vertical=torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0)),
-        slot=torch.where(is_jamb[:, None] & is_wall, 0, slot[:, None]).expand_as(hit),
-        wall_m=distance,
-        normal=_facing_normal(sub.walls_m, wall[:, None], direction[columns][:, None])[:, 0],
-    )
+    slot = torch.where(is_jamb[:, None] & is_wall, 0, slot[:, None]).expand_as(hit)
+    for whole, part in (
+        (shell.distance_m, hit),
+        (shell.surface, surface[:, 0]),
+        (shell.vertical, torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0))),
+        (shell.slot, slot),
+        (shell.is_beyond, torch.ones_like(slot)),
+    ):
+        whole[columns] = torch.where(hole >= 0, part.to(whole.dtype), whole[columns])
+    shell.end_m[columns] = torch.maximum(shell.end_m[columns], distance)
+    shell.beyond_normal[columns] = _facing_normal(sub.walls_m, wall[:, None], direction[columns][:, None])[:, 0]

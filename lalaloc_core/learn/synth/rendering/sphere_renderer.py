@@ -97,9 +97,7 @@ class SphereRenderer:
         return torch.cat([self._render_batch(scenes[k : k + step], walls) for k in range(0, len(scenes), step)])
 
     def _render_batch(self, scenes: Sequence[RenderScene], walls: bool) -> UInt8[Tensor, "b h w c"]:
-        batch = stack_scenes(scenes, self._device)
-        direction = self._directions(batch)
-        hits = trace(batch, direction, self._slope)
+        batch, direction, hits = self._trace(scenes)
         picture = self._photograph(batch, hits, direction)
         if not walls:
             return picture
@@ -113,9 +111,7 @@ class SphereRenderer:
     ) -> tuple[UInt8[Tensor, "m h w 3"], Float[Tensor, "h2 w2"]]:
         """Photograph a staged shot in several lights, casting its rays once; return pictures and ranges (m)."""
         scene = build_scene(dataclasses.replace(shot, lighting="raw"), self._materials)
-        batch = stack_scenes([scene], self._device)
-        direction = self._directions(batch)
-        hits = trace(batch, direction, self._slope)
+        _, direction, hits = self._trace([scene])
         pictures = [
             self._photograph(stack_scenes([relit(scene, mood)], self._device), hits, direction) for mood in moods
         ]
@@ -124,8 +120,7 @@ class SphereRenderer:
     @torch.no_grad()
     def hits(self, shots: Sequence[Shot]) -> Hits:
         """Return the hit of every ray, laid out (b, w, h): distances, surfaces, normals."""
-        batch = stack_scenes([build_scene(shot, self._materials) for shot in shots], self._device)
-        return trace(batch, self._directions(batch), self._slope)
+        return self._trace([build_scene(shot, self._materials) for shot in shots])[2]
 
     @torch.no_grad()
     def depth_m(self, shots: Sequence[Shot]) -> Float[Tensor, "b h w"]:
@@ -142,9 +137,12 @@ class SphereRenderer:
     def _range_m(self, hits: Hits) -> Float[Tensor, "b h w"]:
         return hits.distance_m.transpose(1, 2) * torch.sqrt(1.0 + self._slope.square())[None, :, None]
 
-    def _directions(self, batch: SceneBatch) -> Float[Tensor, "b c 2"]:
+    def _trace(self, scenes: Sequence[RenderScene]) -> tuple[SceneBatch, Float[Tensor, "b c 2"], Hits]:
+        """Return a batch of scenes, the direction of each column, and the hits of all rays."""
+        batch = stack_scenes(scenes, self._device)
         azimuth = batch.heading[:, None] + self._azimuth
-        return torch.stack([azimuth.sin(), azimuth.cos()], dim=-1)
+        direction = torch.stack([azimuth.sin(), azimuth.cos()], dim=-1)
+        return batch, direction, trace(batch, direction, self._slope)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(self._device)

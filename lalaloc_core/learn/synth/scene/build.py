@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -52,7 +51,7 @@ class _Builder:
         self._is_bare = shot.furniture == "empty"
         # Homes for sale: bare, pale, in daylight.
         self._is_bright = self._is_bare and not self._streams.is_staged and self._rng.random() < 0.6
-        surfaces = SurfaceTable(materials, materials.mean_colours, self._streams.materials)
+        surfaces = SurfaceTable(materials, self._streams.materials)
         self._tables = SceneTables(shot.position_m, surfaces)
         self._style = sample_style(surfaces, self._rng)
         if shot.is_night:
@@ -149,14 +148,8 @@ _MIN_WIDTH_M = 0.35
 _DEPTH_M = 0.004
 
 
-class Mirror(NamedTuple):
-    """Place of a mirror: wall, start and end along it, lower and upper edge (m)."""
-
-    wall: int
-    s0_m: float
-    s1_m: float
-    z0_m: float
-    z1_m: float
+# Place of a mirror: wall, start and end along it, lower and upper edge (m).
+Mirror = tuple[int, tuple[float, float], tuple[float, float]]
 
 
 def sample_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool) -> Mirror | None:
@@ -180,7 +173,7 @@ def sample_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Genera
             stands = rng.random() < 0.4
             low = rng.uniform(0.03, 0.3) if stands else rng.uniform(0.8, 1.15)
             high = min(rng.uniform(1.6, 2.3), room.ceiling_height_m - 0.1)
-            return Mirror(int(wall), float(start), float(start + width), float(low), float(high))
+            return int(wall), (start, start + width), (low, high)
     return None
 
 
@@ -199,7 +192,7 @@ def add_mirror(
     The tables' first walls are those of `room`, the own one; `prisms` is its furniture, rows of `tables.prisms`. The
     brightest of its lights shines in the reflected room.
     """
-    wall, s0, s1, z0, z1 = mirror
+    wall, (s0, s1), (z0, z1) = mirror
     ends, count, first, slot = tables.walls_m[wall], len(room.walls_m), len(tables.walls_m), len(tables.rooms)
     reflection, relative = Reflection(ends), Reflection(ends - np.tile(tables.camera_m, 2))
     tables.rooms.append(_reflected_room(tables.rooms[0], lights, relative))

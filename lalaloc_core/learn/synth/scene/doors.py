@@ -134,7 +134,8 @@ def add_door(
         tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=cheeks, slot=slot_behind, depth_m=depth)
         _add_threshold(tables, style, room, opening, depth, rng)
         if opening.kind == "door_open":
-            _add_leaves(tables, style, opening, room=room, neighbour=neighbour, depth_m=depth, rng=rng)
+            for leaf in hang_leaves(opening, room, neighbour, depth, tables.camera_m, rng):
+                _add_leaf(tables, style, leaf, head)
     elif opening.kind == "door_shut" or (opening.kind == "door_open" and rng.random() < 0.5):
         _add_shut_door(tables, style, wall, opening, rng)
     else:
@@ -173,24 +174,13 @@ def _add_shut_door(
         tables.add_decal(wall, s_m=(middle - 0.006, middle + 0.006), z_m=(0.0, head), surface=style.gloom)
 
 
-def _add_leaves(
-    tables: SceneTables,
-    style: HouseStyle,
-    opening: Opening,
-    *,
-    room: Room,
-    neighbour: Room,
-    depth_m: float,
-    rng: np.random.Generator,
-) -> None:
-    for leaf in hang_leaves(opening, room, neighbour, depth_m, tables.camera_m, rng):
-        for board in boards(leaf.half_width_m, opening.head_m, glazed=style.doors_are_glazed):
-            centre = leaf.centre_m + leaf.axis * board.along_m
-            tables.add_box(
-                centre, leaf.axis, half_m=(board.half_a, board.half_b), z_m=(board.z0, board.z1), surface=style.door
-            )
-        knob = leaf.centre_m + leaf.axis * 0.8 * leaf.half_width_m
-        tables.add_box(knob, leaf.axis, half_m=(0.06, 0.06), z_m=(_HANDLE_M, _HANDLE_M + 0.03), surface=style.handle)
+def _add_leaf(tables: SceneTables, style: HouseStyle, leaf: Leaf, head_m: float) -> None:
+    for board in boards(leaf.half_width_m, head_m, glazed=style.doors_are_glazed):
+        centre = leaf.centre_m + leaf.axis * board.along_m
+        half_m, z_m = (board.half_a, board.half_b), (board.z0, board.z1)
+        tables.add_box(centre, leaf.axis, half_m=half_m, z_m=z_m, surface=style.door)
+    knob = leaf.centre_m + leaf.axis * 0.8 * leaf.half_width_m
+    tables.add_box(knob, leaf.axis, half_m=(0.06, 0.06), z_m=(_HANDLE_M, _HANDLE_M + 0.03), surface=style.handle)
 
 
 def _add_threshold(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import shapely
@@ -41,14 +41,6 @@ _SKY_TINTS: dict[Mood, tuple[float, float, float]] = {
 }
 
 
-class RoomLight(NamedTuple):
-    """Position (m) and colour of the one lamp of a room seen through a door, and its ambient light."""
-
-    position_m: Float[np.ndarray, "3"]
-    colour: Float[np.ndarray, "3"]
-    ambient: Float[np.ndarray, "3"]
-
-
 class Lighting:
     """Mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
 
@@ -74,8 +66,8 @@ class Lighting:
         """Make it night: only lamps give light."""
         self.daylight, self.lamps_on = 0.0, True
 
-    def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> RoomLight:
-        """Return the one lamp of a neighbouring room, and its ambient light."""
+    def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> dict[str, Float[np.ndarray, "3"]]:
+        """Return the columns of `VisibleRooms` about the one lamp of a neighbouring room, and its ambient light."""
         rng = self.rng
         centre = np.array(room.shape.representative_point().coords[0]) - origin_m
         strength = math.exp(rng.uniform(math.log(0.1), math.log(3.5)))
@@ -83,7 +75,8 @@ class Lighting:
         # The next room can be dark or very bright.
         low, high = (-0.7, 0.6) if self._bright else (-2.4, 1.1)
         ambient = self.ambient * math.exp(rng.uniform(low, high)) * (0.5 + 0.5 * tint)
-        return RoomLight(np.append(centre, room.ceiling_height_m - 0.3), strength * tint, ambient)
+        light_m = np.append(centre, room.ceiling_height_m - 0.3)
+        return {"light_m": light_m, "light_colour": strength * tint, "ambient": ambient}
 
 
 def light_room(
@@ -171,9 +164,7 @@ def _lamps(
 def _hanging(
     spot_m: np.ndarray, radius_m: float, z_m: tuple[float, float], finish: Finish, *, is_round: bool = True
 ) -> Prism:
-    return Prism.upright(
-        spot_m, (1.0, 0.0), (radius_m, radius_m), z_m, finish=finish, piece=_NO_PIECE, is_round=is_round
-    )
+    return Prism(spot_m, np.array([1.0, 0.0]), (radius_m, radius_m), z_m, finish, _NO_PIECE, is_round)
 
 
 def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Prism]:
@@ -195,7 +186,7 @@ def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.ran
     at, z = foot + inwards * 0.06, rng.uniform(1.6, 1.95)
     power = math.exp(rng.uniform(math.log(0.15), math.log(0.8)))
     light = Lights.row(xy_m=foot + inwards * 0.2 - origin_m, z_m=z, colour=power * lighting.lamp_colour)
-    lamp = Prism.upright(at, along, (0.06, 0.04), (z - 0.1, z + 0.1), finish="glow", piece=_NO_PIECE)
+    lamp = Prism(at, along, (0.06, 0.04), (z - 0.1, z + 0.1), "glow", _NO_PIECE)
     return light, lamp
 
 

@@ -51,8 +51,8 @@ class Prisms(Records):
     Attributes:
         x_m, y_m: centre; both as `centre_m`.
         axis_x, axis_y: unit vector of the first axis, both as `axis`; the second is the first turned by +90°.
-        half_a_m, half_b_m: half extents along the two axes.
-        z0_m, z1_m: lower and upper end above the floor.
+        half_a_m, half_b_m: half extents along the two axes, both as `half_m`.
+        z0_m, z1_m: lower and upper end above the floor, both as `z_m`.
         is_opaque: 1 for prisms that cast shadows.
     """
 
@@ -60,6 +60,8 @@ class Prisms(Records):
     z0_m, z1_m, is_round, surface, is_opaque = columns(5)
     centre_m = Joined(x_m, y_m)
     axis = Joined(axis_x, axis_y)
+    half_m = Joined(half_a_m, half_b_m)
+    z_m = Joined(z0_m, z1_m)
 
 
 class VisibleRooms(Records):

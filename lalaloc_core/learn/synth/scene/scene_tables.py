@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -77,31 +77,22 @@ class SceneTables:
         depth_m: float = 0.0,
     ) -> None:
         """Add a rectangle on a wall; with a `slot` it is a hole of some depth that shows that room."""
-        decal = Decal(
-            wall=wall, s0_m=s_m[0], s1_m=s_m[1], z0_m=z_m[0], z1_m=z_m[1], surface=surface, slot=slot, depth_m=depth_m
-        )
-        self.decals.append(decal)
+        self.decals.append(Decal(wall, *s_m, *z_m, surface, slot, depth_m))
 
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
         """Add a box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
         self.add_box(
-            np.array([prism.x, prism.y]),
-            (prism.axis_x, prism.axis_y),
-            half_m=(prism.half_a, prism.half_b),
-            z_m=(prism.z0, prism.z1),
-            surface=surface,
-            is_round=prism.is_round,
-            opaque=opaque,
+            prism.centre_m, prism.axis, prism.half_m, prism.z_m, surface, is_round=prism.is_round, opaque=opaque
         )
 
     def add_box(
         self,
         centre_m: Float[np.ndarray, "2"],
-        axis: Sequence[float] | np.ndarray,
-        *,
+        axis: Float[np.ndarray, "2"],
         half_m: tuple[float, float],
         z_m: tuple[float, float],
         surface: int,
+        *,
         is_round: bool = False,
         opaque: bool = True,
     ) -> None:
@@ -109,10 +100,8 @@ class SceneTables:
         row = Prisms.row(
             centre_m=centre_m - self.camera_m,
             axis=axis,
-            half_a_m=half_m[0],
-            half_b_m=half_m[1],
-            z0_m=z_m[0],
-            z1_m=z_m[1],
+            half_m=half_m,
+            z_m=z_m,
             is_round=is_round,
             surface=surface,
             is_opaque=opaque,

@@ -49,16 +49,10 @@ class Shells:
         ceiling = tables.surfaces.add_ceiling(np.clip(ceiling_colour, 0.01, 0.92))
         floor = self._floor_of(room_index, room, colour)
         streams.begin(ScenePart.ACCENT, room_index)
-        lamp = lighting.of_room_beyond(room, tables.camera_m)
-        room_row = VisibleRooms.row(
-            ceiling_m=room.ceiling_height_m,
-            floor_surface=floor,
-            ceiling_surface=ceiling,
-            light_m=lamp.position_m,
-            light_colour=lamp.colour,
-            ambient=lamp.ambient,
+        light = lighting.of_room_beyond(room, tables.camera_m)
+        tables.rooms.append(
+            VisibleRooms.row(ceiling_m=room.ceiling_height_m, floor_surface=floor, ceiling_surface=ceiling, **light)
         )
-        tables.rooms.append(room_row)
         accented = int(rng.integers(len(room.walls_m)))
         streams.begin(ScenePart.TRIM, room_index)
         first = len(tables.walls_m)
@@ -233,7 +227,7 @@ def _box(
     centre = 0.5 * (low + high)
     middle = along * centre[0] + across * centre[1]
     half_a, half_b = (0.5 * (high - low)).tolist()
-    return Prism.upright(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish=finish, piece=-1)
+    return Prism(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish, piece=-1)
 
 
 _HALF_DEPTH_M = 0.05
@@ -275,48 +269,33 @@ def add_curtains(tables: SceneTables, room: Room, window: Opening, rng: np.rando
     width, top = rng.uniform(0.15, 0.6), min(window.head_m + 0.15, room.ceiling_height_m - 0.01)
     bottom = 0.03 if rng.random() < 0.7 else max(0.03, window.sill_m - 0.1)
     for s in (window.start_m, window.end_m):
-        _hang(
-            tables,
-            room,
-            window.wall,
-            at_m=s,
-            half_m=0.5 * width,
-            from_wall_m=_CURTAIN_FROM_WALL_M,
-            z_m=(bottom, top),
-            surface=cloth,
-        )
+        place_m = s, _CURTAIN_FROM_WALL_M
+        _hang(tables, room, window.wall, place_m, half_m=0.5 * width, z_m=(bottom, top), surface=cloth)
 
 
 def add_radiator(tables: SceneTables, style: HouseStyle, room: Room, window: Opening, rng: np.random.Generator) -> None:
     """Add a radiator below some windows."""
     if window.sill_m > 0.45 and rng.random() < 0.35:
-        middle, half = 0.5 * (window.start_m + window.end_m), 0.4 * (window.end_m - window.start_m)
-        z_m = (0.1, min(0.7, window.sill_m - 0.05))
-        _hang(
-            tables,
-            room,
-            window.wall,
-            at_m=middle,
-            half_m=half,
-            from_wall_m=_RADIATOR_FROM_WALL_M,
-            z_m=z_m,
-            surface=style.trim,
-        )
+        place_m = 0.5 * (window.start_m + window.end_m), _RADIATOR_FROM_WALL_M
+        half_m, z_m = 0.4 * (window.end_m - window.start_m), (0.1, min(0.7, window.sill_m - 0.05))
+        _hang(tables, room, window.wall, place_m, half_m=half_m, z_m=z_m, surface=style.trim)
 
 
 def _hang(
     tables: SceneTables,
     room: Room,
     wall: int,
+    place_m: tuple[float, float],
     *,
-    at_m: float,
     half_m: float,
-    from_wall_m: float,
     z_m: tuple[float, float],
     surface: int,
 ) -> None:
-    """Add a flat box before a wall, narrower at the wall's end, if it stays in the room and off the camera."""
-    start, along, inwards = wall_frame(room, wall)
+    """Add a flat box at a place along a wall and before it, if it stays in the room and off the camera.
+
+    It is narrower at the wall's end.
+    """
+    (at_m, from_wall_m), (start, along, inwards) = place_m, wall_frame(room, wall)
     length = float(np.hypot(*(room.walls_m[wall, 2:] - room.walls_m[wall, :2])))
     half_m = min(half_m, at_m, length - at_m)
     if half_m <= _MIN_HALF_WIDTH_M:

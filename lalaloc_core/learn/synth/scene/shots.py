@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import Room
-from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, wall_frame
+from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, opening_ends_m, wall_frame
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.scene.lighting import Mood
@@ -156,9 +156,8 @@ def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray,
 def _on_threshold(room: Room, opening: Opening, rng: np.random.Generator) -> Float[np.ndarray, "2"] | None:
     """Draw a position in front of an opening or in it, clear of the walls beside it; None if none is found."""
     start, along, inwards = wall_frame(room, opening.wall)
-    ends = shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
     # Slightly wider than the opening, so that no sliver of it remains.
-    walls = room.shape.boundary.difference(ends.buffer(1e-3))
+    walls = room.shape.boundary.difference(shapely.LineString(opening_ends_m(room, opening)).buffer(1e-3))
     low, high = (_IN_OPENING_M, POSE_MARGIN_M) if rng.random() < 0.5 else (POSE_MARGIN_M, _THRESHOLD_M)
     for _ in range(_TRIES):
         position = start + along * rng.uniform(opening.start_m, opening.end_m) + inwards * rng.uniform(low, high)

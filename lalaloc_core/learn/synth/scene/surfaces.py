@@ -36,10 +36,8 @@ class Surfaces(Records):
 class SurfaceTable:
     """Table of the surfaces of one scene; every method returns the index of the row it added."""
 
-    def __init__(self, materials: MaterialLibrary, mean_colours: Float[np.ndarray, "m 3"], rng: np.random.Generator):
-        self._materials = materials
-        self._means = mean_colours
-        self._rng = rng
+    def __init__(self, materials: MaterialLibrary, rng: np.random.Generator) -> None:
+        self._materials, self._rng = materials, rng
         self.rows: list[Row] = []
 
     def add(
@@ -62,28 +60,19 @@ class SurfaceTable:
         if colour is None:
             tint = np.exp(self._rng.normal(0.0, 0.2)) * np.exp(self._rng.normal(0.0, 0.04, 3))
         else:
-            tint = colour / self._means[picture]
-        return self._append(picture, tint, scale=scale, angle=angle, gloss=gloss, glow=glow)
+            tint = colour / self._materials.mean_colours[picture]
+        return self._append(picture, tint, angle, scale=scale, gloss=gloss, glow=glow)
 
     def add_plain(self, colour: Colour, *, gloss: float = 0.0, glow: float = 0.0) -> int:
         """Add a surface of one colour; see `add`."""
         picture = self._materials.sample_plain(self._rng)
-        return self._append(picture, colour / self._means[picture], scale=0.5, angle=0.0, gloss=gloss, glow=glow)
+        tint = colour / self._materials.mean_colours[picture]
+        return self._append(picture, tint, 0.0, scale=0.5, gloss=gloss, glow=glow)
 
-    def _append(self, picture: int, tint: Colour, *, scale: float, angle: float, gloss: float, glow: float) -> int:
+    def _append(self, picture: int, tint: Colour, angle: float, **columns: float) -> int:
         shift_u, shift_v = self._rng.random(2)
-        row = Surfaces.row(
-            picture=picture,
-            scale=scale,
-            cosine=math.cos(angle),
-            sine=math.sin(angle),
-            tint=tint,
-            gloss=gloss,
-            glow=glow,
-            shift_u=shift_u,
-            shift_v=shift_v,
-        )
-        self.rows.append(row)
+        columns |= {"cosine": math.cos(angle), "sine": math.sin(angle), "shift_u": shift_u, "shift_v": shift_v}
+        self.rows.append(Surfaces.row(picture=picture, tint=tint, **columns))
         return len(self.rows) - 1
 
     def add_outdoors(self, glow: float) -> int:
