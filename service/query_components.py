@@ -75,7 +75,13 @@ LOCAL_BACKENDS = Backends(optimiser=LpoPool, encoder=warm_encoder)
 
 @dataclass(frozen=True, kw_only=True)
 class QueryComponents:
-    """Components of this process that compute answers; attributes as of `Runtime`."""
+    """Components of this process that compute answers.
+
+    Attributes:
+        bundle: the model.
+        reads: store reads of queries.
+        cores: cores to compute on, of which each piece of work holds one.
+    """
 
     settings: Settings
     telemetry: Telemetry
@@ -129,7 +135,7 @@ class QueryComponents:
             idle_cores=idle_cores,
         )
 
-    def localiser(self, plans: VenuePlans, indices: IndexSource) -> LocalLocaliser:
+    def build_localiser(self, plans: VenuePlans, indices: IndexSource) -> LocalLocaliser:
         """Build the localiser."""
         executor = Executor(self.settings, self.optimiser, self.telemetry, self.cores)
         queries, tolerance_deg = self.admission.queries, self.settings.photographs.compass_tolerance_deg
@@ -153,7 +159,7 @@ class QueryComponents:
         albums = Threads("albums", 1, self.telemetry.cpu_accounts)
         return LocalLocaliser(parts, queries, albums, self.cores)
 
-    def venue_plans(self) -> VenuePlans:
+    def build_venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""
         return VenuePlans(
             self.store,
@@ -164,7 +170,7 @@ class QueryComponents:
             idle_cores=self.idle_cores,
         )
 
-    def plan_indices(self) -> PlanIndices:
+    def build_plan_indices(self) -> PlanIndices:
         """Build the indices of plans."""
         return PlanIndices(
             self.store,
@@ -175,7 +181,7 @@ class QueryComponents:
             limit_bytes=self.settings.storage.venue_cache_bytes,
         )
 
-    def renditions(self, converter: Converter) -> RenditionCache:
+    def build_renditions(self, converter: Converter) -> RenditionCache:
         """Build the cache of files made from stored plans."""
         return RenditionCache(
             self.store.plans,
