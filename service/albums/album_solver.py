@@ -20,7 +20,6 @@ from service.schemas.albums import AlbumDocument
 from service.settings import Settings
 from service.storage import PlanLookup, Store
 from service.storage.album_jobs import AlbumJob
-from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import LOGGER_NAME, Telemetry
 
 # Albums solved at a time by a replica, one per tenant.
@@ -167,7 +166,7 @@ class AlbumSolver:
     async def _pin(self, job: AlbumJob, progress: AlbumProgress) -> None:
         album = job.album
         document = AlbumDocument.model_validate_json(album.options)
-        place = await self._place(album.tenant, document)
+        place = await self._plans.place(album.tenant, document.floorplan_id, document.venue_id, self._reads)
         if job.attempts > _MAX_ATTEMPTS:
             reason = f"it was begun {_MAX_ATTEMPTS} times and never finished"
             await self._finish(job, place.revision_id, failure=reason)
@@ -193,20 +192,6 @@ class AlbumSolver:
         values = {"pins": {}, "solution": None} | result
         finish = self._store.album_jobs.finish
         await self._call(job.album.tenant, lambda: finish(job, self._owner, place_revision_id, **values))
-
-    async def _place(self, tenant: str, document: AlbumDocument) -> PlanRecord | VenueRecord:
-        """Return the plan or venue of an album."""
-        if document.venue_id is not None:
-            venue_id = document.venue_id
-            venue = await self._call(tenant, lambda: self._store.venues.get(tenant, venue_id))
-            if venue is None:
-                raise errors.UnknownVenueError(venue_id)
-            return venue
-        assert document.floorplan_id is not None
-        record = await self._plans.find(tenant, document.floorplan_id, self._reads)
-        if record is None:
-            raise errors.UnknownFloorPlanError(document.floorplan_id)
-        return record
 
     async def _renew(self, job: AlbumJob, progress: AlbumProgress) -> None:
         """Renew the lease until the task is cancelled; stop the solve if it is lost."""

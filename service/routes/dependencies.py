@@ -183,19 +183,16 @@ class ApiCall:
 
     async def place(self, floorplan_id: str | None, venue_id: str | None) -> PlanRecord | VenueRecord:
         """Return the plan or venue of a query; a plan from memory while the database is away."""
-        if venue_id is not None:
-            if not is_id(venue_id):
-                raise UnknownVenueError(venue_id)
-            venue = await self.read(self.venue, venue_id)
-            self.log(venue=venue.id)
-            return venue
-        assert floorplan_id is not None
-        lookup, reads = self.runtime.plan_lookup, self.runtime.reads
-        record = await lookup.find(self.tenant, floorplan_id, reads) if is_id(floorplan_id) else None
-        if record is None:
+        if venue_id is not None and not is_id(venue_id):
+            raise UnknownVenueError(venue_id)
+        if venue_id is None and floorplan_id is not None and not is_id(floorplan_id):
             raise UnknownFloorPlanError(floorplan_id)
-        self.log(plan=record.id, revision=record.revision_id)
-        return record
+        place = await self.runtime.plan_lookup.place(self.tenant, floorplan_id, venue_id, self.runtime.reads)
+        if isinstance(place, VenueRecord):
+            self.log(venue=place.id)
+        else:
+            self.log(plan=place.id, revision=place.revision_id)
+        return place
 
     def path_of(self, route: str, **ids: str) -> str:
         """Return the path of a route, by the name of its function."""
