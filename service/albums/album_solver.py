@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import uuid
-from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from time import monotonic
-from typing import Any, TypeVar
+from typing import Any
 
 from lalaloc_core.errors import InvalidInputError
 from service import errors
@@ -46,8 +44,6 @@ _PASSING = (
 )
 # The service itself, in the place of a tenant.
 _SERVICE = ""
-
-T = TypeVar("T")
 
 
 class AlbumSolver:
@@ -124,9 +120,8 @@ class AlbumSolver:
         begin, corrected = monotonic(), asyncio.Event()
         self._corrected[tenant] = corrected
         try:
-            job = await self._call(
-                tenant, lambda: self._store.album_jobs.claim(album_id, self._owner, self._settings.grids.grid_lease_s)
-            )
+            claim, lease_s = self._store.album_jobs.claim, self._settings.grids.grid_lease_s
+            job = await self._reads.run(tenant, claim, album_id, self._owner, lease_s)
             if job is not None:
                 await self._attempt(job)
         except errors.StoreUnavailableError:
@@ -189,26 +184,23 @@ class AlbumSolver:
         await self._finish(job, place.revision_id, pins=outcome.pins, solution=outcome.solution)
 
     async def _finish(self, job: AlbumJob, place_revision_id: str, **result: Any) -> None:
-        values = {"pins": {}, "solution": None} | result
+        values: dict[str, Any] = {"pins": {}, "solution": None} | result
         finish = self._store.album_jobs.finish
-        await self._call(job.album.tenant, lambda: finish(job, self._owner, place_revision_id, **values))
+        await self._reads.run(job.album.tenant, finish, job, self._owner, place_revision_id, **values)
 
     async def _renew(self, job: AlbumJob, progress: AlbumProgress) -> None:
         """Renew the lease until the task is cancelled; stop the solve if it is lost."""
         lease_s = self._settings.grids.grid_lease_s
-        jobs, album = self._store.album_jobs, job.album
+        renew, album = self._store.album_jobs.renew, job.album
         while not progress.stopped:
             await asyncio.sleep(lease_s / _HEARTBEATS)
             # During an outage no other replica can take the lease either.
             with suppress(errors.StoreUnavailableError):
-                renew = partial(jobs.renew, album.id, self._owner, lease_s, min(max(progress.share, 0.0), 1.0))
-                if not await self._call(album.tenant, renew):
+                share = min(max(progress.share, 0.0), 1.0)
+                if not await self._reads.run(album.tenant, renew, album.id, self._owner, lease_s, share):
                     progress.stopped = True
 
     async def _release(self, job: AlbumJob, *, failed: bool) -> None:
         release = self._store.album_jobs.release
         with suppress(errors.StoreUnavailableError):
-            await self._call(job.album.tenant, lambda: release(job.album.id, self._owner, failed=failed))
-
-    async def _call(self, tenant: str, work: Callable[[], T]) -> T:
-        return await self._reads.run(tenant, work)
+            await self._reads.run(job.album.tenant, release, job.album.id, self._owner, failed=failed)
