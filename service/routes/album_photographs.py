@@ -17,12 +17,12 @@ from service import errors
 from service.albums.album_documents import correction_document, pins_csv, pins_geojson, pins_svg, stored_correction
 from service.capacity.admission_control import QUERY_IN_PARTS, admitted_as
 from service.http.problems import problem_responses
-from service.http.representations import NDJSON, LinesResponse, expected_revision, preferred, revision_etag
+from service.http.representations import NDJSON, LinesResponse, expected_revision, preferred
 from service.http.uploads import GEOJSON, JSON, MULTIPART, Repeats
 from service.query import AlbumPhotographQuery, Content, QueryContext
 from service.routes.albums import album_of
 from service.routes.batch_lines import BatchLines
-from service.routes.dependencies import After, ApiCall, Call, cursor_text, is_id, parse_venue_cursor
+from service.routes.dependencies import After, ApiCall, Call, cursor_text, is_id, json_with_etag, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
     PHOTOGRAPH_LINES,
@@ -243,8 +243,8 @@ async def _drawing(
 @router.get("/{photograph_id}", summary="Get a photograph of an album", **reads(AlbumPhotographAnswer, *_MISSING))
 def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
     """Return a photograph with its correction and its pin."""
-    content, etag = _representation(_photograph_of(call, album_of(call, album_id), photograph_id))
-    return call.representation(content, etag)
+    record = _photograph_of(call, album_of(call, album_id), photograph_id)
+    return call.representation(*json_with_etag(_photograph_answer(record)))
 
 
 @router.patch(
@@ -288,9 +288,8 @@ async def correct_album_photograph(album_id: str, photograph_id: str, call: Call
     def store() -> Response:
         correct = call.store.albums.correct
         record = correct(call.tenant, album.id, current.id, correction, ttl_s=ttl_s, expected=expected)
-        content, etag = _representation(record)
         path = call.path_of("get_album_photograph", album_id=album.id, photograph_id=record.id)
-        return call.change_answer(content, etag, path, created=False)
+        return call.change_answer(*json_with_etag(_photograph_answer(record)), path, created=False)
 
     answer = await call.upload(store)
     call.runtime.albums.wake(corrected=call.tenant)
@@ -343,9 +342,3 @@ def _photograph_answer(record: PhotographRecord) -> AlbumPhotographAnswer:
         correction=correction,
         pin=_pin_of(record),
     )
-
-
-def _representation(record: PhotographRecord) -> tuple[bytes, str]:
-    """Return a photograph as JSON, and its entity tag."""
-    content = _photograph_answer(record).model_dump_json().encode()
-    return content, revision_etag(record.revision_id, content)

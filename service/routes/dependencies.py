@@ -19,10 +19,12 @@ from service.http import IdempotentRequest
 from service.http.fields import Model, parse_document
 from service.http.idempotent_request import HEADER
 from service.http.middleware.admission import reading
-from service.http.representations import expected_revision, not_modified, tagged_answer
+from service.http.representations import expected_revision, not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.plan_documents import Rendition, RenditionKind
 from service.runtime import Runtime, get_runtime
+from service.schemas.albums import AlbumAnswer, AlbumPhotographAnswer
+from service.schemas.venues import VenueAnswer
 from service.security import caller_of
 from service.settings import Settings
 from service.storage import Store
@@ -243,3 +245,9 @@ Page = Annotated[_Page, Depends()]
 def is_id(text: str) -> bool:
     """Return True for 32 hexadecimal digits; other texts are never looked up in the database."""
     return _ID.fullmatch(text) is not None
+
+
+def json_with_etag(answer: VenueAnswer | AlbumAnswer | AlbumPhotographAnswer) -> tuple[bytes, str]:
+    """Return an answer as JSON, and its entity tag."""
+    content = answer.model_dump_json().encode()
+    return content, revision_etag(answer.revision, content)
