@@ -65,6 +65,8 @@ class IdempotentRequest:
 
         `work` makes the answer from a token of 32 hexadecimal digits, the same for every attempt.
         """
+        if not self._key:
+            return work(uuid.uuid4().hex)
         token = self._begin(parts)
         if isinstance(token, Response):
             return token
@@ -79,7 +81,7 @@ class IdempotentRequest:
         self, parts: Parts, work: Callable[[str], Awaitable[Response]], reads: BoundedReads
     ) -> Response:
         """Execute the request as `run` does, for work that is cancelled if the client leaves."""
-        if self._key is None:
+        if not self._key:
             return await work(uuid.uuid4().hex)
         tenant, waiting = self._place[0], _Waiting()
         try:
@@ -105,8 +107,6 @@ class IdempotentRequest:
         return answer
 
     def _begin(self, parts: Parts) -> Response | str:
-        if self._key is None:
-            return uuid.uuid4().hex
         claim = self._claims.begin(*self._place, self._key, parts_sha256(parts))
         match claim:
             case Claimed():
@@ -125,8 +125,6 @@ class IdempotentRequest:
         return begun
 
     def _keep(self, token: str, answer: Response) -> Response:
-        if self._key is None:
-            return answer
         headers = {name: value for name, value in answer.headers.items() if name != "content-length"}
         try:
             kept = StoredAnswer(answer.status_code, headers, bytes(answer.body))
@@ -141,8 +139,6 @@ class IdempotentRequest:
 
     def _fail(self, token: str, error: BaseException) -> Response | None:
         """Return the answer to a permanent error, which is kept; None for other errors."""
-        if self._key is None:
-            return None
         # A decoder can also die for reasons other than the picture.
         if isinstance(error, _PERMANENT_ERRORS) and not isinstance(error.__cause__, JobLostError):
             return self._keep(token, problem_answer(self._request, error))
@@ -150,8 +146,6 @@ class IdempotentRequest:
         return None
 
     def _abandon(self, token: str) -> None:
-        if self._key is None:
-            return
         try:
             self._claims.abandon(*self._place, self._key, token)
         except errors.StoreUnavailableError:
@@ -193,10 +187,11 @@ def parts_sha256(parts: Parts) -> str:
     return digest.hexdigest()
 
 
-def _key_of(request: Request) -> str | None:
+def _key_of(request: Request) -> str:
+    """Return the key of a request; empty without one."""
     values = request.headers.getlist(HEADER)
     if not values:
-        return None
+        return ""
     if len(values) > 1 or not _KEY.fullmatch(values[0]):
         fault = f"is '{', '.join(values)[:100]}'; give one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
         raise errors.InvalidRequestError([(HEADER, fault)])
