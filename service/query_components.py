@@ -208,7 +208,7 @@ def _admission(settings: Settings, telemetry: Telemetry, store: Store) -> Admiss
         tenants = {client: value for client, value in values.items() if client != PROBES}
         return tenants if settings.access.api_keys else {DEFAULT_TENANT: sum(tenants.values())}
 
-    limits = store.tenant_limits
+    limits = store.tenants
     telemetry.cpu_accounts.share = lambda client: limits.of(client).cpu_share or 1.0
     return Admission(
         settings, telemetry, bytes_limit_of=lambda client: limits.of(client).bytes_in_flight, by_tenant=by_tenant

@@ -22,7 +22,7 @@ from service.errors import StoreBusyError, StoreUnavailableError, UnknownFloorPl
 from service.settings import Settings
 from service.storage.album_jobs import AlbumJobs
 from service.storage.albums import Albums
-from service.storage.api_keys import ApiKeys, TenantLimits, Tenants
+from service.storage.api_keys import ApiKeys, Tenants
 from service.storage.audit_log import AuditLog
 from service.storage.database import CircuitBreaker, Database
 from service.storage.kept_answers import MIN_LEASE_S, IdempotencyKeys, KeptAnswers
@@ -58,7 +58,6 @@ class Store:
         album_jobs: leases on the solution of albums.
         quota: stored bytes of tenants.
         tenants: the operator's limits per tenant.
-        tenant_limits: the same limits in memory.
     """
 
     def __init__(
@@ -104,7 +103,6 @@ class Store:
         self.albums = Albums(database, self.quota)
         self.album_jobs = AlbumJobs(database)
         self.tenants = Tenants(database)
-        self.tenant_limits = TenantLimits(self.tenants)
 
     def purge_tenant(self, tenant: str) -> int:
         """Delete all that a tenant stored, but not its API keys and limits, and return the number of plans.
