@@ -104,7 +104,6 @@ class _LeaseHeartbeat:
         self.lost = False
 
     def beat(self) -> None:
-        """Renew the lease if it is due."""
         if not self.lost and monotonic() >= self._beat_at:
             self.lost = not self._renew()
             self._beat_at = monotonic() + self._every_s

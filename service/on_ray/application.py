@@ -115,7 +115,6 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
 
 
 def _scaled(name: str, options: RayOptions, target: float) -> dict[str, Any]:
-    """Return the scaling options of a deployment."""
     low, high = getattr(options, f"{name}_min"), getattr(options, f"{name}_max")
     if high < low:
         raise ConfigError(f"{name}_max is {high}, less than {name}_min, which is {low}")

@@ -207,7 +207,6 @@ class RemoteLocaliser:
         await self._call("check", where, context, form)
 
     async def _call(self, method: str, where: Where, context: QueryContext, argument: Any) -> Any:
-        """Call a method of the localiser of a search replica."""
         about = StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
         with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):

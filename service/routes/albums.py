@@ -109,7 +109,6 @@ def album_of(call: ApiCall, album_id: str) -> AlbumRecord:
 
 
 def _summary(record: AlbumRecord, call: ApiCall) -> AlbumSummary:
-    """Return an album as an item of a list."""
     return AlbumSummary(
         id=record.id,
         revision=record.revision_id,

@@ -159,7 +159,6 @@ def _description_parts(
 
 
 def _list_entries(summaries: list[PlanSummary], states: list[GridState]) -> list[FloorPlanSummary]:
-    """Return plans as items of a list."""
     return [
         FloorPlanSummary(
             id=summary.id,

@@ -262,7 +262,6 @@ def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
 
 
 def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
-    """Return the plans of a venue in a request."""
     limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise errors.InvalidRequestError(
@@ -295,7 +294,6 @@ def _change_answer(call: ApiCall, record: VenueRecord, *, created: bool) -> Resp
 
 
 def _summary(record: VenueRecord) -> VenueSummary:
-    """Return a venue as an item of a list."""
     return VenueSummary(
         id=record.id,
         revision=record.revision_id,

@@ -164,7 +164,6 @@ def _client_of(request: Request) -> str:
 
 
 def _needed(request: Request) -> Permission:
-    """Return the scope that the request's route requires."""
     methods = permissions_needed(routed_path(request.scope))
     if not methods:
         raise HTTPException(404)

@@ -186,7 +186,6 @@ def _column(kind: str) -> str:
 
 
 def _count(connection: Connection, tenant: str) -> StoredBytes:
-    """Return the sums of the rows of a tenant."""
     own_plans = FLOORPLANS.join(REVISIONS, REVISIONS.c.plan_id == FLOORPLANS.c.id)
     own_grids = own_plans.join(LATENT_GRIDS, LATENT_GRIDS.c.revision_id == REVISIONS.c.id)
     own_photographs = ALBUMS.join(ALBUM_PHOTOGRAPHS, ALBUM_PHOTOGRAPHS.c.album_id == ALBUMS.c.id)

@@ -28,7 +28,6 @@ class _PerTenant(Collector):
     read: Callable[[], Mapping[str, float]]
 
     def collect(self) -> Iterator[Metric]:
-        """Return the current values."""
         family = self.family(self.name, self.meaning, labels=["tenant"])
         for tenant, value in self.read().items():
             family.add_metric([tenant], value)
