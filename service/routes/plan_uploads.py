@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 from fastapi import Response
 from pydantic import BaseModel
 
-from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import (
@@ -29,10 +28,9 @@ from lalaloc_core.importers import (
     import_if_native,
     is_json,
 )
-from service import errors
 from service.errors import InvalidRequestError
 from service.http.idempotent_request import REPLAYED, IdempotentRequest
-from service.http.problems import problem_document
+from service.http.problems import problem_in_line
 from service.http.representations import NDJSON, LinesResponse, preferred
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 from service.plan_documents import LARGE, PlanDocument, Rendition
@@ -42,7 +40,6 @@ from service.routes.descriptions import BINARY, json_body
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.plan_import import ImportForm, LevelsForm
 from service.storage.records import ComputedGrid, NewPlan, Original
-from service.telemetry import LOGGER_NAME
 from service.uploaded_file import UploadedFile
 
 P = ParamSpec("P")
@@ -262,7 +259,9 @@ async def _lines(
         try:
             yield _answer_line(task.result())
         except Exception as error:
-            yield _problem_line(call, error)
+            problem, retry_after_s = problem_in_line(call.request, error)
+            document = problem.model_dump(mode="json", exclude_none=True)
+            yield _line({"status": problem.status, "problem": document, "retry_after_s": retry_after_s})
     finally:
         # A call that has begun is finished on its thread, as for an answer in JSON.
         task.cancel()
@@ -308,16 +307,6 @@ def _answer_line(response: Response) -> str:
     # Not parsed: plans can have megabytes. A text of JSON has no line breaks, only the space between its values.
     content = bytes(response.body).decode().replace("\n", " ")
     return f'{_line(values)[:-1]}, "{"problem" if is_problem else "answer"}": {content}}}'
-
-
-def _problem_line(call: ApiCall, error: Exception) -> str:
-    if not isinstance(error, LaLaLocError):
-        logging.getLogger(LOGGER_NAME).exception("unexpected error")
-    problem = problem_document(call.request, error)
-    values: dict[str, Any] = {"status": problem.status, "problem": problem.model_dump(mode="json", exclude_none=True)}
-    if isinstance(error, errors.ServiceError) and error.retry_after_s is not None:
-        values["retry_after_s"] = error.retry_after_s
-    return _line(values)
 
 
 def _line(values: dict[str, Any]) -> str:
