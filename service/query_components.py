@@ -78,7 +78,6 @@ class QueryComponents:
     """Components of this process that compute answers.
 
     Attributes:
-        bundle: the model.
         reads: store reads of queries.
         cores: cores to compute on, of which each piece of work holds one.
     """
