@@ -11,9 +11,9 @@ import hashlib
 import json
 import logging
 import re
-import threading
 import uuid
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
 from contextlib import suppress
 
 from starlette.requests import Request
@@ -83,13 +83,13 @@ class IdempotentRequest:
         """Execute the request as `run` does, for work that is cancelled if the client leaves."""
         if not self._key:
             return await work(uuid.uuid4().hex)
-        tenant, waiting = self._place[0], _Waiting()
+        tenant, waiting = self._place[0], Future[str]()
         try:
             token = await reads.run(tenant, self._begin_for, waiting, parts)
         except BaseException:
-            if (left := waiting.leave()) is not None:
+            if not waiting.cancel():
                 with suppress(errors.StoreUnavailableError):
-                    await reads.run(tenant, self._abandon, left)
+                    await reads.run(tenant, self._abandon, waiting.result())
             raise
         if isinstance(token, Response):
             return token
@@ -118,10 +118,14 @@ class IdempotentRequest:
             case InProgress():
                 raise errors.IdempotencyInProgressError(self._key)
 
-    def _begin_for(self, waiting: _Waiting, parts: Parts) -> Response | str:
+    def _begin_for(self, waiting: Future[str], parts: Parts) -> Response | str:
+        """Claim the request, and hand the claim over unless the request has left, which must not keep it."""
         begun = self._begin(parts)
-        if isinstance(begun, str) and not waiting.give(begun):
-            self._abandon(begun)
+        if isinstance(begun, str):
+            if waiting.set_running_or_notify_cancel():
+                waiting.set_result(begun)
+            else:
+                self._abandon(begun)
         return begun
 
     def _keep(self, token: str, answer: Response) -> Response:
@@ -150,27 +154,6 @@ class IdempotentRequest:
             self._claims.abandon(*self._place, self._key, token)
         except errors.StoreUnavailableError:
             logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in progress for its lease")
-
-
-class _Waiting:
-    """Handover of a claim to a waiting request; a request that has left must not keep the claim."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._left = False
-        self._token: str | None = None
-
-    def give(self, token: str) -> bool:
-        """Hand the claim over; return False if the request has left."""
-        with self._lock:
-            self._token = token
-            return not self._left
-
-    def leave(self) -> str | None:
-        """Stop waiting; return the claim if it was handed over already."""
-        with self._lock:
-            self._left = True
-            return self._token
 
 
 def parts_sha256(parts: Parts) -> str:
