@@ -23,14 +23,7 @@ from lalaloc_core.photograph import Photograph
 from service.app import create_app
 from service.errors import IndexTooLargeError, OverloadedError
 from service.on_ray.index_shards import RemoteIndices, Stage
-from service.on_ray.remote import (
-    RemoteLocaliser,
-    RemoteOptimiser,
-    RemotePhotographEncoder,
-    StoredPlace,
-    Success,
-    returning_failures,
-)
+from service.on_ray.remote import RemoteLocaliser, RemoteOptimiser, RemotePhotographEncoder, Success, returning_failures
 from service.query_components import Backends, warm_encoder
 from service.runtime import start_runtime
 from service.settings import Settings
@@ -162,10 +155,9 @@ class SearchReplica(_ServiceReplica):
     """Search of plans and venues."""
 
     @returning_failures
-    async def call(self, method: str, about: StoredPlace, *arguments: Any) -> Any:
-        """Return the result of a method of `Localiser`."""
-        plan_id, venue_id = (None, about.id) if about.is_venue else (about.id, None)
-        where = await self._runtime.plan_lookup.place(about.tenant, plan_id, venue_id, self._runtime.reads)
+    async def call(self, method: str, tenant: str, plan_id: str | None, venue_id: str | None, *arguments: Any) -> Any:
+        """Return the result of a method of `Localiser` about a stored plan or venue."""
+        where = await self._runtime.plan_lookup.place(tenant, plan_id, venue_id, self._runtime.reads)
         return await getattr(self._runtime.localiser, method)(where, *arguments)
 
     async def revisions(self) -> frozenset[str]:
