@@ -141,7 +141,7 @@ class AlbumSolver:
         heartbeat = asyncio.create_task(self._renew(job, progress))
         finished = failed = False
         try:
-            with self._telemetry.timed(self._telemetry.album_seconds):
+            with self._telemetry.album_seconds.time():
                 await self._pin(job, progress)
             finished = True
         except _PASSING as error:
