@@ -195,8 +195,6 @@ class TooManyPhotographsError(ServiceError, problem=(507, "too-many-photographs"
 
 
 class UnanchoredPlanError(ServiceError, problem=(409, "floorplan-unanchored", "Floor plan has no anchor")):
-    """The requested answer needs latitude and longitude."""
-
     message = "floor plan '{}' has no anchor{}; add one for answers in latitude and longitude"
 
     def __init__(self, plan_id: str, venue_id: str | None = None) -> None:
@@ -208,8 +206,6 @@ class UnmeasuredModelError(ServiceError, problem=(501, "model-unmeasured", "Mode
 
 
 class UploadTooLargeError(ServiceError, problem=(413, "upload-too-large", "Upload too large")):
-    """The body exceeds its size limit, which a setting states."""
-
     message = "the body {}; the limit is {} bytes (LALALOC_{})"
 
     def __init__(self, setting: str, limit: int, stated: int | None = None) -> None:
@@ -217,8 +213,6 @@ class UploadTooLargeError(ServiceError, problem=(413, "upload-too-large", "Uploa
 
 
 class BytesInFlightError(ServiceError, problem=(503, "overloaded", "Overloaded")):
-    """The bodies in progress, of the tenant or of all together, leave no room for this one."""
-
     message = "the body needs {} bytes; {} in progress have {} of {} bytes ({}). Retry after {retry_after_s} s"
     retry_after_s = 2
 
@@ -412,8 +406,6 @@ class OverloadedError(ServiceError, problem=(503, "overloaded", "Overloaded")):
 
 
 class ShareExceededError(OverloadedError, problem=(503, "overloaded", "Overloaded")):
-    """One tenant (without API keys: one client address) uses its whole share of the slots."""
-
     message = (
         "{} of your requests are in progress, and the rest of the {} slots is reserved for other tenants. Retry after "
         "{retry_after_s} s."

@@ -109,7 +109,6 @@ class PlanHead:
     """Stored plan at one of its revisions, without its rooms.
 
     Attributes:
-        id: id of the plan.
         revision_id: id of the revision, unique among all plans.
         revision: number of the revision, from 1.
         created_at: time when the plan was first stored.
@@ -137,8 +136,6 @@ class RenditionJob:
     """Stored plan from which a file is made.
 
     Attributes:
-        stored: the plan.
-        kind: kind of the file.
         step_m: grid step, for the estimated size of the pose grid.
         bundle: model of the service, for localisability.
         report: the localisability, for its maps.
@@ -156,8 +153,6 @@ class Rendition:
     """File made from a revision of a plan.
 
     Attributes:
-        content: the file.
-        bounds_m: bounds of the plan.
         poses: estimated size of the pose grid; 0 in files other than descriptions.
     """
 

@@ -75,7 +75,12 @@ LOCAL_BACKENDS = Backends(optimiser=LpoPool, encoder=warm_encoder)
 
 @dataclass(frozen=True, kw_only=True)
 class QueryComponents:
-    """Components of this process that compute answers; attributes as of `Runtime`."""
+    """Components of this process that compute answers.
+
+    Attributes:
+        reads: store reads of queries.
+        cores: cores to compute on, of which each piece of work holds one.
+    """
 
     settings: Settings
     telemetry: Telemetry
@@ -129,7 +134,7 @@ class QueryComponents:
             idle_cores=idle_cores,
         )
 
-    def localiser(self, plans: VenuePlans, indices: IndexSource) -> LocalLocaliser:
+    def build_localiser(self, plans: VenuePlans, indices: IndexSource) -> LocalLocaliser:
         """Build the localiser."""
         executor = Executor(self.settings, self.optimiser, self.telemetry, self.cores)
         queries, tolerance_deg = self.admission.queries, self.settings.photographs.compass_tolerance_deg
@@ -153,7 +158,7 @@ class QueryComponents:
         albums = Threads("albums", 1, self.telemetry.cpu_accounts)
         return LocalLocaliser(parts, queries, albums, self.cores)
 
-    def venue_plans(self) -> VenuePlans:
+    def build_venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""
         return VenuePlans(
             self.store,
@@ -164,7 +169,7 @@ class QueryComponents:
             idle_cores=self.idle_cores,
         )
 
-    def plan_indices(self) -> PlanIndices:
+    def build_plan_indices(self) -> PlanIndices:
         """Build the indices of plans."""
         return PlanIndices(
             self.store,
@@ -175,7 +180,7 @@ class QueryComponents:
             limit_bytes=self.settings.storage.venue_cache_bytes,
         )
 
-    def renditions(self, converter: Converter) -> RenditionCache:
+    def build_renditions(self, converter: Converter) -> RenditionCache:
         """Build the cache of files made from stored plans."""
         return RenditionCache(
             self.store.plans,
@@ -202,7 +207,7 @@ def _admission(settings: Settings, telemetry: Telemetry, store: Store) -> Admiss
         tenants = {client: value for client, value in values.items() if client != PROBES}
         return tenants if settings.access.api_keys else {DEFAULT_TENANT: sum(tenants.values())}
 
-    limits = store.tenant_limits
+    limits = store.tenants
     telemetry.cpu_accounts.share = lambda client: limits.of(client).cpu_share or 1.0
     return Admission(
         settings, telemetry, bytes_limit_of=lambda client: limits.of(client).bytes_in_flight, by_tenant=by_tenant

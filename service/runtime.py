@@ -16,16 +16,14 @@ from sqlalchemy.engine import make_url
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from service.albums.album_solver import AlbumSolver
-from service.capacity.admission_control import Admission
 from service.capacity.cores import usable_cores
-from service.capacity.fair_share import FairSemaphore, with_headroom
+from service.capacity.fair_share import with_headroom
 from service.capacity.threads import BoundedReads, Threads
-from service.decoding.decoder import Decoder
 from service.grids import GridProvider, Sweeper
 from service.http.events import ALBUM_ENDS, PLAN_ENDS, ProgressEvents, album_look, heartbeat_s, plan_look
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
-from service.query import Localiser, Optimiser
+from service.query import Localiser
 from service.query_components import LOCAL_BACKENDS, Backends, QueryComponents, closed_at_end, store_reads
 from service.schemas.albums import AlbumEvent
 from service.schemas.stored_plans import PlanEvent
@@ -51,32 +49,21 @@ _ALBUM_WAIT_S = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Runtime:
+class Runtime(QueryComponents):
     """Components that the routes use.
 
     Attributes:
-        bundle: the model.
         uploads: threads that check, prepare and store plans.
         file_uploads: threads for uploads that wait for the converter.
-        reads: store reads of queries.
         venue_plans: rows of the plans of venues in memory.
         plan_indices: indices of venues in this process.
         renditions: files made from stored plans.
-        cores: cores to compute on, of which each piece of work holds one.
         albums: solves albums, while its `run` does.
     """
 
-    settings: Settings
-    telemetry: Telemetry
-    bundle: Bundle
-    store: Store
-    grids: GridProvider
     plan_lookup: PlanLookup
-    optimiser: Optimiser
-    decoder: Decoder
     converter: Converter
     localiser: Localiser
-    admission: Admission
     access_control: AccessControl
     audit_trail: AuditTrail
     events: ProgressEvents[PlanEvent]
@@ -84,11 +71,9 @@ class Runtime:
     albums: AlbumSolver
     uploads: Threads
     file_uploads: Threads
-    reads: BoundedReads
     venue_plans: VenuePlans
     plan_indices: PlanIndices
     renditions: RenditionCache
-    cores: FairSemaphore
 
     @property
     def ready(self) -> bool:
@@ -127,26 +112,19 @@ def start_runtime(
     sweeper = Sweeper(store, grids, telemetry, sweep_s=sweep_s, keep_answers_s=keep_answers_s)
     closed_at_end(cleanup, sweeper).start()
     streams = _event_streams(settings, components, cleanup)
-    plans, plan_indices = components.venue_plans(), closed_at_end(cleanup, components.plan_indices())
+    plans, plan_indices = components.build_venue_plans(), closed_at_end(cleanup, components.build_plan_indices())
     indices: IndexSource = plan_indices if backends.indices is None else backends.indices(settings)
-    localiser: Localiser = closed_at_end(cleanup, components.localiser(plans, indices))
+    localiser: Localiser = closed_at_end(cleanup, components.build_localiser(plans, indices))
     if backends.localiser is not None:
         localiser = backends.localiser(localiser.model, settings, telemetry)
     lookup = PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S)
     album_reads = closed_at_end(cleanup, BoundedReads(threads=2, max_pending=16, wait_s=_ALBUM_WAIT_S))
     _log_start(settings, bundle, grids, store, telemetry)
     return Runtime(
-        settings=settings,
-        telemetry=telemetry,
-        bundle=bundle,
-        store=store,
-        grids=grids,
+        **vars(components),
         plan_lookup=lookup,
-        optimiser=components.optimiser,
-        decoder=components.decoder,
         converter=converter,
         localiser=localiser,
-        admission=components.admission,
         access_control=access_control,
         audit_trail=audit_trail,
         events=streams(partial(plan_look, store, grids), PlanEvent(status="deleted"), PLAN_ENDS),
@@ -154,11 +132,9 @@ def start_runtime(
         albums=AlbumSolver(store, lookup, localiser, album_reads, settings, telemetry),
         uploads=uploads,
         file_uploads=file_uploads,
-        reads=components.reads,
         venue_plans=plans,
         plan_indices=plan_indices,
-        renditions=closed_at_end(cleanup, components.renditions(converter)),
-        cores=components.cores,
+        renditions=closed_at_end(cleanup, components.build_renditions(converter)),
     )
 
 

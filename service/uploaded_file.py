@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import threading
 from collections.abc import Callable, Iterator
-from tempfile import SpooledTemporaryFile
 from typing import IO
 
 _CHUNK_BYTES = 2**20
@@ -23,13 +22,6 @@ class UploadedFile:
         self._file = file
         self._lock = threading.Lock()
         self._size = file.seek(0, io.SEEK_END)
-
-    @classmethod
-    def of(cls, content: bytes, memory_bytes: int = 0) -> UploadedFile:
-        """Return a file with a content, which is written to disk beyond `memory_bytes`; 0: never."""
-        file = SpooledTemporaryFile(memory_bytes)  # noqa: SIM115  closed by `close`
-        file.write(content)
-        return cls(file)
 
     def __len__(self) -> int:
         return self._size

@@ -94,8 +94,8 @@ def pins_csv(photographs: Sequence[AlbumPhotographAnswer]) -> bytes:
     writer = csv.DictWriter(buffer, _COLUMNS)
     writer.writeheader()
     for photograph in photographs:
-        row = {name: "" if value is None else value for name, value in _row(photograph).items()}
-        writer.writerow({name: _plain(value) for name, value in row.items()})
+        row = _row(photograph).items()
+        writer.writerow({name: no_formula(value) if isinstance(value, str) else value for name, value in row})
     return buffer.getvalue().encode(errors="replace")
 
 
@@ -142,11 +142,6 @@ def _row(photograph: AlbumPhotographAnswer) -> dict[str, Any]:
     if pin.geopose is not None:
         row |= {"latitude": pin.geopose.position.lat, "longitude": pin.geopose.position.lon}
     return row
-
-
-def _plain(value: Any) -> Any:
-    """Return a value that spreadsheets do not take for a formula."""
-    return no_formula(value) if isinstance(value, str) else value
 
 
 def _mark(photograph: AlbumPhotographAnswer, pin: PinAnswer, radius_m: float) -> str:

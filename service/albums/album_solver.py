@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import uuid
-from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from time import monotonic
-from typing import Any, TypeVar
+from typing import Any
 
 from lalaloc_core.errors import InvalidInputError
 from service import errors
@@ -20,7 +18,6 @@ from service.schemas.albums import AlbumDocument
 from service.settings import Settings
 from service.storage import PlanLookup, Store
 from service.storage.album_jobs import AlbumJob
-from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import LOGGER_NAME, Telemetry
 
 # Albums solved at a time by a replica, one per tenant.
@@ -47,8 +44,6 @@ _PASSING = (
 )
 # The service itself, in the place of a tenant.
 _SERVICE = ""
-
-T = TypeVar("T")
 
 
 class AlbumSolver:
@@ -125,9 +120,8 @@ class AlbumSolver:
         begin, corrected = monotonic(), asyncio.Event()
         self._corrected[tenant] = corrected
         try:
-            job = await self._call(
-                tenant, lambda: self._store.album_jobs.claim(album_id, self._owner, self._settings.grids.grid_lease_s)
-            )
+            claim, lease_s = self._store.album_jobs.claim, self._settings.grids.grid_lease_s
+            job = await self._reads.run(tenant, claim, album_id, self._owner, lease_s)
             if job is not None:
                 await self._attempt(job)
         except errors.StoreUnavailableError:
@@ -147,7 +141,7 @@ class AlbumSolver:
         heartbeat = asyncio.create_task(self._renew(job, progress))
         finished = failed = False
         try:
-            with self._telemetry.timed(self._telemetry.album_seconds):
+            with self._telemetry.album_seconds.time():
                 await self._pin(job, progress)
             finished = True
         except _PASSING as error:
@@ -167,7 +161,7 @@ class AlbumSolver:
     async def _pin(self, job: AlbumJob, progress: AlbumProgress) -> None:
         album = job.album
         document = AlbumDocument.model_validate_json(album.options)
-        place = await self._place(album.tenant, document)
+        place = await self._plans.place(album.tenant, document.floorplan_id, document.venue_id, self._reads)
         if job.attempts > _MAX_ATTEMPTS:
             reason = f"it was begun {_MAX_ATTEMPTS} times and never finished"
             await self._finish(job, place.revision_id, failure=reason)
@@ -190,40 +184,23 @@ class AlbumSolver:
         await self._finish(job, place.revision_id, pins=outcome.pins, solution=outcome.solution)
 
     async def _finish(self, job: AlbumJob, place_revision_id: str, **result: Any) -> None:
-        values = {"pins": {}, "solution": None} | result
+        values: dict[str, Any] = {"pins": {}, "solution": None} | result
         finish = self._store.album_jobs.finish
-        await self._call(job.album.tenant, lambda: finish(job, self._owner, place_revision_id, **values))
-
-    async def _place(self, tenant: str, document: AlbumDocument) -> PlanRecord | VenueRecord:
-        """Return the plan or venue of an album."""
-        if document.venue_id is not None:
-            venue_id = document.venue_id
-            venue = await self._call(tenant, lambda: self._store.venues.get(tenant, venue_id))
-            if venue is None:
-                raise errors.UnknownVenueError(venue_id)
-            return venue
-        assert document.floorplan_id is not None
-        record = await self._plans.find(tenant, document.floorplan_id, self._reads)
-        if record is None:
-            raise errors.UnknownFloorPlanError(document.floorplan_id)
-        return record
+        await self._reads.run(job.album.tenant, finish, job, self._owner, place_revision_id, **values)
 
     async def _renew(self, job: AlbumJob, progress: AlbumProgress) -> None:
         """Renew the lease until the task is cancelled; stop the solve if it is lost."""
         lease_s = self._settings.grids.grid_lease_s
-        jobs, album = self._store.album_jobs, job.album
+        renew, album = self._store.album_jobs.renew, job.album
         while not progress.stopped:
             await asyncio.sleep(lease_s / _HEARTBEATS)
             # During an outage no other replica can take the lease either.
             with suppress(errors.StoreUnavailableError):
-                renew = partial(jobs.renew, album.id, self._owner, lease_s, min(max(progress.share, 0.0), 1.0))
-                if not await self._call(album.tenant, renew):
+                share = min(max(progress.share, 0.0), 1.0)
+                if not await self._reads.run(album.tenant, renew, album.id, self._owner, lease_s, share):
                     progress.stopped = True
 
     async def _release(self, job: AlbumJob, *, failed: bool) -> None:
         release = self._store.album_jobs.release
         with suppress(errors.StoreUnavailableError):
-            await self._call(job.album.tenant, lambda: release(job.album.id, self._owner, failed=failed))
-
-    async def _call(self, tenant: str, work: Callable[[], T]) -> T:
-        return await self._reads.run(tenant, work)
+            await self._reads.run(job.album.tenant, release, job.album.id, self._owner, failed=failed)

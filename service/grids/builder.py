@@ -104,7 +104,6 @@ class _LeaseHeartbeat:
         self.lost = False
 
     def beat(self) -> None:
-        """Renew the lease if it is due."""
         if not self.lost and monotonic() >= self._beat_at:
             self.lost = not self._renew()
             self._beat_at = monotonic() + self._every_s
@@ -169,7 +168,7 @@ class GridBuilder:
             raise PlanFailedError(job.plan_id, reason)
         # Small grids that interrupt this one are charged to the same client.
         with self._telemetry.cpu_accounts.charged(record.tenant):
-            with self._telemetry.timed(self._telemetry.grid_seconds):
+            with self._telemetry.grid_seconds.time():
                 grid = self._embed(job, record.plan, record.tenant)
             with self._cores.hold(record.tenant):
                 prototypes = SortedPrototypes.of_grid(grid, record.plan)

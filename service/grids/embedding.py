@@ -40,14 +40,9 @@ def embed(
 ) -> PoseGrid:
     """Sample and render the poses of a plan, and embed them if the model compares latents.
 
-    Args:
-        plan: the plan.
-        encoders: the networks.
-        step_m: grid step (m).
-        camera_height_m: camera height (m).
-        computing: entered for the sampling and for each chunk, so that queries take turns with them.
-        after_room: called after each room of the sampling; an error that it or `after_chunk` raises ends the work.
-        after_chunk: called with the share done (0 to 1), without a core.
+    `computing` is entered for the sampling and for each chunk, so that queries take turns with them. `after_room` is
+    called after each room of the sampling, and `after_chunk` with the share done (0 to 1), without a core; an error
+    that either raises ends the work.
     """
     with computing():
         poses = pose_grid(plan, step_m, after_room)

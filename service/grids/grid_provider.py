@@ -176,7 +176,7 @@ class GridProvider:
             is_brief = self._estimate(plan) <= RENDERED
             with hold() if is_brief else nullcontext():
                 part = nullcontext if is_brief else hold
-                with self._telemetry.timed(self._telemetry.grid_seconds):
+                with self._telemetry.grid_seconds.time():
                     grid = embed(
                         plan,
                         self._encoders,
@@ -222,7 +222,7 @@ class GridProvider:
         made: list[tuple[PoseGrid, SortedPrototypes]] = []
         step_m, hold = self._settings.grids.grid_step_m, partial(self._cores.hold, client)
         try:
-            with self._telemetry.timed(self._telemetry.grid_seconds):
+            with self._telemetry.grid_seconds.time():
                 for part in embed_small(plans, self._encoders, step_m=step_m, computing=hold):
                     made += part
         except Exception:

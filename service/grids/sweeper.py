@@ -35,7 +35,7 @@ class Sweeper:
 
     def start(self) -> None:
         """Read the limits of tenants, clear the failures of earlier runs to try these grids again, start the thread."""
-        self._store.tenant_limits.refresh()
+        self._store.tenants.refresh()
         # A full disk must not prevent the start, because deleting plans frees it.
         with suppress(StoreFullError):
             self._store.plans.clear_failures()
@@ -74,7 +74,7 @@ class Sweeper:
                 due = monotonic() >= sweep_at
                 if due:
                     sweep_at = monotonic() + self._sweep_s
-                    self._store.tenant_limits.refresh()
+                    self._store.tenants.refresh()
                     self._measure()
                     self.sweep()
                     self._store.database.give_back(self._stop.is_set)

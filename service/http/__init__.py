@@ -7,5 +7,4 @@ Routes check form fields with `fields.py`, choose and send answers with `represe
 app.
 """
 
-from service.http.events import ProgressEvents
 from service.http.idempotent_request import IdempotentRequest

@@ -161,7 +161,6 @@ class _Subscriber(Generic[EventT]):
             self._changed.set()
 
     async def next(self) -> EventT | None:
-        """Wait for the next event."""
         await self._changed.wait()
         self._changed.clear()
         return self._event

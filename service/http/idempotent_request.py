@@ -11,9 +11,9 @@ import hashlib
 import json
 import logging
 import re
-import threading
 import uuid
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
 from contextlib import suppress
 
 from starlette.requests import Request
@@ -65,6 +65,8 @@ class IdempotentRequest:
 
         `work` makes the answer from a token of 32 hexadecimal digits, the same for every attempt.
         """
+        if not self._key:
+            return work(uuid.uuid4().hex)
         token = self._begin(parts)
         if isinstance(token, Response):
             return token
@@ -79,15 +81,15 @@ class IdempotentRequest:
         self, parts: Parts, work: Callable[[str], Awaitable[Response]], reads: BoundedReads
     ) -> Response:
         """Execute the request as `run` does, for work that is cancelled if the client leaves."""
-        if self._key is None:
+        if not self._key:
             return await work(uuid.uuid4().hex)
-        tenant, waiting = self._place[0], _Waiting()
+        tenant, waiting = self._place[0], Future[str]()
         try:
             token = await reads.run(tenant, self._begin_for, waiting, parts)
         except BaseException:
-            if (left := waiting.leave()) is not None:
+            if not waiting.cancel():
                 with suppress(errors.StoreUnavailableError):
-                    await reads.run(tenant, self._abandon, left)
+                    await reads.run(tenant, self._abandon, waiting.result())
             raise
         if isinstance(token, Response):
             return token
@@ -105,8 +107,6 @@ class IdempotentRequest:
         return answer
 
     def _begin(self, parts: Parts) -> Response | str:
-        if self._key is None:
-            return uuid.uuid4().hex
         claim = self._claims.begin(*self._place, self._key, parts_sha256(parts))
         match claim:
             case Claimed():
@@ -118,15 +118,17 @@ class IdempotentRequest:
             case InProgress():
                 raise errors.IdempotencyInProgressError(self._key)
 
-    def _begin_for(self, waiting: _Waiting, parts: Parts) -> Response | str:
+    def _begin_for(self, waiting: Future[str], parts: Parts) -> Response | str:
+        """Claim the request, and hand the claim over unless the request has left, which must not keep it."""
         begun = self._begin(parts)
-        if isinstance(begun, str) and not waiting.give(begun):
-            self._abandon(begun)
+        if isinstance(begun, str):
+            if waiting.set_running_or_notify_cancel():
+                waiting.set_result(begun)
+            else:
+                self._abandon(begun)
         return begun
 
     def _keep(self, token: str, answer: Response) -> Response:
-        if self._key is None:
-            return answer
         headers = {name: value for name, value in answer.headers.items() if name != "content-length"}
         try:
             kept = StoredAnswer(answer.status_code, headers, bytes(answer.body))
@@ -141,8 +143,6 @@ class IdempotentRequest:
 
     def _fail(self, token: str, error: BaseException) -> Response | None:
         """Return the answer to a permanent error, which is kept; None for other errors."""
-        if self._key is None:
-            return None
         # A decoder can also die for reasons other than the picture.
         if isinstance(error, _PERMANENT_ERRORS) and not isinstance(error.__cause__, JobLostError):
             return self._keep(token, problem_answer(self._request, error))
@@ -150,33 +150,10 @@ class IdempotentRequest:
         return None
 
     def _abandon(self, token: str) -> None:
-        if self._key is None:
-            return
         try:
             self._claims.abandon(*self._place, self._key, token)
         except errors.StoreUnavailableError:
             logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in progress for its lease")
-
-
-class _Waiting:
-    """Handover of a claim to a waiting request; a request that has left must not keep the claim."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._left = False
-        self._token: str | None = None
-
-    def give(self, token: str) -> bool:
-        """Hand the claim over; return False if the request has left."""
-        with self._lock:
-            self._token = token
-            return not self._left
-
-    def leave(self) -> str | None:
-        """Stop waiting; return the claim if it was handed over already."""
-        with self._lock:
-            self._left = True
-            return self._token
 
 
 def parts_sha256(parts: Parts) -> str:
@@ -193,10 +170,11 @@ def parts_sha256(parts: Parts) -> str:
     return digest.hexdigest()
 
 
-def _key_of(request: Request) -> str | None:
+def _key_of(request: Request) -> str:
+    """Return the key of a request; empty without one."""
     values = request.headers.getlist(HEADER)
     if not values:
-        return None
+        return ""
     if len(values) > 1 or not _KEY.fullmatch(values[0]):
         fault = f"is '{', '.join(values)[:100]}'; give one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
         raise errors.InvalidRequestError([(HEADER, fault)])

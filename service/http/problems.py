@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -28,7 +29,7 @@ from service.http.fields import describe_fault
 from service.schemas.fields import Fault, Problem
 from service.security.access_control import routed_path
 from service.security.permissions import permissions_needed
-from service.telemetry import add_log_fields, request_id_of
+from service.telemetry import LOGGER_NAME, add_log_fields, request_id_of
 
 PROBLEM_JSON = "application/problem+json"
 _HIDDEN = "internal error; the service's log has the details under this request_id"
@@ -79,6 +80,13 @@ def problem_document(request: Request, error: Exception) -> Problem:
         levels=list(error.levels) if isinstance(error, SeveralLevelsError) else None,
         errors=faults and [Fault(field=field, message=message) for field, message in faults],
     )
+
+
+def problem_in_line(request: Request, error: Exception) -> tuple[Problem, int | None]:
+    """Return the problem document of an error that is handled, and its `retry_after_s`, for a line of an answer."""
+    if not isinstance(error, LaLaLocError):
+        logging.getLogger(LOGGER_NAME).exception("unexpected error")
+    return problem_document(request, error), error.retry_after_s if isinstance(error, ServiceError) else None
 
 
 def problem_answer(request: Request, error: Exception) -> JSONResponse:

@@ -297,7 +297,6 @@ class _Expected:
         return errors.MalformedRequestError(f"not valid {MULTIPART}: {message}")
 
     def sort(self, items: list[tuple[str, UploadedFile | str]], limits: UploadLimits, check: Check) -> Parts:
-        """Return the parts by kind."""
         found, counts = Parts({}, {}), Counter[str]()
         added = [(part[:50], self._add(part, value, limits, found, counts)) for part, value in items]
         faults = [(label, fault) for label, fault in added if fault]

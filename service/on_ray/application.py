@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from ray import serve
 from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
@@ -25,15 +25,13 @@ _QUEUED_REQUESTS = 1
 _INDEX_REQUESTS = 4
 
 
-class RayOptions(BaseModel):
+class RayOptions(BaseModel, frozen=True, extra="forbid"):
     """Minimum and maximum number of replicas per deployment.
 
     Attributes:
         index_shards: deployments between which the index of each venue is divided; 0: each search replica has the
             whole index.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     ingress_min: Replicas = 1
     ingress_max: Replicas = 4
@@ -115,7 +113,6 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
 
 
 def _scaled(name: str, options: RayOptions, target: float) -> dict[str, Any]:
-    """Return the scaling options of a deployment."""
     low, high = getattr(options, f"{name}_min"), getattr(options, f"{name}_max")
     if high < low:
         raise ConfigError(f"{name}_max is {high}, less than {name}_min, which is {low}")

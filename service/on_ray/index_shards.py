@@ -143,7 +143,6 @@ class RemoteShard:
         return held
 
     def _waited(self, begin: Callable[[], Any]) -> Any:
-        """Return the result of a call."""
         outcome: Success[Any] | Failure = result_of(begin, self._deadline_s, _MISSED)
         if isinstance(outcome, Failure):
             raise outcome.error

@@ -104,15 +104,6 @@ def result_of(begin: Callable[[], Any], deadline_s: float, missed: str) -> Any:
     raise DeadlineExceededError(deadline_s, missed)
 
 
-@dataclass(frozen=True)
-class StoredPlace:
-    """Name of a stored plan or venue, whose record each replica has in its own cache."""
-
-    is_venue: bool
-    tenant: str
-    id: str
-
-
 class RemotePhotographEncoder(PhotographEncoder):
     """Networks of which those for photographs are remote."""
 
@@ -207,11 +198,11 @@ class RemoteLocaliser:
         await self._call("check", where, context, form)
 
     async def _call(self, method: str, where: Where, context: QueryContext, argument: Any) -> Any:
-        """Call a method of the localiser of a search replica."""
-        about = StoredPlace(isinstance(where, VenueRecord), where.tenant, where.id)
+        # Each replica has the record of the plan or venue in its own cache.
+        place = (None, where.id) if isinstance(where, VenueRecord) else (where.id, None)
         with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):
-                response = self._search.options(session_id=where.id).call.remote(method, about, argument)
+                response = self._search.options(session_id=where.id).call.remote(method, where.tenant, *place, argument)
                 try:
                     async with asyncio.timeout(max(context.left_s + _ON_THE_WAY_S, 0.0)):
                         outcome: Success[Any] | Failure = await response

@@ -21,17 +21,9 @@ from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.venue.index_search import ShardSizes
 from lalaloc_core.photograph import Photograph
 from service.app import create_app
-from service.errors import IndexTooLargeError, OverloadedError, UnknownFloorPlanError, UnknownVenueError
+from service.errors import IndexTooLargeError, OverloadedError
 from service.on_ray.index_shards import RemoteIndices, Stage
-from service.on_ray.remote import (
-    RemoteLocaliser,
-    RemoteOptimiser,
-    RemotePhotographEncoder,
-    StoredPlace,
-    Success,
-    returning_failures,
-)
-from service.query import Where
+from service.on_ray.remote import RemoteLocaliser, RemoteOptimiser, RemotePhotographEncoder, Success, returning_failures
 from service.query_components import Backends, warm_encoder
 from service.runtime import start_runtime
 from service.settings import Settings
@@ -163,26 +155,14 @@ class SearchReplica(_ServiceReplica):
     """Search of plans and venues."""
 
     @returning_failures
-    async def call(self, method: str, about: StoredPlace, *arguments: Any) -> Any:
-        """Return the result of a method of `Localiser`."""
-        return await getattr(self._runtime.localiser, method)(await self._where(about), *arguments)
+    async def call(self, method: str, tenant: str, plan_id: str | None, venue_id: str | None, *arguments: Any) -> Any:
+        """Return the result of a method of `Localiser` about a stored plan or venue."""
+        where = await self._runtime.plan_lookup.place(tenant, plan_id, venue_id, self._runtime.reads)
+        return await getattr(self._runtime.localiser, method)(where, *arguments)
 
     async def revisions(self) -> frozenset[str]:
         """Return the revisions of plans whose pose grids are in memory."""
         return frozenset(self._runtime.grids.revisions())
-
-    async def _where(self, about: StoredPlace) -> Where:
-        runtime, tenant = self._runtime, about.tenant
-        if about.is_venue:
-            venue = await runtime.reads.run(tenant, runtime.store.venues.get, tenant, about.id)
-            if venue is None:
-                raise UnknownVenueError(about.id)
-            return venue
-        record = await runtime.plan_lookup.find(tenant, about.id, runtime.reads)
-        if record is None:
-            # The plan was deleted meanwhile.
-            raise UnknownFloorPlanError(about.id)
-        return record
 
 
 @serve.ingress()

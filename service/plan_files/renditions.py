@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from typing import Literal, cast
 
-from lalaloc_core.conditions import CONDITIONS, Condition
+from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.draw.plan import bounds_with, draw_rooms
 from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from lalaloc_core.importers import ExportFormat, export_plan
@@ -41,14 +41,10 @@ def make_rendition(job: RenditionJob) -> Rendition:
     if job.kind == "description":
         return describe(plan, stored, job.step_m)
     if job.kind == "preview":
-        no_room = no_room_of(stored.report)
+        # Areas that became no room; reports of earlier versions have none.
+        no_room = [] if stored.report is None else json.loads(stored.report).get("no_room", [])
         return Rendition(draw_rooms(plan, no_room).encode(), bounds_with(plan.bounds_m, no_room))
     return Rendition(_content(plan, job), plan.bounds_m)
-
-
-def no_room_of(report: str | None) -> list[list[list[float]]]:
-    """Return the areas that became no room from an import report; none from those of earlier versions."""
-    return [] if report is None else json.loads(report).get("no_room", [])
 
 
 def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
@@ -65,7 +61,10 @@ def _content(plan: FloorPlan, job: RenditionJob) -> bytes:
 
             return plan_glb(plan)
         case kind if kind in CONDITIONS:
-            return localisability_map(plan, job.report, kind)
+            # Imported late: other files do not need its libraries.
+            from lalaloc_core.draw.heat import localisability_svg
+
+            return localisability_svg(plan, json.loads(job.report), kind).encode()
         case kind:
             return export_plan(plan, cast(ExportFormat, kind))
 
@@ -108,14 +107,6 @@ def plan_localisability(plan: FloorPlan, job: RenditionJob, *, coarse: bool = Fa
         **report_of(plan, localisability(plan, job.bundle.manifest, coarse=coarse), coarse=coarse),
     )
     return answer.model_dump_json().encode()
-
-
-def localisability_map(plan: FloorPlan, report: bytes, condition: Condition) -> bytes:
-    """Return the drawing of a `LocalisabilityAnswer` of the plan as SVG."""
-    # Imported late for the same reason.
-    from lalaloc_core.draw.heat import localisability_svg
-
-    return localisability_svg(plan, json.loads(report), condition).encode()
 
 
 def describe(plan: FloorPlan, head: PlanHead, step_m: float) -> Rendition:

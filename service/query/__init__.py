@@ -15,7 +15,6 @@ from service.query.lpo_pool import LpoPool
 from service.query.photograph_reader import PhotographReader
 from service.query.queries import (
     SOLVE_S,
-    AlbumEntry,
     AlbumOutcome,
     AlbumPhotographQuery,
     AlbumProgress,
@@ -25,7 +24,6 @@ from service.query.queries import (
     PhotographQuery,
     PictureQuery,
     SequenceQuery,
-    TrackOutcome,
     TrackQuery,
     Where,
 )

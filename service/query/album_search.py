@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 
@@ -114,7 +115,7 @@ class AlbumSearch:
             else:
                 stated.append(replace(entry, correction=correction))
         memory = self._take(query.album_id)
-        turns = _Turns(self._cores, query.context.client)
+        hold = partial(self._cores.hold, query.context.client)
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
@@ -122,10 +123,12 @@ class AlbumSearch:
         def pause() -> None:
             if query.progress.stopped:
                 raise _Stopped
-            # Others compute in between.
-            turns.pass_on()
+            # Others that wait for the core compute in between.
+            held.close()
+            held.enter_context(hold())
 
-        with turns:
+        with ExitStack() as held:
+            held.enter_context(hold())
             album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
         self._memories.put(query.album_id, memory)
         before = {part.id: part.pin for part in query.photographs}
@@ -141,27 +144,6 @@ class AlbumSearch:
     def close(self) -> None:
         """Wait for the solve in progress."""
         self._threads.close()
-
-
-class _Turns:
-    """Core that a thread holds, and passes on to others that wait."""
-
-    def __init__(self, cores: FairSemaphore, client: str) -> None:
-        self._cores, self._client = cores, client
-        self._held = cores.hold(client)
-
-    def __enter__(self) -> _Turns:
-        self._held = self._cores.hold(self._client)
-        self._held.__enter__()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._held.__exit__(None, None, None)
-
-    def pass_on(self) -> None:
-        """Give the core to the next one, and wait for it."""
-        self.__exit__()
-        self.__enter__()
 
 
 def _size_of(memory: AlbumMemory) -> int:

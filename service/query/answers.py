@@ -19,13 +19,7 @@ _POSE_FIELDS = SequencePoseAnswer.model_fields.keys() & LocaliseAnswer.model_fie
 
 
 def localise_answer(answer: Answer, ground: Ground, timings_ms: dict[str, float]) -> LocaliseAnswer:
-    """Return the answer to a query about one photograph, with its places in stored plans and on Earth.
-
-    Args:
-        answer: the answer.
-        ground: the searched places.
-        timings_ms: durations (ms) by stage.
-    """
+    """Return the answer to a query about one photograph, with its places in stored plans and on Earth."""
     found, fields = answer.evidence.found, answer.document()
     places = [ground.place(candidate) for candidate in found.candidates]
     candidates = [

@@ -78,15 +78,11 @@ class Grounds:
             if isinstance(form, HintFields | SessionDocument):
                 stated_hints(form, where.plan).check(where.plan)
             return
-        members = await self.members(where)
+        members = await self._plans.members(where.tenant, where.id)
         if not members:
             raise VenueUnsearchableError(where.id, "it has no floor plans")
         if isinstance(form, HintFields | SessionDocument):
             VenueHints.from_form(form, where.anchor).check(members)
-
-    async def members(self, venue: VenueRecord) -> PlanList:
-        """Return the current row of every plan of a venue."""
-        return await self._plans.members(venue.tenant, venue.id)
 
     async def grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """Return the plan's pose grid for a camera height; compute it on demand and wait until the deadline."""
@@ -166,9 +162,9 @@ class VenueSite:
 
     async def wait(self, context: QueryContext) -> None:
         """Wait for a plan to be ready."""
-        read_plans = partial(self._grounds.members, self._where)
         with context.clock.stage("wait"):
-            ready, warnings = await self._grounds.search.ready(self._where.id, read_plans, self._hints, context)
+            search, where = self._grounds.search, self._where
+            ready, warnings = await search.ready(where.tenant, where.id, self._hints, context)
         if self._max_poses is not None:
             small = ready.chosen(ready.poses <= self._max_poses)
             if len(small) < len(ready):

@@ -97,7 +97,6 @@ class SessionSearch:
         return TrackedPlans.of_levels(ground.merged, plans, graphs, keys, levels, ground.left_out)
 
     def _graph(self, record: PlanRecord, grid: PoseGrid) -> WalkGraph:
-        """Return the links of a plan's pose grid."""
         return self._graphs.get_or_make(
             record.revision_id, lambda: WalkGraph.of(grid.poses, grid.layouts(record.plan), grid.step_m)
         )

@@ -38,14 +38,6 @@ class QueryParts:
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    """An answer, after and before its places were named."""
-
-    answer: LocaliseAnswer
-    composed: Answer
-
-
 class SingleSearch:
     """Search of the place of one photograph."""
 
@@ -54,17 +46,19 @@ class SingleSearch:
 
     async def answer(self, where: Where, query: PhotographQuery) -> LocaliseAnswer:
         """Localise a photograph."""
-        return (await self._search(where, query)).answer
+        answer, _ = await self._search(where, query)
+        return answer
 
     async def answer_and_draw(self, where: Where, query: PictureQuery) -> tuple[LocaliseAnswer, bytes]:
         """Localise a photograph in a plan and draw the answer."""
-        outcome = await self._search(where, query)
+        answer, composed = await self._search(where, query)
         with query.context.clock.stage("draw"):
-            picture = await self._draw(outcome, query)
+            picture = await self._draw(composed, query)
         self._parts.executor.observe_stage(query.context, "draw")
-        return outcome.answer, picture
+        return answer, picture
 
-    async def _search(self, where: Where, query: PhotographQuery | PictureQuery) -> _Outcome:
+    async def _search(self, where: Where, query: PhotographQuery | PictureQuery) -> tuple[LocaliseAnswer, Answer]:
+        """Return the answer, after and before its places were named."""
         form, context = query.form, query.context
         site = await self._parts.grounds.site(where, form, form)
         # Decode first, so that an unreadable picture is refused without waiting for plans.
@@ -86,12 +80,12 @@ class SingleSearch:
             hints=ground.hints,
         )
 
-        def compose(found: Localisation) -> _Outcome:
+        def compose(found: Localisation) -> tuple[LocaliseAnswer, Answer]:
             timings_ms = self._parts.executor.observe(context, found.stage)
             warnings = [*ground.hint_warnings(found), *ground.warnings]
             composed = compose_answer(found, ground, spot, known, self._parts.bundle, warnings=warnings)
             answer = localise_answer(composed, ground, timings_ms)
-            return _Outcome(answer.model_copy(update=self._extras(where, query, ground, found)), composed)
+            return answer.model_copy(update=self._extras(where, query, ground, found)), composed
 
         return await self._parts.executor.run_search(finish_with(steps, compose), context)
 
@@ -107,7 +101,7 @@ class SingleSearch:
         plans = ground.plan_probabilities(found, None if confidence is None else confidence.fit)
         return {"venue_id": where.id, "plans": plans[: query.form.top_k]}
 
-    async def _draw(self, outcome: _Outcome, query: PictureQuery) -> bytes:
+    async def _draw(self, composed: Answer, query: PictureQuery) -> bytes:
         context, picture = query.context, None
         if query.picture != "plan":
             assert not isinstance(query.content, Photograph)
@@ -117,12 +111,12 @@ class SingleSearch:
                 query.form.stated_camera,
                 context.deadline,
                 context.client,
-                is_sphere=outcome.composed.evidence.photograph.is_sphere,
+                is_sphere=composed.evidence.photograph.is_sphere,
                 max_size=PHOTOGRAPH_SIZE,
             )
 
         def draw() -> str:
-            drawn = drawn_answer(outcome.composed)
+            drawn = drawn_answer(composed)
             return draw_answer(drawn, picture, query.picture, rooms=query.rooms)
 
         svg = await self._parts.executor.compute(context, draw)

@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
@@ -17,12 +18,12 @@ from service import errors
 from service.albums.album_documents import correction_document, pins_csv, pins_geojson, pins_svg, stored_correction
 from service.capacity.admission_control import QUERY_IN_PARTS, admitted_as
 from service.http.problems import problem_responses
-from service.http.representations import NDJSON, LinesResponse, expected_revision, preferred, revision_etag
+from service.http.representations import NDJSON, LinesResponse, expected_revision, preferred
 from service.http.uploads import GEOJSON, JSON, MULTIPART, Repeats
 from service.query import AlbumPhotographQuery, Content, QueryContext
 from service.routes.albums import album_of
 from service.routes.batch_lines import BatchLines
-from service.routes.dependencies import After, ApiCall, Call, cursor_text, is_id, parse_venue_cursor
+from service.routes.dependencies import After, ApiCall, Call, cursor_text, is_id, json_with_etag, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
     PHOTOGRAPH_LINES,
@@ -108,42 +109,24 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
     most = call.settings.photographs.max_batch_photographs
     repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
     _, parts, _ = await read_files(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
-    are_features = bool(parts.named(FEATURES))
     files = parts.named(PHOTO) or parts.named(FEATURES)
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(files))
-    adding = _Adding(call, album, len(files), are_features=are_features)
-    lines = BatchLines(call, AlbumLine, adding.add, adding.end).lines([(file, file) for file in files])
-    return LinesResponse(lines, call.settings.requests.request_deadline_s)
+    document = AlbumDocument.model_validate_json(album.options)
+    read = partial(_read, call=call, are_features=bool(parts.named(FEATURES)))
+    # Photographs are read side by side, and stored in the order of the request.
+    done = [asyncio.Event() for _ in files]
 
-
-class _Adding:
-    """Photographs of one request that are added to an album."""
-
-    def __init__(self, call: ApiCall, album: AlbumRecord, count: int, *, are_features: bool) -> None:
-        self._call = call
-        self._album = album
-        self._document = AlbumDocument.model_validate_json(album.options)
-        self._are_features = are_features
-        # Photographs are read side by side, and stored in the order of the request.
-        self._done = [asyncio.Event() for _ in range(count)]
-
-    def end(self, index: int) -> None:
-        """Let the next photograph be stored."""
-        self._done[index].set()
-
-    async def add(self, index: int, file: UploadedFile, _: Content, context: QueryContext) -> dict[str, Any]:
-        """Store a photograph, and return the fields of its line: status 201 if it is new."""
-        call, album = self._call, self._album
-        content, sha256 = await call.upload(self._read, file)
+    async def add(index: int, file: UploadedFile, _: Content, context: QueryContext) -> dict[str, Any]:
+        content, sha256 = await call.upload(read, file)
         same = await call.read(call.store.albums.same_picture, album.id, sha256)
         if same is not None:
             return {"status": 200, "photograph": _photograph_answer(same)}
-        place = await call.place(self._document.floorplan_id, self._document.venue_id)
-        query = AlbumPhotographQuery(document=self._document, content=content, sha256=sha256, context=context)
+        place = await call.place(document.floorplan_id, document.venue_id)
+        query = AlbumPhotographQuery(document=document, content=content, sha256=sha256, context=context)
         entry = await call.runtime.localiser.answer(place, query)
         new = NewPhotograph(sha256=sha256, name=_clean(file.name), facts=entry.facts, entry=entry.entry)
         if index:
-            await self._done[index - 1].wait()
+            await done[index - 1].wait()
         storage = call.settings.storage
         ttl_s, limit = storage.album_ttl_s, storage.max_album_photographs
         record, is_new = await call.upload(
@@ -152,15 +135,20 @@ class _Adding:
         call.runtime.albums.wake()
         return {"status": 201 if is_new else 200, "photograph": _photograph_answer(record)}
 
-    def _read(self, file: UploadedFile) -> tuple[Content, str]:
-        digest = hashlib.sha256()
-        for chunk in file.chunks():
-            digest.update(chunk)
-        if not self._are_features:
-            return file, digest.hexdigest()
-        if len(file) > MAX_BYTES:
-            raise InvalidFeaturesError(f"{FEATURES} has {len(file)} bytes; the limit is {MAX_BYTES}")
-        return read_features(file.read(), self._call.runtime.bundle), digest.hexdigest()
+    lines = BatchLines(call, AlbumLine, add, lambda index: done[index].set()).lines([(file, file) for file in files])
+    return LinesResponse(lines, call.settings.requests.request_deadline_s)
+
+
+def _read(file: UploadedFile, call: ApiCall, *, are_features: bool) -> tuple[Content, str]:
+    """Return a photograph, and the digest of its file."""
+    digest = hashlib.sha256()
+    for chunk in file.chunks():
+        digest.update(chunk)
+    if not are_features:
+        return file, digest.hexdigest()
+    if len(file) > MAX_BYTES:
+        raise InvalidFeaturesError(f"{FEATURES} has {len(file)} bytes; the limit is {MAX_BYTES}")
+    return read_features(file.read(), call.runtime.bundle), digest.hexdigest()
 
 
 @router.get(
@@ -243,8 +231,8 @@ async def _drawing(
 @router.get("/{photograph_id}", summary="Get a photograph of an album", **reads(AlbumPhotographAnswer, *_MISSING))
 def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
     """Return a photograph with its correction and its pin."""
-    content, etag = _representation(_photograph_of(call, album_of(call, album_id), photograph_id))
-    return call.representation(content, etag)
+    record = _photograph_of(call, album_of(call, album_id), photograph_id)
+    return call.representation(*json_with_etag(_photograph_answer(record)))
 
 
 @router.patch(
@@ -288,9 +276,8 @@ async def correct_album_photograph(album_id: str, photograph_id: str, call: Call
     def store() -> Response:
         correct = call.store.albums.correct
         record = correct(call.tenant, album.id, current.id, correction, ttl_s=ttl_s, expected=expected)
-        content, etag = _representation(record)
         path = call.path_of("get_album_photograph", album_id=album.id, photograph_id=record.id)
-        return call.change_answer(content, etag, path, created=False)
+        return call.change_answer(*json_with_etag(_photograph_answer(record)), path, created=False)
 
     answer = await call.upload(store)
     call.runtime.albums.wake(corrected=call.tenant)
@@ -343,9 +330,3 @@ def _photograph_answer(record: PhotographRecord) -> AlbumPhotographAnswer:
         correction=correction,
         pin=_pin_of(record),
     )
-
-
-def _representation(record: PhotographRecord) -> tuple[bytes, str]:
-    """Return a photograph as JSON, and its entity tag."""
-    content = _photograph_answer(record).model_dump_json().encode()
-    return content, revision_etag(record.revision_id, content)

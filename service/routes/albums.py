@@ -11,8 +11,7 @@ from lalaloc_core.localise.encode.features import gives_features
 from service import errors
 from service.capacity.admission_control import STREAM, admitted_as
 from service.http.problems import problem_responses
-from service.http.representations import revision_etag
-from service.routes.dependencies import ApiCall, Call, Name, Page, is_id
+from service.routes.dependencies import ApiCall, Call, Name, Page, is_id, json_with_etag
 from service.routes.descriptions import BEGIN_ERRORS, READ_ERRORS, deletes, event_stream, json_body, reads, stores
 from service.schemas.albums import AlbumAnswer, AlbumDocument, AlbumList, AlbumSolution, AlbumSummary
 from service.storage.album_rows import AlbumRecord, NewAlbum
@@ -56,8 +55,8 @@ async def create_album(call: Call) -> Response:
     def store(token: str) -> Response:
         add = call.store.albums.add
         record = add(call.tenant, token, new, ttl_s=storage.album_ttl_s, limit=storage.max_albums)
-        content, etag = _representation(record, call)
-        return call.change_answer(content, etag, call.path_of("get_album", album_id=record.id), created=True)
+        path = call.path_of("get_album", album_id=record.id)
+        return call.change_answer(*json_with_etag(_answer(record, call)), path, created=True)
 
     return await call.upload(idempotent.run, parts, store)
 
@@ -72,8 +71,7 @@ def list_albums(call: Call, page: Page, name: Name = None) -> AlbumList:
 @router.get("/{album_id}", summary="Get an album", **reads(AlbumAnswer, errors.UnknownAlbumError))
 def get_album(album_id: str, call: Call) -> Response:
     """Return an album with its state and what its photographs have in common."""
-    content, etag = _representation(album_of(call, album_id), call)
-    return call.representation(content, etag)
+    return call.representation(*json_with_etag(_answer(album_of(call, album_id), call)))
 
 
 @router.get(
@@ -111,7 +109,6 @@ def album_of(call: ApiCall, album_id: str) -> AlbumRecord:
 
 
 def _summary(record: AlbumRecord, call: ApiCall) -> AlbumSummary:
-    """Return an album as an item of a list."""
     return AlbumSummary(
         id=record.id,
         revision=record.revision_id,
@@ -130,13 +127,10 @@ def _summary(record: AlbumRecord, call: ApiCall) -> AlbumSummary:
     )
 
 
-def _representation(record: AlbumRecord, call: ApiCall) -> tuple[bytes, str]:
-    """Return an album as JSON, and its entity tag."""
-    answer = AlbumAnswer(
+def _answer(record: AlbumRecord, call: ApiCall) -> AlbumAnswer:
+    return AlbumAnswer(
         **_summary(record, call).model_dump(),
         place_revision=record.place_revision_id,
         model_sha256=record.model_sha256,
         solution=None if record.solution is None else AlbumSolution.model_validate_json(record.solution),
     )
-    content = answer.model_dump_json().encode()
-    return content, revision_etag(record.revision_id, content)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 from collections import deque
 from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from typing import Any
 
 from pydantic import BaseModel
 
-from lalaloc_core.errors import InvalidHintError, LaLaLocError
+from lalaloc_core.errors import InvalidHintError
 from service import errors
-from service.http.problems import problem_document
+from service.http.problems import problem_in_line
 from service.query import Content, QueryContext
 from service.routes.dependencies import ApiCall
-from service.telemetry import LOGGER_NAME
 from service.uploaded_file import UploadedFile
 
 # Errors that every further photograph of the request would meet.
@@ -89,13 +87,10 @@ class BatchLines:
         try:
             fields = await self._answer(index, file, photograph)
         except Exception as error:
-            if not isinstance(error, LaLaLocError):
-                logging.getLogger(LOGGER_NAME).exception("unexpected error")
             if isinstance(error, _COMMON_ERRORS):
                 self._common_error = error
-            problem = problem_document(self._call.request, error)
+            problem, retry_after_s = problem_in_line(self._call.request, error)
             fields = {"status": problem.status}
-            retry_after_s = error.retry_after_s if isinstance(error, errors.ServiceError) else None
         finally:
             file.close()
         self._on_end(index)

@@ -19,10 +19,12 @@ from service.http import IdempotentRequest
 from service.http.fields import Model, parse_document
 from service.http.idempotent_request import HEADER
 from service.http.middleware.admission import reading
-from service.http.representations import expected_revision, not_modified, tagged_answer
+from service.http.representations import expected_revision, not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.plan_documents import Rendition, RenditionKind
 from service.runtime import Runtime, get_runtime
+from service.schemas.albums import AlbumAnswer, AlbumPhotographAnswer
+from service.schemas.venues import VenueAnswer
 from service.security import caller_of
 from service.settings import Settings
 from service.storage import Store
@@ -183,19 +185,16 @@ class ApiCall:
 
     async def place(self, floorplan_id: str | None, venue_id: str | None) -> PlanRecord | VenueRecord:
         """Return the plan or venue of a query; a plan from memory while the database is away."""
-        if venue_id is not None:
-            if not is_id(venue_id):
-                raise UnknownVenueError(venue_id)
-            venue = await self.read(self.venue, venue_id)
-            self.log(venue=venue.id)
-            return venue
-        assert floorplan_id is not None
-        lookup, reads = self.runtime.plan_lookup, self.runtime.reads
-        record = await lookup.find(self.tenant, floorplan_id, reads) if is_id(floorplan_id) else None
-        if record is None:
+        if venue_id is not None and not is_id(venue_id):
+            raise UnknownVenueError(venue_id)
+        if venue_id is None and floorplan_id is not None and not is_id(floorplan_id):
             raise UnknownFloorPlanError(floorplan_id)
-        self.log(plan=record.id, revision=record.revision_id)
-        return record
+        place = await self.runtime.plan_lookup.place(self.tenant, floorplan_id, venue_id, self.runtime.reads)
+        if isinstance(place, VenueRecord):
+            self.log(venue=place.id)
+        else:
+            self.log(plan=place.id, revision=place.revision_id)
+        return place
 
     def path_of(self, route: str, **ids: str) -> str:
         """Return the path of a route, by the name of its function."""
@@ -246,3 +245,9 @@ Page = Annotated[_Page, Depends()]
 def is_id(text: str) -> bool:
     """Return True for 32 hexadecimal digits; other texts are never looked up in the database."""
     return _ID.fullmatch(text) is not None
+
+
+def json_with_etag(answer: VenueAnswer | AlbumAnswer | AlbumPhotographAnswer) -> tuple[bytes, str]:
+    """Return an answer as JSON, and its entity tag."""
+    content = answer.model_dump_json().encode()
+    return content, revision_etag(answer.revision, content)

@@ -15,11 +15,10 @@ from service.http.problems import problem_responses
 from service.http.representations import not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON
 from service.plan_documents import Rendition
-from service.plan_files.plan_file import PlanFile
 from service.plan_files.renditions import describe, state_of_description, with_head
 from service.routes.dependencies import ApiCall, Call, Name, Page, Revision
 from service.routes.descriptions import READ_ERRORS, UPLOAD_ERRORS, changes, deletes, import_lines, reads, stores
-from service.routes.plan_uploads import UPLOAD_BODY, PlanUpload, answer_import, prepare_plan, read_upload
+from service.routes.plan_uploads import UPLOAD_BODY, PlanFile, PlanUpload, answer_import, prepare_plan, read_upload
 from service.schemas.stored_plans import FloorPlanAnswer, FloorPlanList, FloorPlanSummary
 from service.storage.records import PlanRecord, PlanSummary
 
@@ -160,7 +159,6 @@ def _description_parts(
 
 
 def _list_entries(summaries: list[PlanSummary], states: list[GridState]) -> list[FloorPlanSummary]:
-    """Return plans as items of a list."""
     return [
         FloorPlanSummary(
             id=summary.id,

@@ -92,7 +92,6 @@ def _largest(call: ApiCall) -> Settable:
 
 
 def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCall) -> SequenceQuery:
-    """Return the query about the film or the photographs of a request."""
     limits = call.settings.photographs
     films = parts.named(FILM)
     if not films:
@@ -111,7 +110,6 @@ def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCal
 
 
 def _photographs(parts: Parts, form: SequenceForm, call: ApiCall) -> list[Content]:
-    """Return the photographs in order."""
     limit = call.settings.photographs.max_photograph_bytes
     if (largest := max(map(len, parts.named(PHOTO)), default=0)) > limit:
         raise UploadTooLargeError("max_photograph_bytes", limit, largest)

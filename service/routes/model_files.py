@@ -77,7 +77,6 @@ async def get_model_file(file: str, call: Call) -> Response:
 
 
 def _open(path: Path, size_bytes: int) -> BinaryIO:
-    """Open a file of the model."""
     try:
         opened = path.open("rb")
     except OSError as error:

@@ -56,7 +56,6 @@ def part(request: Request, name: str) -> Response:
 
 
 def _file(request: Request, name: str) -> Response:
-    """Return a built file."""
     if not _NAME.fullmatch(name):
         raise HTTPException(404)
     content, media, etag = _built(name)

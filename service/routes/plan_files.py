@@ -254,7 +254,6 @@ def _check_near(marker: Marker, bounds_m: Bounds) -> None:
 
 
 def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
-    """Return (xx, xy, yy)."""
     if given is None:
         return None
     xx, xy, yy = given

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,22 +13,33 @@ from typing import Any, ParamSpec, TypeVar
 from fastapi import Response
 from pydantic import BaseModel
 
-from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError
-from lalaloc_core.importers import ImportOptions, ImportStep, OnStep, building_name
-from service import errors
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.file_kinds import describe_file
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.importers import (
+    ImportOptions,
+    ImportStep,
+    Level,
+    OnStep,
+    begins_with_plans,
+    building_name,
+    detect_format,
+    detect_media_type,
+    import_if_native,
+    is_json,
+)
 from service.errors import InvalidRequestError
 from service.http.idempotent_request import REPLAYED, IdempotentRequest
-from service.http.problems import problem_document
+from service.http.problems import problem_in_line
 from service.http.representations import NDJSON, LinesResponse, preferred
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
-from service.plan_documents import PlanDocument
-from service.plan_files.plan_file import PlanFile, PlanReader, seems_native
+from service.plan_documents import LARGE, PlanDocument, Rendition
+from service.plan_files.convert_worker import report_of
 from service.routes.dependencies import ApiCall
 from service.routes.descriptions import BINARY, json_body
 from service.schemas.native_plan import FloorPlanDocument
 from service.schemas.plan_import import ImportForm, LevelsForm
 from service.storage.records import ComputedGrid, NewPlan, Original
-from service.telemetry import LOGGER_NAME
 from service.uploaded_file import UploadedFile
 
 P = ParamSpec("P")
@@ -65,6 +75,18 @@ LEVELS_FORM: dict[str, Any] = {"schema": _form_schema(LevelsForm)}
 
 
 @dataclass(frozen=True)
+class PlanFile:
+    """Plan of an uploaded file."""
+
+    plan: FloorPlan
+    report: str
+    media_type: str
+    level: Level | None = None
+    document: PlanDocument | None = None
+    description: Rendition | None = None
+
+
+@dataclass(frozen=True)
 class PlanUpload:
     """Uploaded file with its options."""
 
@@ -80,20 +102,6 @@ class PlanUpload:
         threads = call.runtime.uploads if self.is_native else call.runtime.file_uploads
         return await threads.run(call.client, work, *args, **kwargs)
 
-    def reader(self, call: ApiCall, on_step: OnStep | None) -> PlanReader:
-        """Return the reader of the file."""
-        runtime = call.runtime
-        return PlanReader(
-            self.file.read(),
-            self.options,
-            self.is_native,
-            call.client,
-            runtime.converter,
-            runtime.settings,
-            runtime.cores,
-            on_step,
-        )
-
 
 async def read_upload(call: ApiCall, form: type[BaseModel] = ImportForm) -> PlanUpload:
     """Read the file in a request, with its options, the fields of a form."""
@@ -104,7 +112,15 @@ async def read_upload(call: ApiCall, form: type[BaseModel] = ImportForm) -> Plan
         known = set(form.model_fields)
         parts = await read_parts(call.request, limits, files={_FILE}, fields=known, check=_faults)
     file = parts.files[_FILE]
-    return PlanUpload(file, ImportOptions.from_text(parts.fields), parts, seems_native(file))
+    return PlanUpload(file, ImportOptions.from_text(parts.fields), parts, _seems_native(file))
+
+
+def _seems_native(file: UploadedFile) -> bool:
+    """Return whether a file looks like a small native plan, which needs no worker."""
+    if len(file) > LARGE:
+        return False
+    content = file.read()
+    return is_json(content) and not begins_with_plans(content) and describe_file(content) is None
 
 
 def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
@@ -123,15 +139,46 @@ def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
     return faults
 
 
+def _plan_files(
+    uploaded: PlanUpload, content: bytes, call: ApiCall, name: str | None, on_step: OnStep | None, *, every_level: bool
+) -> list[PlanFile]:
+    """Return the only plan of an uploaded file, or those of its levels, lowest first.
+
+    `name` is for plans that have none, and for those of several levels, unless the options have one. Single native
+    plans of up to 256 KiB are parsed here, in milliseconds. Worker processes read, validate and describe all others:
+    large or many plans would take the interpreter from other requests, and other formats can crash their reader.
+    """
+    runtime, limits = call.runtime, call.settings.plans.import_limits
+    if not content.strip():
+        raise InvalidFloorPlanError("the body is empty; send a plan file")
+    if uploaded.is_native:
+        with runtime.cores.hold(call.client):
+            imported = import_if_native(content, uploaded.options, limits, building=name)
+            if imported is not None:
+                media_type = detect_media_type(content, "native")
+                return [PlanFile(imported.plan(limits.plan), report_of(imported), media_type)]
+    elif not is_json(content):
+        # Reject unsupported formats before they take a worker.
+        detect_format(content, limits)
+    files: list[PlanFile] = []
+    for level in runtime.converter.read(
+        content, uploaded.options, call.client, every_level=every_level, building=name, on_step=on_step
+    ):
+        with runtime.cores.hold(call.client):
+            plan = level.plan.plan()
+        files.append(PlanFile(plan, level.report, level.media_type, level.level, level.document, level.description))
+    return files
+
+
 def prepare_plan(uploaded: PlanUpload, call: ApiCall, on_step: OnStep | None = None) -> tuple[NewPlan, PlanFile]:
     """Return the plan in an uploaded file, with its pose grid if that is computed at once, and as it was read. Blocks.
 
     `on_step` is as for `Converter.read`.
     """
-    reader, grids = uploaded.reader(call, on_step), call.runtime.grids
-    file = reader.read(building_name(uploaded.file.name))
+    content, grids = uploaded.file.read(), call.runtime.grids
+    (file,) = _plan_files(uploaded, content, call, building_name(uploaded.file.name), on_step, every_level=False)
     grids.check_size(file.plan)
-    original = Original(reader.content, file.media_type, file.report)
+    original = Original(content, file.media_type, file.report)
     return _new_plan(file, original, grids.prepare(file.plan, call.client), 0.0, call), file
 
 
@@ -140,8 +187,8 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnSt
 
     `on_step` is as for `Converter.read`.
     """
-    reader, provider = uploaded.reader(call, on_step), call.runtime.grids
-    files = reader.read_levels(name)
+    content, provider = uploaded.file.read(), call.runtime.grids
+    files = _plan_files(uploaded, content, call, name, on_step, every_level=True)
     limit = call.settings.plans.max_venue_plans
     if len(files) > limit:
         fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"
@@ -149,7 +196,7 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnSt
     for file in files:
         provider.check_size(file.plan, None if file.level is None else file.level.name)
     grids = provider.prepare_all([file.plan for file in files], call.client)
-    originals = [_original(file, reader.content if len(files) == 1 else None) for file in files]
+    originals = [_original(file, content if len(files) == 1 else None) for file in files]
     return [_new_plan(*values, call) for values in zip(files, originals, grids, _level_numbers(files), strict=True)]
 
 
@@ -212,7 +259,9 @@ async def _lines(
         try:
             yield _answer_line(task.result())
         except Exception as error:
-            yield _problem_line(call, error)
+            problem, retry_after_s = problem_in_line(call.request, error)
+            document = problem.model_dump(mode="json", exclude_none=True)
+            yield _line({"status": problem.status, "problem": document, "retry_after_s": retry_after_s})
     finally:
         # A call that has begun is finished on its thread, as for an answer in JSON.
         task.cancel()
@@ -258,16 +307,6 @@ def _answer_line(response: Response) -> str:
     # Not parsed: plans can have megabytes. A text of JSON has no line breaks, only the space between its values.
     content = bytes(response.body).decode().replace("\n", " ")
     return f'{_line(values)[:-1]}, "{"problem" if is_problem else "answer"}": {content}}}'
-
-
-def _problem_line(call: ApiCall, error: Exception) -> str:
-    if not isinstance(error, LaLaLocError):
-        logging.getLogger(LOGGER_NAME).exception("unexpected error")
-    problem = problem_document(call.request, error)
-    values: dict[str, Any] = {"status": problem.status, "problem": problem.model_dump(mode="json", exclude_none=True)}
-    if isinstance(error, errors.ServiceError) and error.retry_after_s is not None:
-        values["retry_after_s"] = error.retry_after_s
-    return _line(values)
 
 
 def _line(values: dict[str, Any]) -> str:

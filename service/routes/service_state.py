@@ -12,7 +12,6 @@ from service.capacity.admission_control import PROBE, admitted_as
 from service.capacity.fair_share import max_per_client
 from service.errors import StoreUnavailableError
 from service.http.problems import problem_responses
-from service.pools import PoolState
 from service.routes.dependencies import Call, Running
 from service.schemas.service_state import (
     BytesInFlightAnswer,
@@ -57,9 +56,9 @@ async def get_readiness(runtime: Running, response: Response) -> ReadyAnswer:
     return ReadyAnswer(
         ready=runtime.ready,
         model=runtime.localiser.model,
-        lpo_pool=_pool(runtime.optimiser.state),
-        decode_pool=_pool(runtime.decoder.state),
-        import_pool=_pool(runtime.converter.state),
+        lpo_pool=PoolAnswer(**asdict(runtime.optimiser.state)),
+        decode_pool=PoolAnswer(**asdict(runtime.decoder.state)),
+        import_pool=PoolAnswer(**asdict(runtime.converter.state)),
         database=runtime.store.database.state,
         plans_preparing=runtime.grids.preparing,
     )
@@ -105,7 +104,3 @@ def get_usage(call: Call) -> UsageAnswer:
     )
     cpu_s = round(admission.cpu_accounts.total_s(client), 3)
     return UsageAnswer(tenant=call.tenant, stored_bytes=stored, bytes_in_flight=in_flight, cpu_seconds=cpu_s)
-
-
-def _pool(state: PoolState) -> PoolAnswer:
-    return PoolAnswer(workers=state.workers, ready=state.ready, warmed_up=state.warmed_up, fault=state.fault)

@@ -197,7 +197,6 @@ def _response(session: SessionRecord, media: str) -> Response:
 
 
 def _answer(session: SessionRecord) -> str:
-    """Return the answer about a session as JSON."""
     stored, in_venue = _stored_pose(session), session.venue_id is not None
     return SessionAnswer(
         id=session.id,

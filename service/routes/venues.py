@@ -15,9 +15,8 @@ from lalaloc_core.importers import OnStep, building_name
 from service import errors
 from service.http.fields import Model, parse_document
 from service.http.problems import problem_responses
-from service.http.representations import revision_etag
 from service.http.uploads import JSON, MULTIPART, Parts, media_type
-from service.routes.dependencies import ApiCall, Call, Name, Page, is_id, parse_venue_cursor
+from service.routes.dependencies import ApiCall, Call, Name, Page, is_id, json_with_etag, parse_venue_cursor
 from service.routes.descriptions import (
     BODY_ERRORS,
     READ_ERRORS,
@@ -112,8 +111,7 @@ def list_venues(call: Call, page: Page, name: Name = None) -> VenueList:
 @router.get("/{venue_id}", summary="Get a venue", **reads(VenueAnswer, errors.UnknownVenueError))
 def get_venue(venue_id: str, call: Call) -> Response:
     """Return a stored venue with the number of plans that are ready."""
-    content, etag = _representation(call.venue(venue_id), call)
-    return call.representation(content, etag)
+    return call.representation(*json_with_etag(_answer(call.venue(venue_id), call)))
 
 
 @router.get(
@@ -264,7 +262,6 @@ def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
 
 
 def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
-    """Return the plans of a venue in a request."""
     limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise errors.InvalidRequestError(
@@ -292,12 +289,11 @@ def _removed(document: VenueChangeDocument) -> set[str]:
 
 def _change_answer(call: ApiCall, record: VenueRecord, *, created: bool) -> Response:
     call.log(venue=record.id, revision=record.revision_id)
-    content, etag = _representation(record, call)
-    return call.change_answer(content, etag, call.path_of("get_venue", venue_id=record.id), created=created)
+    path = call.path_of("get_venue", venue_id=record.id)
+    return call.change_answer(*json_with_etag(_answer(record, call)), path, created=created)
 
 
 def _summary(record: VenueRecord) -> VenueSummary:
-    """Return a venue as an item of a list."""
     return VenueSummary(
         id=record.id,
         revision=record.revision_id,
@@ -309,17 +305,14 @@ def _summary(record: VenueRecord) -> VenueSummary:
     )
 
 
-def _representation(record: VenueRecord, call: ApiCall) -> tuple[bytes, str]:
-    """Return a venue as JSON, and its entity tag."""
+def _answer(record: VenueRecord, call: ApiCall) -> VenueAnswer:
     counts = call.runtime.venue_plans.counts(record.tenant, record.id)
-    answer = VenueAnswer(
+    return VenueAnswer(
         **_summary(record).model_dump(),
         revision_number=record.revision,
         plans_ready=counts.ready,
         plans_failed=counts.failed,
     )
-    content = answer.model_dump_json().encode()
-    return content, revision_etag(record.revision_id, content)
 
 
 def _plan_entries(members: list[VenueMember], call: ApiCall) -> list[VenuePlanAnswer]:

@@ -31,11 +31,4 @@ from service.schemas.localise_answer import (
 )
 from service.schemas.query_fields import EarthPoint, LocaliseForm
 from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading
-from service.schemas.sessions import (
-    PathPoint,
-    PhotographForm,
-    RivalAnswer,
-    SessionDocument,
-    StoredPose,
-    TrackedPoseAnswer,
-)
+from service.schemas.sessions import PathPoint, PhotographForm, SessionDocument, StoredPose, TrackedPoseAnswer

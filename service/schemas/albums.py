@@ -24,17 +24,13 @@ _MAX_ID = 128
 class AlbumDocument(PlaceFields, HeightFields, PhotographFields):
     """Album of a plan or venue, and what is known about the camera of its photographs."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", json_schema_extra={"example": {"floorplan_id": "0" * 32, "name": "Visit in May"}}
-    )
+    model_config = ConfigDict(json_schema_extra={"example": {"floorplan_id": "0" * 32, "name": "Visit in May"}})
 
     name: Name = Field("album", description="Name of the album.")
 
 
-class AlbumPhotographForm(BaseModel):
+class AlbumPhotographForm(BaseModel, frozen=True, extra="forbid"):
     """Form fields beside the photographs of an album: none, as the album states its camera."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class CorrectionDocument(Document):

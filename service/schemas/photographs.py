@@ -16,14 +16,13 @@ _HFOV_RANGES = ", ".join(
 _Number = Annotated[float, Finite]
 
 
-class StatedIntrinsics(BaseModel):
+class StatedIntrinsics(
+    BaseModel,
+    frozen=True,
+    extra="forbid",
+    json_schema_extra={"example": {"fx": 2870.0, "fy": 2868.0, "cx": 2010.5, "cy": 1509.0}},
+):
     """Camera matrix and distortion as OpenCV's calibration prints them, for the upright picture at its full size."""
-
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        json_schema_extra={"example": {"fx": 2870.0, "fy": 2868.0, "cx": 2010.5, "cy": 1509.0}},
-    )
 
     fx: _Number = Field(description="Focal length, pixels.")
     fy: _Number = Field(description="Focal length, pixels.")

@@ -138,13 +138,11 @@ class ImportReport(ResponseModel):
     )
 
 
-class ImportLine(BaseModel):
+class ImportLine(BaseModel, frozen=True):
     """Line of the answer to an import: a step that begins, or at the end the answer or the problem.
 
     Members that do not apply are left out.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     step: str | None = Field(None, description="Step that begins or goes on, such as `reading texts`.")
     done: int | None = Field(None, description="Levels of the file that are done, if the step is one of several.")

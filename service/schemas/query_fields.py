@@ -88,21 +88,17 @@ _parse_rooms = parse_json('a JSON array such as ["kitchen", "hall"]')
 _ON_EARTH = '{"latitude": 48.13722, "longitude": 11.57569}'
 
 
-class PlanPoint(BaseModel):
+class PlanPoint(BaseModel, frozen=True, extra="forbid", json_schema_extra={"example": {"x_m": 3.5, "y_m": 2.0}}):
     """Point in the plan frame."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", json_schema_extra={"example": {"x_m": 3.5, "y_m": 2.0}})
 
     x_m: Annotated[float, Finite] = Field(description="Metres to the right on the drawing.")
     y_m: Annotated[float, Finite] = Field(description="Metres up on the drawing.")
 
 
-class EarthPoint(BaseModel):
+class EarthPoint(
+    BaseModel, frozen=True, extra="forbid", json_schema_extra={"example": {"latitude": 48.13722, "longitude": 11.57569}}
+):
     """Place on Earth, WGS84."""
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", json_schema_extra={"example": {"latitude": 48.13722, "longitude": 11.57569}}
-    )
 
     latitude: Annotated[float, Finite] = Field(ge=-90, le=90, description="Degrees north.")
     longitude: Annotated[float, Finite] = Field(ge=-180, le=180, description="Degrees east.")

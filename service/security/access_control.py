@@ -81,6 +81,7 @@ class AccessControl:
         if not self._needs_keys:
             self._check_local(request, request.method)
             if Permission.ADMIN in permissions_needed(routed_path(request.scope)).values():
+                # A key that is created while keys are off would outlast this state.
                 raise errors.InsufficientScopeError(Permission.ADMIN, None)
             return anyone(_client_of(request))
         is_read = request.method in ("GET", "HEAD")
@@ -92,7 +93,7 @@ class AccessControl:
         needed = _needed(request)
         if needed not in identity.permissions:
             raise errors.InsufficientScopeError(needed, identity.permissions)
-        return Caller(identity.tenant, identity, identity.permissions, client=identity.tenant)
+        return Caller(identity.tenant, identity, client=identity.tenant)
 
     async def charge(self, caller: Caller, sent_bytes: int) -> None:
         """Count the bytes of an answer to a read against the rate limit of its caller's key."""
@@ -164,7 +165,6 @@ def _client_of(request: Request) -> str:
 
 
 def _needed(request: Request) -> Permission:
-    """Return the scope that the request's route requires."""
     methods = permissions_needed(routed_path(request.scope))
     if not methods:
         raise HTTPException(404)

@@ -124,7 +124,6 @@ class TokenVerifier:
             return jwt.decode(token, renewed, registry=self._registry)
 
     def _check(self, token: jwt.Token) -> None:
-        """Check type, issuer, audience and times."""
         kind = token.header.get("typ")
         if (kind.lower() if isinstance(kind, str) else kind) not in _TYPES:
             raise UnauthenticatedError("the token's type must be 'at+jwt' or 'JWT'; send an access token")

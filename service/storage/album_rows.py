@@ -16,8 +16,8 @@ from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, FLOORPLANS, VENUE_
 AlbumState = Literal["empty", "solving", "solved", "failed", "outdated"]
 # Bytes that count as stored for a correction and a pin, and for the common part of a solution, whatever their size.
 _PIN_BYTES, _SOLUTION_BYTES = 2048, 2048
-# Columns of photographs without their features.
-_LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in ("entry", "stored_bytes")]
+# Columns of `PhotographRecord`.
+_LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in ("album_id", "entry", "stored_bytes")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,6 @@ class AlbumRecord(NewAlbum):
         number: number of the revision, from 1.
         solved_number: number of the revision that was solved last; 0 before.
         place_revision_id: revision of the plan or venue that it was solved in; None before.
-        place_change: number of the tenant's last change of a plan when it was solved.
         solution: common part of the solution, as JSON.
         failure: reason why it could not be solved.
         progress: share of the solution that is done, while it is computed.
@@ -63,7 +62,6 @@ class AlbumRecord(NewAlbum):
     photographs: int
     solved_number: int
     place_revision_id: str | None
-    place_change: int
     solution: str | None
     failure: str | None
     progress: float
@@ -118,7 +116,6 @@ class PhotographRecord:
     """
 
     id: str
-    album_id: str
     number: int
     sha256: str
     revision_id: str

@@ -121,10 +121,22 @@ _NO_LIMITS = OperatorLimits()
 
 
 class Tenants:
-    """The operator's limits in the database."""
+    """The operator's limits, in the database, and in memory as of the last `refresh`."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._limits: dict[str, OperatorLimits] = {}
+
+    def of(self, tenant: str) -> OperatorLimits:
+        """Return the limits of a tenant in memory, without waiting; attributes are None without a limit of its own."""
+        return self._limits.get(tenant, _NO_LIMITS)
+
+    def refresh(self) -> None:
+        """Read the limits into memory; `Sweeper` calls this every 5 s.
+
+        Without the database, the limits of before stay.
+        """
+        self._limits = self.limits()
 
     def limits(self, among: Collection[str] | None = None) -> dict[str, OperatorLimits]:
         """Return the limits of the tenants that have any, of all tenants or of some."""
@@ -144,25 +156,6 @@ class Tenants:
         statement = statement.on_conflict_do_update(index_elements=["tenant"], set_=values | {"tenant": tenant})
         with self._database.writing() as connection:
             return _limits(connection.execute(statement.returning(TENANTS)).one())
-
-
-class TenantLimits:
-    """The operator's limits in memory, as of the last `refresh`; reading them never waits."""
-
-    def __init__(self, tenants: Tenants) -> None:
-        self._tenants = tenants
-        self._limits: dict[str, OperatorLimits] = {}
-
-    def of(self, tenant: str) -> OperatorLimits:
-        """Return the limits of a tenant; attributes are None without a limit of its own."""
-        return self._limits.get(tenant, _NO_LIMITS)
-
-    def refresh(self) -> None:
-        """Read the limits; `Sweeper` calls this every 5 s.
-
-        Without the database, the limits of before stay.
-        """
-        self._limits = self._tenants.limits()
 
 
 def _limits(row: Row[Any]) -> OperatorLimits:

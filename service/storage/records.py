@@ -239,7 +239,6 @@ class AuditEntry:
         status: HTTP status; None on the command line.
         result: `done`, or the kind of the problem.
         count: number of equal actions; above 1 for those that are counted per minute.
-        request_id: id of the request.
         detail: further facts, without secrets.
         created_at: time of the first of the actions.
     """

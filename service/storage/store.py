@@ -18,17 +18,17 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lalaloc_core.errors import ConfigError
 from service.capacity.threads import BoundedReads
-from service.errors import StoreBusyError, StoreUnavailableError
+from service.errors import StoreBusyError, StoreUnavailableError, UnknownFloorPlanError, UnknownVenueError
 from service.settings import Settings
 from service.storage.album_jobs import AlbumJobs
 from service.storage.albums import Albums
-from service.storage.api_keys import ApiKeys, TenantLimits, Tenants
+from service.storage.api_keys import ApiKeys, Tenants
 from service.storage.audit_log import AuditLog
 from service.storage.database import CircuitBreaker, Database
 from service.storage.kept_answers import MIN_LEASE_S, IdempotencyKeys, KeptAnswers
 from service.storage.plan_rows import Originals, PlanCache
 from service.storage.plans import Plans
-from service.storage.records import PlanRecord
+from service.storage.records import PlanRecord, VenueRecord
 from service.storage.sessions import Sessions
 from service.storage.stored_bytes import StorageQuota
 from service.storage.stored_grids import GridLeases, StoredGrids
@@ -58,7 +58,6 @@ class Store:
         album_jobs: leases on the solution of albums.
         quota: stored bytes of tenants.
         tenants: the operator's limits per tenant.
-        tenant_limits: the same limits in memory.
     """
 
     def __init__(
@@ -104,7 +103,6 @@ class Store:
         self.albums = Albums(database, self.quota)
         self.album_jobs = AlbumJobs(database)
         self.tenants = Tenants(database)
-        self.tenant_limits = TenantLimits(self.tenants)
 
     def purge_tenant(self, tenant: str) -> int:
         """Delete all that a tenant stored, but not its API keys and limits, and return the number of plans.
@@ -180,7 +178,7 @@ def _migrate(database: Database) -> None:
 
 
 class PlanLookup:
-    """Lookup of plans for queries; safe to share between threads."""
+    """Lookup of plans and venues for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, max_age_s: float) -> None:
         self._store = store
@@ -206,6 +204,21 @@ class PlanLookup:
             return None if found is None else self._store.plans.record(found)
         # On a thread of the tenant.
         return await reads.process(tenant, self._store.plans.record, found)
+
+    async def place(
+        self, tenant: str, plan_id: str | None, venue_id: str | None, reads: BoundedReads
+    ) -> PlanRecord | VenueRecord:
+        """Return a venue, or, without its id, a plan as `find` does."""
+        if venue_id is not None:
+            venue = await reads.run(tenant, self._store.venues.get, tenant, venue_id)
+            if venue is None:
+                raise UnknownVenueError(venue_id)
+            return venue
+        assert plan_id is not None
+        record = await self.find(tenant, plan_id, reads)
+        if record is None:
+            raise UnknownFloorPlanError(plan_id)
+        return record
 
     def _recent(self, tenant: str, plan_id: str) -> PlanRecord | None:
         return self._store.plan_cache.recent(tenant, plan_id, self._max_age_s)

@@ -109,14 +109,9 @@ class StorageQuota:
     ) -> Account:
         """Count a change in the last call of its transaction, and return the tenant's account after it.
 
-        Args:
-            connection: the transaction.
-            tenant: the tenant.
-            change: the change.
-            refuse: refuse a growth beyond the limit; the transaction is then rolled back.
-            changed_plan: id of a plan whose row the transaction has locked, and whose revision, grid or failure it
-                changed: the plan gets the number of this change. Numbers rise in the order of the commits, as the
-                tenant's row stays locked until then.
+        A growth beyond the limit rolls the transaction back, unless `refuse` is off. `changed_plan` is the id of a plan
+        whose row the transaction has locked, and whose revision, grid or failure it changed: the plan gets the number
+        of this change. Numbers rise in the order of the commits, as the tenant's row stays locked until then.
         """
         counted = {_column(name): value for name, value in asdict(change).items() if value}
         searched_bytes = change.plans + change.grids + change.venues
@@ -186,7 +181,6 @@ def _column(kind: str) -> str:
 
 
 def _count(connection: Connection, tenant: str) -> StoredBytes:
-    """Return the sums of the rows of a tenant."""
     own_plans = FLOORPLANS.join(REVISIONS, REVISIONS.c.plan_id == FLOORPLANS.c.id)
     own_grids = own_plans.join(LATENT_GRIDS, LATENT_GRIDS.c.revision_id == REVISIONS.c.id)
     own_photographs = ALBUMS.join(ALBUM_PHOTOGRAPHS, ALBUM_PHOTOGRAPHS.c.album_id == ALBUMS.c.id)

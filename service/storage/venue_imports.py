@@ -143,7 +143,6 @@ class _Batch:
 
     @property
     def size(self) -> StoredBytes:
-        """Size of the plans and their grids."""
         stored = [content.stored for content in self.contents]
         return StoredBytes(plans=sum(size.plans for size in stored), grids=sum(size.grids for size in stored))
 

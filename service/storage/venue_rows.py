@@ -37,11 +37,7 @@ def insert_venue(
 def insert_members(connection: Connection, venue_id: str, members: Sequence[VenueMember]) -> None:
     """Insert plans of a venue."""
     if members:
-        values = [
-            {"venue_id": venue_id, "plan_id": member.plan_id, "level": member.level, "name": member.name}
-            for member in members
-        ]
-        connection.execute(VENUE_PLANS.insert(), values)
+        connection.execute(VENUE_PLANS.insert(), [{"venue_id": venue_id} | vars(member) for member in members])
 
 
 def check_count(connection: Connection, tenant: str, limit: int) -> None:

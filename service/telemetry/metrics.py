@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
-from time import perf_counter
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -28,7 +26,6 @@ class _PerTenant(Collector):
     read: Callable[[], Mapping[str, float]]
 
     def collect(self) -> Iterator[Metric]:
-        """Return the current values."""
         family = self.family(self.name, self.meaning, labels=["tenant"])
         for tenant, value in self.read().items():
             family.add_metric([tenant], value)
@@ -117,15 +114,6 @@ class Telemetry:
         gauge = self._gauge("lalaloc_build_info", "Versions of software and model.", labels)
         gauge.clear()
         gauge.labels(version, model, model_version, model_sha256).set(1.0)
-
-    @contextmanager
-    def timed(self, histogram: Histogram) -> Iterator[None]:
-        """Observe the duration of the block."""
-        begin = perf_counter()
-        try:
-            yield
-        finally:
-            histogram.observe(perf_counter() - begin)
 
     def render(self) -> bytes:
         """Return all metrics in Prometheus' text format."""

@@ -63,11 +63,6 @@ class PrototypeFile:
         self._end = 0
         self._read()
 
-    @property
-    def bytes(self) -> int:
-        """Size of the file."""
-        return self._end * ROW.itemsize
-
     def find(self, keys: Iterable[BlockKey]) -> dict[BlockKey, tuple[int, int]]:
         """Return the first row in `rows` and the number of rows of each block that is in the file."""
         with self._lock:

@@ -103,12 +103,8 @@ class VenuePlans:
     ) -> ChosenPlans:
         """Return the most probable plans of an index, those that are probable for any of the photographs.
 
-        Args:
-            known: rows of the index's plans.
-            index: the index.
-            choosing: the encoded photographs, each with the weights of its matching cost.
-            log_prior: (p,) log prior of the plans.
-            favour: (p,) log factors by which plans are preferred in the choice alone.
+        `known` are the rows of its plans, `choosing` the encoded photographs, each with the weights of its matching
+        cost, and `favour` log factors by which plans are preferred in the choice alone.
         """
         helper = None if self._idle_cores is None else self._idle_cores.if_any()
         masses = [

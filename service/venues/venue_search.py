@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
@@ -30,8 +30,6 @@ from service.venues.venue_plans import ChosenPlans, VenuePlans, possible_plans
 
 # Interval (s) of polling while no plan of a venue is ready.
 _POLL_INTERVAL_S = 0.25
-# Function that reads the current rows of the plans to search.
-ReadPlans = Callable[[], Awaitable[PlanList]]
 # Function that returns a log factor for each row of a plan.
 Favour = Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]]
 
@@ -69,12 +67,12 @@ class VenueSearch:
         self._queries = queries
 
     async def ready(
-        self, venue_id: str, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
+        self, tenant: str, venue_id: str, hints: VenueHints, context: QueryContext
     ) -> tuple[PlanList, list[str]]:
         """Wait for a plan to be ready; return the plans that are ready, and warnings about the others."""
         begin = monotonic()
         while True:
-            members = await read_plans()
+            members = await self._plans.members(tenant, venue_id)
             if members:
                 hints.check(members)
             ready, failed = members.ready, members.failed

@@ -36,12 +36,8 @@ def load_refiner(
 ) -> Callable[[RefinementJob], RefinementResult]:
     """Return the function from job to result.
 
-    Args:
-        bundle_folder: folder of the model.
-        model_sha256: digest of the model.
-        threads: threads of torch.
-        by_latents: whether the model's poses are refined by latents. If so, torch is loaded and warmed up now, else
-            with the first job that needs it: poses refined by walls need none, and torch takes a quarter of a gigabyte.
+    If the model's poses are refined `by_latents`, torch is loaded and warmed up now, with some `threads`; else with the
+    first job that needs it: poses refined by walls need none, and torch takes a quarter of a gigabyte.
     """
     bundle = Bundle.open(bundle_folder)
     if bundle.sha256 != model_sha256:

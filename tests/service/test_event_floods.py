@@ -219,7 +219,7 @@ def charged(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, CpuAccounts]
 
     @app.post("/keyed")
     async def keyed(request: Request) -> int:
-        put_caller(request.scope, Caller("acme", None, frozenset(), "acme"))
+        put_caller(request.scope, Caller("acme", None, "acme"))
         return len(await request.body())
 
     with served(app, Settings()) as port:

@@ -7,6 +7,7 @@ import json
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -177,7 +178,7 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
     with start_app(tmp_path) as client:
         store = Store(database_of(tmp_path))
         # State after a crash: the plan is stored, the answer is not.
-        digest = parts_sha256(Parts({}, {"file": UploadedFile.of(CONTENT)}))
+        digest = parts_sha256(Parts({}, _files({"file": CONTENT})))
         claim = IdempotencyKeys(store.database, store.quota, lease_s=1.0).begin(
             "default", "POST /floorplans", "a", digest
         )
@@ -336,7 +337,7 @@ FILES = st.dictionaries(st.text(max_size=3), st.binary(max_size=3), max_size=3)
 
 
 def _files(contents: dict[str, bytes]) -> dict[str, UploadedFile]:
-    return {name: UploadedFile.of(content) for name, content in contents.items()}
+    return {name: UploadedFile(BytesIO(content)) for name, content in contents.items()}
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_blocks_are_found_after_reopening(path: Path) -> None:
     before = file.rows()
     file.add({key(3): rows_of(3, 1)})
     assert len(before) == 16
-    assert file.bytes == path.stat().st_size == 18 * ROW.itemsize
+    assert file.rows().nbytes == path.stat().st_size == 18 * ROW.itemsize
     file.close()
     again = opened(path)
     for number, count in ((1, 5), (2, 9), (3, 1)):
@@ -94,7 +94,7 @@ def test_full_file_is_replaced_and_maps_stay_valid(path: Path) -> None:
     file.add({key(3): rows_of(3, 20)})
     assert content(file, 3) is None
     assert content(file, 2) is not None
-    assert file.bytes <= 20 * ROW.itemsize
+    assert file.rows().nbytes <= 20 * ROW.itemsize
     file.close()
     assert content(opened(path), 2) == rows_of(2, 15).tobytes()
 

@@ -93,14 +93,14 @@ def test_invalid_limit_is_a_usage_error(options: list[str]) -> None:
 
 
 def test_limits_in_memory_follow_the_database(store: Store) -> None:
-    assert store.tenant_limits.of("acme") == OperatorLimits()
+    assert store.tenants.of("acme") == OperatorLimits()
     store.tenants.change_limits("acme", stored_bytes=2**40)
-    store.tenant_limits.refresh()
-    assert store.tenant_limits.of("acme") == OperatorLimits(stored_bytes=2**40)
-    assert store.tenant_limits.of("other") == OperatorLimits()
+    store.tenants.refresh()
+    assert store.tenants.of("acme") == OperatorLimits(stored_bytes=2**40)
+    assert store.tenants.of("other") == OperatorLimits()
     store.tenants.change_limits("acme", stored_bytes=None)
-    store.tenant_limits.refresh()
-    assert store.tenant_limits.of("acme") == OperatorLimits()
+    store.tenants.refresh()
+    assert store.tenants.of("acme") == OperatorLimits()
 
 
 # Stored bytes

@@ -23,7 +23,6 @@ import lalaloc_core
 import service
 from benchmarks.harness import Caller
 from benchmarks.heaviest import LOADS, Load, Stored, building, missing_routes, store_venue
-from service.plan_files import converter, plan_file, rendition_cache
 from service.storage.records import AuditEntry
 from service.storage.store import Store
 from tests.service.conftest import StartApp, upload, wait_for
@@ -99,8 +98,8 @@ def client(
     quiet = {"sweep_s": 3600.0, "grid_step_m": 5.0}
     with pytest.MonkeyPatch.context() as patch:
         # Worker processes, which are not counted, read large plans and make their files.
-        for module, name in ((rendition_cache, "_SMALL"), (converter, "LARGE"), (plan_file, "LARGE")):
-            patch.setattr(module, name, 10**9)
+        for name in ("plan_files.rendition_cache._SMALL", "plan_files.converter.LARGE", "routes.plan_uploads.LARGE"):
+            patch.setattr(f"service.{name}", 10**9)
         data_dir = tmp_path_factory.mktemp("data")
         with start_app(data_dir, bundle=tiny_view_bundle, api_keys=True, **unlimited, **quiet) as started:
             started.headers.update(bearer(_fill_pages(Store(f"sqlite:///{data_dir / 'lalaloc.sqlite3'}"))))

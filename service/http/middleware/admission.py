@@ -124,7 +124,6 @@ class _Rests:
         self.spent_s = 0.0
 
     def spend(self, cpu_s: float) -> None:
-        """Add CPU time (s)."""
         self.spent_s += cpu_s
 
     @property
@@ -134,12 +133,10 @@ class _Rests:
         return accounts.refused_rest_s(self._client) if self._free_bytes > 0 else accounts.rest_s(self._client)
 
     async def take(self) -> None:
-        """Wait until no rest is left."""
         while (left_s := self.left_s) > 0.0:
             await asyncio.sleep(left_s)
 
     async def receive(self, size: int) -> None:
-        """Count bytes of the body, and rest."""
         self._free_bytes -= size
         if self._free_bytes <= 0:
             self._accounts.charge(self._client, size * _RECEIVING_S, rests=True)
@@ -208,7 +205,6 @@ class _BodyBudget:
             self._take(_STEP_BYTES)
 
     def end(self) -> None:
-        """Give everything back."""
         self._budget.give_back(self._client, self._taken)
         self._taken = 0
 
@@ -269,7 +265,6 @@ class _Connection:
         return message
 
     async def send(self, message: Message) -> None:
-        """Send a part of the answer."""
         self.answered = True
         self.status = message.get("status", self.status)
         self._on_answer()

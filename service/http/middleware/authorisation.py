@@ -40,60 +40,35 @@ class AuthorisationMiddleware:
             await http_problem_answer(request, error)(scope, receive, send)
             return
         put_caller(scope, caller)
-        if is_audited(scope):
-            await self._audited(trail, access, caller, scope, receive, send)
-        else:
-            await self._refusing(trail, access, caller, scope, receive, send)
+        await self._observed(trail, access, caller, scope, receive, send)
 
-    async def _refusing(
+    async def _observed(
         self, trail: AuditTrail, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send
     ) -> None:
-        """Handle a request whose entry is stored only if its route refuses it."""
+        """Handle a request, store its entry before the answer begins, and charge the caller for the bytes of a read.
+
+        A request that is not audited has an entry only if its route refuses it.
+        """
+        audited, is_read = is_audited(scope), scope["method"] in READING
+        noted, sent_bytes = False, 0
 
         async def sending(message: Message) -> None:
-            if message["type"] == "http.response.start" and message["status"] in REFUSED:
-                trail.count(entry_of(scope, message["status"], caller=caller))
-            await send(message)
-
-        await self._handle(access, caller, scope, receive, sending)
-
-    async def _audited(
-        self, trail: AuditTrail, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send
-    ) -> None:
-        """Handle a request, and store its entry before the answer begins."""
-        noted = False
-
-        async def sending(message: Message) -> None:
-            nonlocal noted
-            if message["type"] == "http.response.start" and not noted:
+            nonlocal noted, sent_bytes
+            sent_bytes += len(message.get("body", b""))
+            if message["type"] == "http.response.start" and not noted and (audited or message["status"] in REFUSED):
                 noted = True
                 status, location = message["status"], Headers(raw=message["headers"]).get("location")
                 entry = entry_of(scope, status, caller=caller, location=location)
-                if status < 400 and scope["method"] not in READING:
+                if status < 400 and not is_read:
                     await trail.record(entry)
                 else:
                     trail.count(entry)
             await send(message)
 
         try:
-            await self._handle(access, caller, scope, receive, sending)
+            await self._app(scope, receive, sending)
         finally:
-            if not noted:
+            if audited and not noted:
                 trail.count(entry_of(scope, CLIENT_CLOSED, caller=caller))
-
-    async def _handle(self, access: AccessControl, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle a request, and charge the caller for the bytes of the answer to a read."""
-        if scope["method"] not in READING:
-            await self._app(scope, receive, send)
-            return
-        sent_bytes = 0
-
-        async def counting(message: Message) -> None:
-            nonlocal sent_bytes
-            sent_bytes += len(message.get("body", b""))
-            await send(message)
-
-        try:
-            await self._app(scope, receive, counting)
-        finally:
-            await access.charge(caller, sent_bytes)
+            if is_read:
+                await access.charge(caller, sent_bytes)

@@ -140,7 +140,6 @@ class _Exchange:
         return _CLIENT_CLOSED if self._log_fields.gave_up else 500
 
     async def receive(self) -> Message:
-        """Return the next part of the body, and count its bytes."""
         message = await self._receive()
         if message["type"] == "http.request":
             self._log_fields.bytes_in += len(message.get("body", b""))
