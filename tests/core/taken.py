@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from functools import cache
 from pathlib import Path
@@ -14,6 +13,7 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.photograph.cameras import Camera, camera_axes
+from tests.painted import picture_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -61,10 +61,8 @@ def jpeg(
     model: str | None = None,
 ) -> bytes:
     """Return a JPEG file with tags of the EXIF IFD as phones write them."""
-    image, tags = Image.fromarray(pixels), exif_of(exif or {})
+    tags = exif_of(exif or {})
     for tag, value in ((0x0112, orientation), (0x010F, maker), (0x0110, model)):
         if value is not None:
             tags[tag] = value
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=92, exif=tags)
-    return buffer.getvalue()
+    return picture_file(pixels, "JPEG", quality=92, exif=tags)

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from datetime import datetime
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +31,8 @@ from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
 from lalaloc_core.photograph.exif import Taken
+from tests.painted import picture_file
+from tests.strategies import present
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("kitchen.jpg", "study.jpg", "bedroom.jpg", "living_room.jpg", "phone.jpg")
@@ -196,9 +197,7 @@ def _facade(seed: int) -> bytes:
     for left in range(120, 520, 85):
         for top in (180, 270):
             draw.rectangle((left, top, left + 50, top + 60), fill=(60, 80, 105), outline=(240, 240, 235), width=5)
-    content = BytesIO()
-    picture.filter(ImageFilter.GaussianBlur(0.7)).save(content, "JPEG")
-    return content.getvalue()
+    return picture_file(picture.filter(ImageFilter.GaussianBlur(0.7)), "JPEG")
 
 
 @pytest.mark.slow

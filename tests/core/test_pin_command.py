@@ -20,6 +20,7 @@ from lalaloc_core.draw.canvas import document, words
 from lalaloc_core.draw.pdf import write_pdf
 from lalaloc_core.photograph.placed_copy import Place, placed_copy
 from lalaloc_core.shown_text import no_formula, printable
+from tests.painted import picture_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLACE = Place(room="Küche", level="Ground & first", latitude=-33.8568, longitude=151.2153, direction_deg=271.24)
@@ -201,9 +202,7 @@ def test_missing_plan_is_named(plan: str, tmp_path: Path, capsys: pytest.Capture
 
 def _picture(kind: str, **options: Any) -> bytes:
     rng = np.random.default_rng(0)
-    content = io.BytesIO()
-    Image.fromarray(rng.integers(0, 256, (96, 128, 3), np.uint8)).save(content, kind, **options)
-    return content.getvalue()
+    return picture_file(rng.integers(0, 256, (96, 128, 3), np.uint8), kind, **options)
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG"])

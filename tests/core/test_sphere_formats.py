@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator
 from functools import cache
@@ -20,6 +19,7 @@ from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, fi
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
+from tests.painted import picture_file
 
 PART: dict[str, object] = {
     "FullPanoWidthPixels": 1024,
@@ -232,9 +232,7 @@ class TestParts:
 
 def test_photograph_is_taken_out_of_its_bars() -> None:
     view = take(small("study"), Perspective.of_hfov(640, 400, math.radians(80.0)))
-    buffer = io.BytesIO()
-    Image.fromarray(barred(view, 60, 0)).save(buffer, "PNG")
-    found = opened(buffer.getvalue())
+    found = opened(picture_file(barred(view, 60, 0)))
     assert found.projection == "perspective"
     assert "within bars, 23% of the picture, as in a screenshot" in found.warnings[0]
     assert found.camera is not None
@@ -256,11 +254,11 @@ def test_black_zenith_and_nadir_are_of_the_sphere() -> None:
 def test_orientation_of_a_picture_that_was_turned_is_ignored(
     size: tuple[int, int], stated: tuple[int, int], is_ignored: bool
 ) -> None:
-    exif, content = Image.Exif(), io.BytesIO()
+    exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExifImageWidth: stated[0], ExifTags.Base.ExifImageHeight: stated[1]}
-    Image.new("RGB", size).save(content, "JPEG", exif=exif.tobytes())
-    with opened_picture(content.getvalue(), PhotographLimits()) as file:
+    content = picture_file(Image.new("RGB", size), "JPEG", exif=exif.tobytes())
+    with opened_picture(content, PhotographLimits()) as file:
         assert (file.orientation, len(file.warnings)) == ((1, 1) if is_ignored else (6, 0))
 
 

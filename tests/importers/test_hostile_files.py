@@ -38,6 +38,7 @@ from lalaloc_core.importers.formats import dxf, pdf_page
 from lalaloc_core.importers.picture import lettering, wall_mask
 from lalaloc_core.importers.picture.ink import read_ink
 from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
+from tests.painted import picture_file
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
@@ -210,9 +211,7 @@ def test_picture_with_too_many_pixels():
 
 
 def test_truncated_picture():
-    stream = io.BytesIO()
-    Image.new("L", (200, 200), 255).save(stream, "PNG")
-    _assert_rejected(stream.getvalue()[:90], "cannot be read")
+    _assert_rejected(picture_file(Image.new("L", (200, 200), 255))[:90], "cannot be read")
 
 
 def test_file_above_the_size_limit():

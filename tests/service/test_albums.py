@@ -29,6 +29,7 @@ from service.schemas.albums import PinAnswer
 from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
+from tests.painted import picture_file
 from tests.service.conftest import FLAT, HOME, DatabaseOf, StartApp, assert_problem, upload, wait_for
 from tests.service.test_security import bearer, make_key
 
@@ -51,9 +52,7 @@ def pictures() -> list[bytes]:
         exif[0x010F], exif[0x0110], exif[0x013B] = "Maker", "Model X", "Erika Mustermann"
         exif.get_ifd(0x8769)[0x9003] = f"2026:05:01 10:0{number}:00"
         exif.get_ifd(0x8825)[2] = (48.0, 8.0, 14.0)
-        buffer = io.BytesIO()
-        Image.open(EXAMPLES / name).save(buffer, "JPEG", quality=95, exif=exif)
-        found.append(buffer.getvalue())
+        found.append(picture_file(Image.open(EXAMPLES / name), "JPEG", quality=95, exif=exif))
     return found
 
 

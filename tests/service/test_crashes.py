@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import random
@@ -21,6 +20,7 @@ from PIL import Image
 from lalaloc_core.bundle import default_bundle
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
+from tests.painted import picture_file
 from tests.service import test_albums as albums
 from tests.service.conftest import upload, wait_for
 from tests.service.test_process import children
@@ -130,10 +130,9 @@ def small_pictures(count: int) -> list[bytes]:
     """Return different pictures of the example rooms."""
     names, found = ("kitchen", "bedroom", "study", "living_room"), []
     for number in range(count):
-        buffer = io.BytesIO()
         with Image.open(EXAMPLES / f"{names[number % len(names)]}.jpg") as picture:
-            picture.resize((512 + 2 * (number // len(names)), 256)).save(buffer, "JPEG", quality=90)
-        found.append(buffer.getvalue())
+            small = picture.resize((512 + 2 * (number // len(names)), 256))
+        found.append(picture_file(small, "JPEG", quality=90))
     return found
 
 

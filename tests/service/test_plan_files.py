@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import multiprocessing
 import os
@@ -26,6 +25,7 @@ from tests.importers.conftest import EXTERNAL_ENTITY, NESTED_ENTITIES, ZIP_BOMB,
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_ifc import DUPLEX, ifc_flat
 from tests.importers.test_pictures import open_hall, vector_pdf
+from tests.painted import picture_file
 from tests.service.conftest import StartApp, assert_problem, end_time_limits, localise, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -372,10 +372,9 @@ def test_stalled_worker_is_replaced(start_app: StartApp, tmp_path: Path) -> None
 
 @pytest.mark.one_replica
 def test_file_above_the_memory_limit_is_rejected(start_app: StartApp, tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    Image.new("L", (9_000, 9_000), 255).save(stream, "PNG")
+    picture = picture_file(Image.new("L", (9_000, 9_000), 255))
     with start_app(tmp_path, import_memory_bytes=256 * 2**20, max_plan_pixels=10**9) as client:
-        response = send_plan(client, stream.getvalue(), metres_per_pixel=0.001)
+        response = send_plan(client, picture, metres_per_pixel=0.001)
         assert "memory" in assert_problem(response, 422, "invalid-floorplan")["detail"]
         assert store_plan(client, plan_file("svg"))["rooms"]
 
