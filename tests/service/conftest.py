@@ -247,6 +247,16 @@ def store(tmp_path: Path, empty_database: Path) -> Iterator[Store]:
         yield opened
 
 
+@pytest.fixture
+def app_store(database_of: DatabaseOf, empty_database: Path, tmp_path: Path) -> Iterator[Store]:
+    """Yield the store of the app whose data folder is `tmp_path`."""
+    url = database_of(tmp_path)
+    if url.startswith("sqlite"):
+        shutil.copy(empty_database, tmp_path)
+    with closing(Store(url)) as opened:
+        yield opened
+
+
 @contextmanager
 def constants(values: Mapping[str, Any]) -> Iterator[None]:
     """Give constants that stand beside the settings other values."""

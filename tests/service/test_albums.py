@@ -30,7 +30,7 @@ from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
-from tests.service.conftest import FLAT, HOME, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, upload, wait_for
 from tests.service.test_security import bearer, make_key
 
 ANCHORED = {**HOME, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0}
@@ -354,24 +354,22 @@ def features_of() -> Callable[[bytes], bytes]:
 
 
 def test_stored_album_has_no_picture_position_or_owner(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path) as client:
         album_id = create(client, upload(client, HOME))
         add(client, album_id, pictures[:1])
         wait_until_solved(client, album_id)
         assert "Mustermann" not in json.dumps(photographs(client, album_id))
-        store = Store(database_of(tmp_path))
-        store.album_jobs.release(album_id, "")
-        with store.database.writing() as connection:
+        app_store.album_jobs.release(album_id, "")
+        with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(solved_number=0))
-        job = store.album_jobs.claim(album_id, "test", 10.0)
+        job = app_store.album_jobs.claim(album_id, "test", 10.0)
         assert job is not None
         (part,) = job.photographs
         assert len(part.entry) <= 20_000
         for secret in (b"Mustermann", b"\xff\xd8\xff", b"GPS"):
             assert secret not in part.entry
-        store.close()
 
 
 def test_model_without_features_has_no_albums(tiny_bundle: Path, start_app: StartApp, tmp_path: Path) -> None:
@@ -381,12 +379,11 @@ def test_model_without_features_has_no_albums(tiny_bundle: Path, start_app: Star
 
 
 def test_albums_of_another_tenant_do_not_exist(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        store = Store(database_of(tmp_path))
-        own, other = bearer(make_key(store, tenant="one")), bearer(make_key(store, tenant="two"))
-        reader = bearer(make_key(store, tenant="one", scopes=("read",)))
+        own, other = bearer(make_key(app_store, tenant="one")), bearer(make_key(app_store, tenant="two"))
+        reader = bearer(make_key(app_store, tenant="one", scopes=("read",)))
         client.headers.update(own)
         album_id = create(client, upload(client, HOME))
         (line,) = add(client, album_id, pictures[:1])
@@ -405,24 +402,22 @@ def test_albums_of_another_tenant_do_not_exist(
         used = client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"]
         assert used > 0
         assert client.get("/usage", headers=other).json()["stored_bytes"]["by_kind"]["albums"] == 0
-        store.quota.recount()
+        app_store.quota.recount()
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == used
         assert client.delete(f"/albums/{album_id}").status_code == 204
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == 0
-        actions = [entry.action for entry in store.audit_log.page(limit=50)]
+        actions = [entry.action for entry in app_store.audit_log.page(limit=50)]
         assert "DELETE /albums/{album_id}" in actions
-        store.close()
 
 
 def test_photographs_count_against_the_storage_quota(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path) as client:
-        store = Store(database_of(tmp_path))
         album_id = create(client, upload(client))
         (first,) = add(client, album_id, pictures[:1])
         used = client.get("/usage").json()["stored_bytes"]["used"]
-        store.tenants.change_limits("default", stored_bytes=used + 3000)
+        app_store.tenants.change_limits("default", stored_bytes=used + 3000)
         wait_for(lambda: client.get("/usage").json()["stored_bytes"]["limit"] == used + 3000)
         kept, refused = add(client, album_id, pictures[:2])
         assert (kept["status"], refused["status"]) == (200, 507)
@@ -431,25 +426,22 @@ def test_photographs_count_against_the_storage_quota(
         # A deleted photograph makes room for another one.
         assert client.delete(f"/albums/{album_id}/photographs/{first['photograph']['id']}").status_code == 204
         assert [line["status"] for line in add(client, album_id, pictures[1:2])] == [201]
-        store.close()
 
 
 def test_album_goes_with_its_plan_and_expires(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path, album_ttl_s=1.0) as client:
-        store = Store(database_of(tmp_path))
         plan_id = upload(client)
         expiring = create(client, plan_id)
         add(client, expiring, pictures[:1])
         wait_for(lambda: client.get(f"/albums/{expiring}").status_code == 404)
         assert client.get("/albums").json()["albums"] == []
-        assert store.albums.purge() == 1
+        assert app_store.albums.purge() == 1
         with_plan = create(client, plan_id)
         assert client.delete(f"/floorplans/{plan_id}").status_code == 204
         assert_problem(client.get(f"/albums/{with_plan}"), 404, "unknown-album")
-        assert store.quota.account("default").used.albums == 0
-        store.close()
+        assert app_store.quota.account("default").used.albums == 0
 
 
 def test_events_follow_an_album_until_it_is_solved(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
@@ -531,14 +523,13 @@ def test_correction_of_a_room_that_is_gone_is_left_out(client: httpx.Client, pic
 
 @pytest.mark.slow
 def test_album_of_another_model_can_only_be_read(
-    client: httpx.Client, database_of: DatabaseOf, start_app: StartApp, tmp_path: Path, pictures: list[bytes]
+    client: httpx.Client, app_store: Store, start_app: StartApp, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path) as own:
         album_id = create(own, upload(own, HOME))
         (line,) = add(own, album_id, pictures[:1])
         wait_until_solved(own, album_id)
-        store = Store(database_of(tmp_path))
-        with store.database.writing() as connection:
+        with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(model_sha256="0" * 64))
         assert own.get(f"/albums/{album_id}").json()["state"] == "outdated"
         assert photographs(own, album_id)[0]["pin"]["place"] is not None
@@ -546,13 +537,12 @@ def test_album_of_another_model_can_only_be_read(
         assert "create a new album" in problem["detail"]
         assert_problem(correct(own, album_id, line["photograph"]["id"], None), 409, "album-outdated")
         assert own.delete(f"/albums/{album_id}").status_code == 204
-        store.close()
 
 
 @pytest.mark.slow
 @pytest.mark.one_replica
 def test_expired_lease_is_taken_over(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, go_on = threading.Event(), threading.Event()
     solve = album_search.solve_album
@@ -567,22 +557,20 @@ def test_expired_lease_is_taken_over(
         album_id = create(client, upload(client, HOME))
         add(client, album_id, pictures[:1])
         assert begun.wait(60.0)
-        store = Store(database_of(tmp_path))
         # Held by the app: another replica gets nothing, nor does it store what it found.
-        assert store.album_jobs.due(client.get(f"/albums/{album_id}").json()["model_sha256"], [], 9) == []
-        assert store.album_jobs.claim(album_id, "other", 10.0) is None
-        with store.database.writing() as connection:
+        assert app_store.album_jobs.due(client.get(f"/albums/{album_id}").json()["model_sha256"], [], 9) == []
+        assert app_store.album_jobs.claim(album_id, "other", 10.0) is None
+        with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(lease_until_s=0.0))
-        job = store.album_jobs.claim(album_id, "other", 10.0)
+        job = app_store.album_jobs.claim(album_id, "other", 10.0)
         assert job is not None
         assert job.attempts == 2
         go_on.set()
         # The app lost the lease, so its result is dropped until the other one releases it.
         pins = {part.id: '{"state": "set_aside"}' for part in job.photographs}
-        assert not store.album_jobs.finish(job, "third", "0" * 32, pins=pins, solution=None)
-        store.album_jobs.release(album_id, "other")
+        assert not app_store.album_jobs.finish(job, "third", "0" * 32, pins=pins, solution=None)
+        app_store.album_jobs.release(album_id, "other")
         wait_until_solved(client, album_id)
-        store.close()
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import pytest
 
 from service.http.representations import LinesResponse
 from service.storage.store import Store
-from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
 from tests.service.test_security import bearer, make_key
 
 
@@ -98,21 +98,19 @@ def test_client_that_leaves_ends_the_batch(client: httpx.Client, plan_id: str, s
 
 @pytest.mark.one_replica
 def test_each_photograph_counts_for_the_rate_limit(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=8, rate_burst=0) as client:
-        store = Store(database_of(tmp_path))
-        unlimited = make_key(store, rate_per_minute=0)
+        unlimited = make_key(app_store, rate_per_minute=0)
         client.headers.update(bearer(unlimited))
         plan_id = upload(client)
-        client.headers.update(bearer(make_key(store)))
+        client.headers.update(bearer(make_key(app_store)))
         assert len(lines_of(ask(client, plan_id, 6 * [sphere]))) == 6
         problem = assert_problem(ask(client, plan_id, 6 * [sphere]), 429, "rate-limited")
         assert "8 requests per minute" in problem["detail"]
-        client.headers.update(bearer(make_key(store)))
+        client.headers.update(bearer(make_key(app_store)))
         problem = assert_problem(ask(client, plan_id, 9 * [sphere]), 422, "invalid-request")
         assert "the rate limit is 8 per minute" in problem["errors"][0]["message"]
-        store.close()
 
 
 @pytest.mark.parametrize("reader", ["stops", "leaves"])

@@ -23,7 +23,7 @@ from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
 WORST = "127.0.0.2"
 
@@ -398,12 +398,10 @@ def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: P
 
 
 @pytest.mark.one_replica
-def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     # Larger than the socket buffers.
     content, plan_id = bytes(8 * 2**20), "a" * 32
-    store = Store(database_of(tmp_path))
-    store.plans.add("default", plan_id, NewPlan(FloorPlan.from_dict(FLAT), Original(content)), limit=1)
-    store.close()
+    app_store.plans.add("default", plan_id, NewPlan(FloorPlan.from_dict(FLAT), Original(content)), limit=1)
     with start_app(tmp_path, max_reads=8) as client, ExitStack() as attack:
         path = f"/floorplans/{plan_id}/original"
         for _ in range(10):

@@ -29,7 +29,7 @@ from lalaloc_core.photograph import Photograph, open_photograph
 from service.routes import model_files
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import HOME, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import HOME, StartApp, assert_problem, upload, wait_for
 from tests.service.test_process import children
 from tests.service.test_security import bearer, make_key
 from tests.service.test_stopping import running_service
@@ -401,12 +401,10 @@ def test_features_of_a_turn_without_angles_are_warned_about(client: httpx.Client
 
 
 def test_every_part_of_a_file_is_sent_beside_other_clients(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
+    start_app: StartApp, app_store: Store, tmp_path: Path
 ) -> None:
     with start_app(tmp_path, bundle=default_bundle(), api_keys=True, rate_per_minute=0) as client:
-        store = Store(database_of(tmp_path))
-        client.headers.update(bearer(make_key(store)))
-        store.close()
+        client.headers.update(bearer(make_key(app_store)))
         # On one connection: parsing is charged to its address until a request has a tenant, which is another client.
         for _ in range(12):
             assert client.get("/model/view_encoder.onnx", timeout=20.0).status_code == 200

@@ -47,17 +47,7 @@ from service.settings import CONSTANTS, Settings
 from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import PlanLookup, Store
 from service.telemetry import Telemetry
-from tests.service.conftest import (
-    FLAT,
-    DatabaseOf,
-    OpenStore,
-    StartApp,
-    assert_problem,
-    constants,
-    localise,
-    upload,
-    wait_for,
-)
+from tests.service.conftest import FLAT, OpenStore, StartApp, assert_problem, constants, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -672,18 +662,16 @@ def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_
 
 
 def test_profile_model_needs_one_grid_for_all_heights(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(builder, "_MAX_GRIDS_PER_PLAN", 3)
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         for height_m in (1.6, 1.7, 1.8, 1.9):
             _localise_at(client, plan_id, sphere, height_m)
-    store = Store(database_of(tmp_path))
     with start_app(tmp_path) as client:
         sha256 = client.get("/readyz").json()["model"]["sha256"]
-    assert {height for _, height in store.grids.poses(sha256, 0.5)} == {1500}
-    store.close()
+    assert {height for _, height in app_store.grids.poses(sha256, 0.5)} == {1500}
 
 
 def _localise_at(client: httpx.Client, plan_id: str, sphere: bytes, height_m: float) -> None:

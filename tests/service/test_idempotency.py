@@ -37,7 +37,7 @@ from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
 from service.uploaded_file import UploadedFile
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 
 CONTENT = json.dumps(FLAT).encode()
 NOTHING = Parts({}, {})
@@ -171,14 +171,11 @@ def test_one_of_many_parallel_requests_is_executed(own: httpx.Client) -> None:
     assert _count(own) == 1
 
 
-def test_plan_of_a_dead_process_is_found_by_the_next(
-    start_app: StartApp, tmp_path: Path, database_of: DatabaseOf
-) -> None:
+def test_plan_of_a_dead_process_is_found_by_the_next(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path) as client:
-        store = Store(database_of(tmp_path))
         # State after a crash: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": UploadedFile.of(CONTENT)}))
-        claim = IdempotencyKeys(store.database, store.quota, lease_s=1.0).begin(
+        claim = IdempotencyKeys(app_store.database, app_store.quota, lease_s=1.0).begin(
             "default", "POST /floorplans", "a", digest
         )
         assert isinstance(claim, Claimed)
@@ -189,13 +186,12 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
             return client.post("/floorplans", content=CONTENT, headers=headers)
 
         assert_problem(send(), 409, "idempotency-in-progress")
-        store.plans.add("default", plan_id, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
+        app_store.plans.add("default", plan_id, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
         wait_for(lambda: send().status_code == 201, 10.0)
         again = send()
         assert again.json()["id"] == plan_id
         assert again.headers["idempotency-replayed"] == "true"
         assert _count(client) == 1
-        store.close()
 
 
 def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:

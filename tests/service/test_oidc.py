@@ -31,7 +31,7 @@ from service.security.oidc import TokenVerifier
 from service.security.permissions import Identity, Permission
 from service.settings import Settings
 from service.storage.store import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, wait_for
 from tests.service.test_security import bearer, make_key
 
 ISSUER = Path(__file__).parent / "issuer"
@@ -115,7 +115,7 @@ def _with_issuer(url: str) -> dict[str, Any]:
 
 @needs_node
 @pytest.mark.one_replica
-def test_tokens_of_a_certified_issuer(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_tokens_of_a_certified_issuer(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with node_issuer(_free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
         reader, admin = issuer.token("lalaloc:read"), issuer.token("lalaloc:admin", "lalaloc:write")
         usage = client.get("/usage", headers=bearer(reader))
@@ -126,9 +126,7 @@ def test_tokens_of_a_certified_issuer(start_app: StartApp, database_of: Database
         assert "'write'; it has: read." in refused["detail"]
         assert client.post("/floorplans", json=FLAT, headers=bearer(admin)).status_code == 201
         # Keys work beside tokens.
-        store = Store(database_of(tmp_path))
-        assert client.get("/limits", headers=bearer(make_key(store))).status_code == 200
-        store.close()
+        assert client.get("/limits", headers=bearer(make_key(app_store))).status_code == 200
         entries = client.get("/admin/audit", headers=bearer(admin)).json()["entries"]
         found = {(entry["actor"], entry["tenant"], entry["action"], entry["result"]) for entry in entries}
         assert {

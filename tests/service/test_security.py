@@ -425,11 +425,10 @@ def test_api_description_states_scopes_and_refusals() -> None:
 
 
 @pytest.mark.one_replica
-def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_rate_limit_states_when_to_retry(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=5, rate_burst=0) as client:
-        store = Store(database_of(tmp_path))
-        usual, unlimited = make_key(store), make_key(store, rate_per_minute=0)
-        more = make_key(store, rate_per_minute=9)
+        usual, unlimited = make_key(app_store), make_key(app_store, rate_per_minute=0)
+        more = make_key(app_store, rate_per_minute=9)
 
         def accepted(key: str) -> int:
             answers = [client.get("/limits", headers=bearer(key)) for _ in range(20)]
@@ -444,14 +443,12 @@ def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: Datab
         assert accepted(unlimited) == 20
         metrics = client.get("/metrics", headers=bearer(unlimited)).text
         assert re.search(r'lalaloc_rejections_total\{reason="rate-limited"\} (2[4-6])\.0', metrics)
-        store.close()
 
 
 @pytest.mark.one_replica
-def test_bytes_of_reads_count_as_requests(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_bytes_of_reads_count_as_requests(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=40, rate_burst=0) as client:
-        store = Store(database_of(tmp_path))
-        key = make_key(store)
+        key = make_key(app_store)
         client.headers.update(bearer(key))
         content = json.dumps(FLAT).encode() + b" " * 5 * access_control.BYTES_PER_REQUEST
         headers = {"Content-Type": "application/json"}
@@ -460,30 +457,26 @@ def test_bytes_of_reads_count_as_requests(start_app: StartApp, database_of: Data
         statuses = [client.get(f"{url}/original").status_code for _ in range(15)]
         assert 6 <= statuses.count(200) < 15
         assert set(statuses) == {200, 429}
-        store.close()
 
 
-def test_burst_is_limited(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_burst_is_limited(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=0, rate_burst=2) as client:
-        store = Store(database_of(tmp_path))
-        key = make_key(store)
+        key = make_key(app_store)
         answers = [client.get("/limits", headers=bearer(key)) for _ in range(15)]
         refused = [answer for answer in answers if answer.status_code == 429]
         assert refused
         assert {answer.headers["retry-after"] for answer in refused} == {"1"}
         wait_for(lambda: client.get("/limits", headers=bearer(key)).status_code == 200, 5.0)
-        store.close()
 
 
 @pytest.mark.one_replica
 @pytest.mark.parametrize("kind", ["unknown", "malformed"])
 def test_many_invalid_keys_do_not_block_valid_ones(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+    start_app: StartApp, app_store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setattr(access_control, "REFUSED_KEYS_PER_MINUTE", 5)
     with start_app(tmp_path, api_keys=True, key_cache_s=0.0) as client:
-        store = Store(database_of(tmp_path))
-        key = make_key(store)
+        key = make_key(app_store)
         assert client.get("/limits", headers=bearer(key)).status_code == 200
         statuses = []
         for _ in range(12):
@@ -496,8 +489,7 @@ def test_many_invalid_keys_do_not_block_valid_ones(
         assert 1 <= int(response.headers["retry-after"]) <= 60
         assert client.get("/limits", headers=bearer(key)).status_code == 200
         # Nor one that the service has not seen before.
-        assert client.get("/limits", headers=bearer(make_key(store))).status_code == 200
-        store.close()
+        assert client.get("/limits", headers=bearer(make_key(app_store))).status_code == 200
 
 
 def test_address_counters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

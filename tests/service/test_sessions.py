@@ -184,9 +184,7 @@ def test_session_survives_a_restart(start_app: StartApp, tmp_path: Path, sphere:
 
 
 @pytest.mark.slow
-def test_sessions_expire_and_are_limited(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
-) -> None:
+def test_sessions_expire_and_are_limited(start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, session_ttl_s=1.0, max_sessions=2) as client:
         own = upload(client)
         first, _ = begin(client, own), begin(client, own)
@@ -195,11 +193,9 @@ def test_sessions_expire_and_are_limited(
         sleep(1.1)
         assert_problem(send(client, first, sphere), 404, "unknown-session")
         begin(client, own)
-        store = Store(database_of(tmp_path))
         sleep(1.1)
-        assert store.sessions.purge() == 1
-        assert store.quota.account("default").used.sessions == 0
-        store.close()
+        assert app_store.sessions.purge() == 1
+        assert app_store.quota.account("default").used.sessions == 0
 
 
 @pytest.mark.slow
@@ -295,20 +291,18 @@ def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, plan_id:
 
 
 def test_session_of_an_earlier_version_goes_on(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
         before = send(client, session_id, sphere).json()
-        store = Store(database_of(tmp_path))
-        record = store.sessions.claim("default", session_id, None, "0" * 32)
+        record = app_store.sessions.claim("default", session_id, None, "0" * 32)
         assert record.state is not None
         assert record.pose is not None
         pose = json.loads(record.pose)
         for place in (pose["pose"], *pose["pose"]["candidates"], *pose["path"]):
             del place["floorplan_id"], place["level"]
-        store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
-        store.close()
+        app_store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
         after = send(client, session_id, sphere, forward_m=0, turn_deg=0)
         assert after.status_code == 200, after.text
         # `finish` counted a photograph.
@@ -368,7 +362,7 @@ def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: s
 
 @pytest.mark.one_replica
 def test_request_whose_answer_was_not_kept_moves_the_camera_once(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_arguments: object) -> None:
         raise StoreUnavailableError()
@@ -385,10 +379,8 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
             first = photograph()
         assert first.status_code == 200
         assert_problem(photograph(), 409, "idempotency-in-progress")
-        store = Store(database_of(tmp_path))
-        with store.database.writing() as connection:
+        with app_store.database.writing() as connection:
             connection.execute(update(IDEMPOTENCY).values(lease_until_s=0.0))
-        store.close()
         assert photograph().json() == first.json()
         assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
         assert send(client, session_id, sphere).json()["photographs"] == 2

@@ -224,21 +224,19 @@ def test_limits_refuse_the_whole_file(
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["plans"] == 0
 
 
-def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        store = Store(database_of(tmp_path))
         mine, theirs = (
-            bearer(make_key(store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
+            bearer(make_key(app_store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
         )
         venue = send(client, geojson(), headers=mine).json()
         assert (counts(client, mine), counts(client, theirs)) == ((2, 1), (0, 0))
         assert_problem(client.get(f"/venues/{venue['id']}", headers=theirs), 404, "unknown-venue")
-        reader = bearer(make_key(store, tenant="mine", scopes=("read", "localise")))
+        reader = bearer(make_key(app_store, tenant="mine", scopes=("read", "localise")))
         assert_problem(send(client, geojson(), headers=reader), 403, "insufficient-scope")
         used = client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"]
-        store.quota.recount()
+        app_store.quota.recount()
         assert client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"] == used
-        store.close()
 
 
 def street(first: int, count: int = 3) -> bytes:
@@ -299,12 +297,12 @@ def test_file_that_cannot_be_added_changes_nothing(start_app: StartApp, tmp_path
         assert extend(client, venue_id, street(3, 2), **{"If-Match": tag}).json()["plans"] == 5
 
 
-def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: DatabaseOf) -> None:
-    store, token = Store(database_of(tmp_path)), uuid.uuid4().hex
-    venue, _ = store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
+def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
+    token = uuid.uuid4().hex
+    venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
 
     def attempt(_number: int) -> tuple[str, int]:
-        extended, records = store.venue_imports.extend(
+        extended, records = app_store.venue_imports.extend(
             "t", venue.id, token, new_plans(), max_plans=9, max_venue_plans=9
         )
         return extended.revision_id, len(records)
@@ -313,15 +311,14 @@ def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: Data
         found = list(threads.map(attempt, range(4)))
     assert len({revision for revision, _ in found}) == 1
     assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
-    extended = store.venues.get("t", venue.id)
+    extended = app_store.venues.get("t", venue.id)
     assert extended is not None
     assert extended.plans == 4
-    used = store.quota.account("t").used
-    store.quota.recount()
-    assert store.quota.account("t").used == used
+    used = app_store.quota.account("t").used
+    app_store.quota.recount()
+    assert app_store.quota.account("t").used == used
     with pytest.raises(UnknownVenueError):
-        store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), max_plans=9, max_venue_plans=9)
-    store.close()
+        app_store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), max_plans=9, max_venue_plans=9)
 
 
 def new_plans(count: int = 3) -> list[NewPlan]:
@@ -359,16 +356,15 @@ def test_failure_between_two_plans_stores_none(tmp_path: Path, database_of: Data
     store.close()
 
 
-def test_attempts_at_the_same_time_store_one_venue(tmp_path: Path, database_of: DatabaseOf) -> None:
-    store, venue_id = Store(database_of(tmp_path)), uuid.uuid4().hex
+def test_attempts_at_the_same_time_store_one_venue(app_store: Store) -> None:
+    venue_id = uuid.uuid4().hex
 
     def attempt(_number: int) -> tuple[str, int]:
-        venue, records = store.venue_imports.add("t", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
+        venue, records = app_store.venue_imports.add("t", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
         return venue.revision_id, len(records)
 
     with ThreadPoolExecutor(4) as threads:
         found = list(threads.map(attempt, range(4)))
     assert len({revision for revision, _ in found}) == 1
     assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
-    assert len(store.plans.list_plans("t", limit=99)) == 3
-    store.close()
+    assert len(app_store.plans.list_plans("t", limit=99)) == 3

@@ -12,6 +12,7 @@ import pytest
 
 from lalaloc_core.localise.match import PoseGrid
 from service.grids import builder
+from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.venues import venue_plans
 from tests.core.taken import EXAMPLES
@@ -144,22 +145,19 @@ def test_most_probable_plans_are_searched(
 
 @pytest.mark.parametrize("stored", ["NULL", "x'4c4c5032'"], ids=["nothing", "fewer poses"])
 def test_missing_prototypes_are_made(
-    start_app: StartApp, tmp_path: Path, database_of: Any, sphere: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
+    start_app: StartApp, tmp_path: Path, app_store: Store, sphere: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
 ) -> None:
-    from service.storage import Store
 
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
     with start_app(tmp_path) as client:
         venue_id = venue_of(client, upload(client), upload(client, STUDIO))
-        store = Store(database_of(tmp_path))
-        with store.database.writing() as connection:
-            value = "'\\x4c4c5032'" if stored != "NULL" and store.database.is_postgresql else stored
+        with app_store.database.writing() as connection:
+            value = "'\\x4c4c5032'" if stored != "NULL" and app_store.database.is_postgresql else stored
             connection.exec_driver_sql(f"UPDATE latent_grids SET prototypes = {value}")
             grid_ids = connection.exec_driver_sql("SELECT id FROM latent_grids").scalars().all()
-        assert store.grids.prototypes(grid_ids) == {}
+        assert app_store.grids.prototypes(grid_ids) == {}
         assert ask(client, venue_id, sphere, refine="none").status_code == 200
-        assert store.grids.prototypes(grid_ids).keys() == set(grid_ids)
-        store.close()
+        assert app_store.grids.prototypes(grid_ids).keys() == set(grid_ids)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from service.storage import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload
 from tests.service.test_security import bearer, make_key
 
 JSON = {"Content-Type": "application/json"}
@@ -218,11 +218,10 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
         assert "(LALALOC_MAX_VENUE_BYTES)" in assert_problem(long, 413, "upload-too-large")["detail"]
 
 
-def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        store = Store(database_of(tmp_path))
         mine, theirs = (
-            bearer(make_key(store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
+            bearer(make_key(app_store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
         )
         plan_id = client.post("/floorplans", json=FLAT, headers=mine).json()["id"]
         stolen = client.post("/venues", json={"plans": [member(plan_id)]}, headers=theirs)
@@ -234,7 +233,6 @@ def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, dat
             assert_problem(refused, 404, "unknown-venue")
         assert_problem(client.get(f"{path}/plans", headers=theirs), 404, "unknown-venue")
         assert client.get("/venues", headers=theirs).json()["venues"] == []
-        reader = bearer(make_key(store, tenant="mine", scopes=("read",)))
+        reader = bearer(make_key(app_store, tenant="mine", scopes=("read",)))
         assert client.get(path, headers=reader).json()["plans"] == 1
         assert_problem(client.delete(path, headers=reader), 403, "insufficient-scope")
-        store.close()
