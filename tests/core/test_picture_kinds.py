@@ -18,6 +18,7 @@ from lalaloc_core.importers.drawing.sketch_drawing import naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.photograph import StatedCamera, open_photograph
 from tests.painted import picture_file
+from tests.strategies import present
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PHOTOGRAPHS = sorted([*EXAMPLES.glob("*.jpg"), *EXAMPLES.glob("real/*.jpg")])
@@ -31,8 +32,7 @@ def test_photographs_are_not_taken_for_drawings() -> None:
 
 @pytest.mark.parametrize("shade", [255, 128, 0])
 def test_plain_pictures_are_neither(shade: int) -> None:
-    tones = Tones.of(np.full((300, 400), shade, np.uint8))
-    assert tones is not None
+    tones = present(Tones.of(np.full((300, 400), shade, np.uint8)))
     assert not tones.is_drawing
     assert not tones.is_photograph
     assert Tones.of(np.zeros((8, 900), np.uint8)) is None
@@ -42,8 +42,7 @@ def test_plain_pictures_are_neither(shade: int) -> None:
 def test_drawn_and_scanned_plans_are_not_taken_for_photographs(style: Style) -> None:
     drawn = draw_plan(style, 3)
     content = drawn.jpeg() if style == "scanned" else drawn.png()
-    tones = Tones.of(np.asarray(Image.open(io.BytesIO(content)).convert("L")))
-    assert tones is not None
+    tones = present(Tones.of(np.asarray(Image.open(io.BytesIO(content)).convert("L"))))
     assert not tones.is_photograph
 
 

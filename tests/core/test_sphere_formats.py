@@ -20,6 +20,7 @@ from tests.core.fault_photographs import FOLDER
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
 from tests.painted import picture_file
+from tests.strategies import present
 
 PART: dict[str, object] = {
     "FullPanoWidthPixels": 1024,
@@ -113,8 +114,7 @@ def unusable(sphere: np.ndarray) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", NAMES)
 def test_sphere_is_taken_out_of_its_bars(name: str) -> None:
     sphere = small(name)
-    whole = opened(jpeg(sphere)).sphere
-    assert whole is not None
+    whole = present(opened(jpeg(sphere)).sphere)
     for words, pixels in usable(sphere).items():
         view = opened(jpeg(pixels))
         assert (view.projection, view.projection_source) == ("equirectangular", "estimated"), words
@@ -166,8 +166,7 @@ def test_statement_turns_a_refusal_into_a_warning() -> None:
 @pytest.mark.parametrize("orientation", [6, 8])
 def test_orientation_of_a_sphere_is_ignored(orientation: int) -> None:
     view = opened(jpeg(small("kitchen"), orientation=orientation))
-    whole = opened(jpeg(small("kitchen"))).sphere
-    assert whole is not None
+    whole = present(opened(jpeg(small("kitchen"))).sphere)
     assert view.sphere is not None
     assert np.abs(view.sphere.astype(int) - whole).mean() < 3.0
     assert f"Exif orientation {orientation}, which is ignored" in view.warnings[0]

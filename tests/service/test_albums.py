@@ -32,6 +32,7 @@ from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
 from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, upload, wait_for
 from tests.service.test_security import bearer, make_key
+from tests.strategies import present
 
 ANCHORED = {**HOME, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0}
 NAMES = ("living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg")
@@ -364,8 +365,7 @@ def test_stored_album_has_no_picture_position_or_owner(
         app_store.album_jobs.release(album_id, "")
         with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(solved_number=0))
-        job = app_store.album_jobs.claim(album_id, "test", 10.0)
-        assert job is not None
+        job = present(app_store.album_jobs.claim(album_id, "test", 10.0))
         (part,) = job.photographs
         assert len(part.entry) <= 20_000
         for secret in (b"Mustermann", b"\xff\xd8\xff", b"GPS"):
@@ -562,8 +562,7 @@ def test_expired_lease_is_taken_over(
         assert app_store.album_jobs.claim(album_id, "other", 10.0) is None
         with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(lease_until_s=0.0))
-        job = app_store.album_jobs.claim(album_id, "other", 10.0)
-        assert job is not None
+        job = present(app_store.album_jobs.claim(album_id, "other", 10.0))
         assert job.attempts == 2
         go_on.set()
         # The app lost the lease, so its result is dropped until the other one releases it.

@@ -19,6 +19,7 @@ from lalaloc_core.importers import Anchor, ImportOptions, import_plan
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.conftest import assert_same_plan
 from tests.service.conftest import FLAT, assert_problem, localise, upload
+from tests.strategies import present
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
 # Required by GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11).
@@ -103,14 +104,12 @@ def test_two_control_points_make_an_anchor() -> None:
         {"x": x, "y": y, "latitude": float(lat), "longitude": float(lon)}
         for (x, y), (lon, lat) in zip(places, known.to_earth(np.array(places)), strict=True)
     ]
-    found = anchored(control_points=points, altitude_m=519.5).anchor
-    assert found is not None
+    found = present(anchored(control_points=points, altitude_m=519.5).anchor)
     assert (found.latitude, found.longitude) == pytest.approx((known.latitude, known.longitude), abs=1e-9)
     assert found.north_deg == pytest.approx(25.0, abs=1e-4)
     in_feet = FLAT | {"units": "ft", "anchor": {"control_points": [p | {"x": p["x"] / 0.3048, "y": p["y"] / 0.3048}
                                                                    for p in points]}}  # fmt: skip
-    converted = import_plan(json.dumps(in_feet).encode(), ImportOptions()).anchor
-    assert converted is not None
+    converted = present(import_plan(json.dumps(in_feet).encode(), ImportOptions()).anchor)
     assert converted.latitude == pytest.approx(known.latitude, abs=1e-9)
     stretched = [points[0], points[1] | {"x": 20.0}]
     with pytest.raises(InvalidFloorPlanError, match="check the scale"):

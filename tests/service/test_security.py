@@ -48,6 +48,7 @@ from tests.service.conftest import (
     wait_for,
 )
 from tests.service.postgres import PostgresServer
+from tests.strategies import present
 
 ROOT = Path(__file__).parents[2]
 EVERYTHING = tuple(Permission)
@@ -555,8 +556,7 @@ def cached(tmp_path: Path) -> Iterator[CachedKey]:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
     cache = KeyCache(store.keys, fresh_s=5.0, clock=lambda: cached.clock_s)
     text = make_key(store)
-    presented = parse_authorization([f"Bearer {text}"])
-    assert presented is not None
+    presented = present(parse_authorization([f"Bearer {text}"]))
     cached = CachedKey(store, id_of(text), lambda: asyncio.run(cache.find(presented)))
     try:
         assert cached.find() is not None
@@ -571,8 +571,7 @@ def test_key_is_cached_ten_minutes_without_database(cached: CachedKey) -> None:
     # The only connection is in use.
     with cached.store.database.reading():
         for cached.clock_s in (1004.0, 1006.0, 1300.0, 1600.0):
-            key = cached.find()
-            assert key is not None
+            key = present(cached.find())
             assert key.id == cached.key_id
         cached.clock_s = 1606.0
         with pytest.raises(StoreUnavailableError):
@@ -590,8 +589,7 @@ def test_busy_database_does_not_extend_the_key_cache(cached: CachedKey) -> None:
         with pytest.raises(StoreBusyError):
             cached.find()
     # A busy database is queried again at the next request.
-    again = cached.find()
-    assert again is not None
+    again = present(cached.find())
     assert again.id == cached.key_id
 
 
