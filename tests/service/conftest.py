@@ -307,9 +307,7 @@ def tiled_plan(side: int, *, openings: bool = False) -> dict[str, Any]:
 
 def upload(client: httpx.Client, plan: dict[str, Any] | None = None, *, wait: bool = True) -> str:
     """Upload a plan, wait until it is ready, return its id."""
-    response = client.post("/floorplans", json=plan or FLAT)
-    assert response.status_code == 201, response.text
-    plan_id = response.json()["id"]
+    plan_id = document_of(client.post("/floorplans", json=plan or FLAT), 201)["id"]
     if wait:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
     return plan_id
@@ -326,6 +324,12 @@ def original_of(store: Store, plan_id: str) -> bytes:
         assert chunk
         content += chunk
     return content
+
+
+def document_of(response: httpx.Response, status: int = 200) -> Any:
+    """Check the status of an answer, and return its document."""
+    assert response.status_code == status, response.text
+    return response.json()
 
 
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:

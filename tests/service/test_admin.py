@@ -27,7 +27,7 @@ from service.settings import Settings
 from service.storage.records import ANONYMOUS, AuditEntry
 from service.storage.store import Store
 from service.storage.tables import API_KEYS, AUDIT_LOG
-from tests.service.conftest import StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, document_of, upload, wait_for
 from tests.service.test_security import bearer, id_of, make_key
 
 NEW_KEY = {"tenant": "acme", "name": "camera 7", "scopes": ["read", "localise"]}
@@ -56,9 +56,7 @@ def _created(client: httpx.Client, **changes: Any) -> dict[str, Any]:
 
 
 def _entries(client: httpx.Client, **query: str) -> list[dict[str, Any]]:
-    answer = client.get("/admin/audit", params=query)
-    assert answer.status_code == 200, answer.text
-    return answer.json()["entries"]
+    return document_of(client.get("/admin/audit", params=query))["entries"]
 
 
 def _entry(actor: str = "a", **values: Any) -> AuditEntry:

@@ -30,7 +30,7 @@ from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
-from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, upload, wait_for
 from tests.service.test_security import bearer, make_key
 from tests.strategies import present
 
@@ -460,9 +460,7 @@ def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: st
     upper = upload(client, {**HOME, "name": "Upper"})
     plans = [{"floorplan_id": plan_id, "level": 0}, {"floorplan_id": upper, "level": 1}]
     venue = client.post("/venues", json={"plans": plans}).json()
-    answer = client.post("/albums", json={"venue_id": venue["id"]})
-    assert answer.status_code == 201, answer.text
-    album_id = answer.json()["id"]
+    album_id = document_of(client.post("/albums", json={"venue_id": venue["id"]}), 201)["id"]
     (line,) = add(client, album_id, pictures[:1])
     wait_until_solved(client, album_id)
     (row,) = photographs(client, album_id)

@@ -19,7 +19,7 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.painted import painted_room, picture_file
-from tests.service.conftest import localise, upload
+from tests.service.conftest import document_of, localise, upload
 
 HOMES = 12
 FIRST_HOME = 1000
@@ -98,9 +98,7 @@ def ask(client: httpx.Client, plan_id: str, picture: bytes, heading_deg: float |
     """Return an answer of the last stage."""
     if heading_deg is not None:
         fields["heading_deg"] = heading_deg
-    response = localise(client, plan_id, picture, **fields)
-    assert response.status_code == 200, response.text
-    answer = response.json()
+    answer = document_of(localise(client, plan_id, picture, **fields))
     assert answer["stage"] == "lpo"
     return answer
 

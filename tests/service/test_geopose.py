@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, ImportOptions, import_plan
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.conftest import assert_same_plan
-from tests.service.conftest import FLAT, assert_problem, localise, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, localise, upload
 from tests.strategies import present
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
@@ -267,9 +267,7 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, sphere: bytes) 
     plans = [{"floorplan_id": plan_id} for plan_id in ids]
     venue_id = client.post("/venues", json={"plans": plans, "anchor": venue_anchor}).json()["id"]
     fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"photo": sphere}
-    response = client.post("/localise", data=fields, files=file)
-    assert response.status_code == 200, response.text
-    found = response.json()["candidates"]
+    found = document_of(client.post("/localise", data=fields, files=file))["candidates"]
     assert {candidate["floorplan_id"] for candidate in found} == set(ids)
     for candidate in found:
         if candidate["floorplan_id"] == ids[2]:

@@ -26,7 +26,7 @@ from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_ifc import DUPLEX, ifc_flat
 from tests.importers.test_pictures import open_hall, vector_pdf
 from tests.painted import picture_file
-from tests.service.conftest import StartApp, assert_problem, end_time_limits, localise, wait_for
+from tests.service.conftest import StartApp, assert_problem, document_of, end_time_limits, localise, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
@@ -38,9 +38,7 @@ def send_plan(client: httpx.Client, content: bytes, **options: Any) -> httpx.Res
 
 
 def store_plan(client: httpx.Client, content: bytes, **options: Any) -> dict[str, Any]:
-    response = send_plan(client, content, **options)
-    assert response.status_code == 201, response.text
-    return response.json()
+    return document_of(send_plan(client, content, **options), 201)
 
 
 def plan_file(format: str) -> bytes:
@@ -388,9 +386,7 @@ def test_example_is_localised_in_an_imported_drawing(start_app: StartApp, tmp_pa
         for format in ("dxf", "svg", "geojson"):
             made = store_plan(client, export_plan(plan, format), ceiling_height_m=2.6)
             assert made["status"] == "ready"
-            response = localise(client, made["id"], picture, heading_deg=truth["heading_deg"], refine="vdr")
-            assert response.status_code == 200, response.text
-            answer = response.json()
+            answer = document_of(localise(client, made["id"], picture, heading_deg=truth["heading_deg"], refine="vdr"))
             assert answer["room"] == "kitchen"
             position = shapely.Point(answer["position"]["x_m"], answer["position"]["y_m"])
             assert position.distance(shapely.Point(truth["x_m"], truth["y_m"])) < 0.3

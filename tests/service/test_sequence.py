@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
-from tests.service.conftest import FLAT, assert_problem, encode_picture, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture, upload
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,7 @@ def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any
 
 
 def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> dict[str, Any]:
-    response = ask(client, plan_id, pictures, **fields)
-    assert response.status_code == 200, response.text
-    return response.json()
+    return document_of(ask(client, plan_id, pictures, **fields))
 
 
 @pytest.mark.parametrize("refine", ["none", "lpo"])

@@ -19,7 +19,7 @@ from service.storage.kept_answers import IdempotencyKeys
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.venues import venue_plans
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, encode_picture, upload
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, encode_picture, upload
 
 
 def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
@@ -47,9 +47,7 @@ def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, p
     empty = client.get(f"/sessions/{session_id}").json()
     assert (empty["photographs"], empty["mode"], empty["pose"], empty["path"]) == (0, "searching", None, [])
     first = send(client, session_id, sphere, number=1).json()
-    second = send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
-    assert second.status_code == 200, second.text
-    answer = second.json()
+    answer = document_of(send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0))
     assert answer == client.get(f"/sessions/{session_id}").json()
     assert answer["photographs"] == answer["pose"]["number"] == 2
     assert [point["number"] for point in answer["path"]] == [1, 2]
@@ -217,15 +215,11 @@ def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: Datab
 def venue_of(client: httpx.Client, *plan_ids: str) -> str:
     """Create a venue with a plan on each level; return its id."""
     plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
-    answer = client.post("/venues", json={"name": "house", "plans": plans})
-    assert answer.status_code == 201, answer.text
-    return answer.json()["id"]
+    return document_of(client.post("/venues", json={"name": "house", "plans": plans}), 201)["id"]
 
 
 def begin_in(client: httpx.Client, venue_id: str, **fields: Any) -> str:
-    answer = client.post("/sessions", json={"venue_id": venue_id} | fields)
-    assert answer.status_code == 201, answer.text
-    return answer.json()["id"]
+    return document_of(client.post("/sessions", json={"venue_id": venue_id} | fields), 201)["id"]
 
 
 STAIRS = {"name": "stairs", "type": "stairs", "polygon": [[20, 0], [22, 0], [22, 4], [20, 4]]}

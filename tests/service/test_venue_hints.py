@@ -11,7 +11,7 @@ import pytest
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.venues import venue_plans
-from tests.service.conftest import FLAT, assert_problem, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, upload
 from tests.service.test_venue_queries import STUDIO, ask, venue_of
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756}
@@ -37,9 +37,7 @@ def venue_id(client: httpx.Client, storeys: list[str]) -> str:
 
 
 def answer_to(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any) -> dict[str, Any]:
-    response = ask(client, venue_id, picture, **{"refine": "none", "top_k": 10, **fields})
-    assert response.status_code == 200, response.text
-    return response.json()
+    return document_of(ask(client, venue_id, picture, **{"refine": "none", "top_k": 10, **fields}))
 
 
 @pytest.fixture(params=["all", "chosen"])

@@ -25,7 +25,7 @@ from service.storage.store import Store
 from tests.importers.conftest import zip_file
 from tests.importers.test_ifc import DUPLEX, ifc_flat, ifc_house
 from tests.importers.test_roomplan import two_stories
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, wait_for
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, wait_for
 from tests.service.test_security import bearer, make_key
 from tests.service.test_venues import plans_of
 
@@ -253,9 +253,7 @@ def test_files_of_plans_make_and_extend_a_venue(client: httpx.Client) -> None:
     # Ready at once, although the file passes through a worker.
     assert (venue["name"], venue["plans"], venue["plans_ready"]) == ("Street", 3, 3)
     before, key = counts(client), {"Idempotency-Key": uuid.uuid4().hex}
-    response = extend(client, venue["id"], street(3), **key)
-    assert response.status_code == 200, response.text
-    extended = response.json()
+    extended = document_of(extend(client, venue["id"], street(3), **key))
     assert (extended["plans"], extended["plans_ready"]) == (6, 6)
     assert extended["revision"] != venue["revision"]
     again = extend(client, venue["id"], street(3), **key)
