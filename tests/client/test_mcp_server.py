@@ -26,11 +26,7 @@ from tests.service.test_security import bearer, make_key
 
 _COMMAND = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main; sys.exit(main())", "mcp"]
 _JPEG = "data:image/jpeg;base64,"
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture

@@ -19,11 +19,7 @@ from tests.core.taken import EXAMPLES, jpeg
 from tests.service.conftest import upload
 
 KITCHEN, PHONE = EXAMPLES / "kitchen.jpg", EXAMPLES / "phone.jpg"
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"bundle": default_bundle(), "require_features": True, "request_deadline_s": 90.0}
+APP_SETTINGS = {"bundle": default_bundle(), "require_features": True, "request_deadline_s": 90.0}
 
 
 @pytest.fixture(scope="module")

@@ -24,10 +24,7 @@ from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import FLAT, StartApp
 
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 def test_plan_is_stored_listed_and_deleted(service: Any, tmp_path: Path) -> None:

@@ -186,9 +186,11 @@ class InTurn(httpx.BaseTransport):
 
 
 @pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    """Settings of a module's app; a module that needs others has a fixture of this name."""
-    return {}
+def app_settings(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Return the `APP_SETTINGS` of a module, which may name the fixture of its bundle."""
+    settings: dict[str, Any] = getattr(request.module, "APP_SETTINGS", {})
+    bundle = settings.get("bundle")
+    return settings | ({"bundle": request.getfixturevalue(bundle)} if isinstance(bundle, str) else {})
 
 
 @pytest.fixture(scope="module")

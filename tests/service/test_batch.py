@@ -16,10 +16,7 @@ from service.storage.store import Store
 from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
 from tests.service.test_security import bearer, make_key
 
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_photograph_bytes": 500_000}
+APP_SETTINGS = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_photograph_bytes": 500_000}
 
 
 @pytest.fixture(scope="module")

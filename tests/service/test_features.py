@@ -37,6 +37,7 @@ from tests.service.test_telemetry import collector
 
 KITCHEN, PHONE = ((EXAMPLES / name).read_bytes() for name in ("kitchen.jpg", "phone.jpg"))
 PREFIX = struct.Struct("<4sHI")
+APP_SETTINGS = {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 class Device:
@@ -57,11 +58,6 @@ class Device:
 @pytest.fixture(scope="module")
 def device() -> Device:
     return Device()
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -22,11 +20,7 @@ SOME = [
     pytest.param(fault, id=fault_id(fault), marks=[] if index % 3 == 0 else [pytest.mark.slow])
     for index, fault in enumerate(FAULTS)
 ]
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,7 @@ import pytest
 from lalaloc_core.floorplan import FloorPlan
 from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture, upload
 
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
+APP_SETTINGS = {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
 
 
 @pytest.fixture(scope="module")

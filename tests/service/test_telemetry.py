@@ -36,6 +36,7 @@ from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upl
 ROOT = Path(__file__).parents[2]
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 _HEX_16 = st.text("0123456789abcdef", min_size=16, max_size=16)
+APP_SETTINGS = {"log_level": "debug"}
 
 
 class Log:
@@ -63,11 +64,6 @@ class Log:
     def _of(self, request_id: str) -> list[dict[str, Any]]:
         lines = [json.loads(line) for line in self.text.splitlines() if line.endswith("}")]
         return [line for line in lines if line["request_id"] == request_id]
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"log_level": "debug"}
 
 
 @pytest.fixture

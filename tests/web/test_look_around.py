@@ -8,7 +8,6 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -26,11 +25,7 @@ FLAT = json.loads((EXAMPLES / "flat.json").read_text())
 STEP_DEG = 3.0
 PERMISSIONS = ["camera", "accelerometer", "gyroscope", "magnetometer"]
 CAMERA = Perspective.of_hfov(360, 640, math.radians(53.0))
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture(scope="module")
