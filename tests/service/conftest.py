@@ -203,6 +203,12 @@ def client(
 
 
 @pytest.fixture(scope="module")
+def flat(client: httpx.Client) -> str:
+    """Return the id of `FLAT` in the app of a module."""
+    return upload(client)
+
+
+@pytest.fixture(scope="module")
 def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     """Yield an app with the shipped model and a ready worker."""
     deadlines = {"lpo_deadline_s": 60.0, "lpo_stall_s": 60.0, "request_deadline_s": 90.0}

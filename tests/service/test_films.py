@@ -23,11 +23,6 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return encode(turn()[:31], tmp_path_factory.mktemp("film") / "turn.mp4")
 
 
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    return upload(client)
-
-
 def send(
     client: httpx.Client, plan_id: str, *parts: tuple[str, bytes], key: str | None = None, **fields: Any
 ) -> httpx.Response:

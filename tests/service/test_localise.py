@@ -39,12 +39,6 @@ HALL: dict[str, Any] = {
 }
 
 
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    """Upload a plan and return its id once it is ready."""
-    return upload(client)
-
-
 @pytest.mark.parametrize("heading", [None, 0.0, 90.0, -360.0, 360.0, 123.456])
 @pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "vdr")])
 def test_answer_lies_in_the_plan_and_names_its_stage(

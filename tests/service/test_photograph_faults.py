@@ -11,7 +11,7 @@ import pytest
 from lalaloc_core.photograph.file_segments import END
 from tests.core.fault_photographs import CONTRADICTED, FAULTS, LIBRARY_WORDS, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere
-from tests.service.conftest import FLAT, assert_problem, upload
+from tests.service.conftest import assert_problem
 from tests.service.test_photographs import PHONE, ask, shown
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
@@ -21,11 +21,6 @@ SOME = [
     for index, fault in enumerate(FAULTS)
 ]
 APP_SETTINGS = {"bundle": "tiny_view_bundle"}
-
-
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    return upload(client, FLAT)
 
 
 def data_of(fault: Fault, plan_id: str) -> dict[str, str]:

@@ -14,14 +14,9 @@ from starlette.requests import Request
 
 from lalaloc_client import Client
 from service.http.representations import preferred
-from tests.service.conftest import assert_problem, upload
+from tests.service.conftest import assert_problem
 
 JSON, PNG, SVG = "application/json", "image/png", "image/svg+xml"
-
-
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    return upload(client)
 
 
 def request_picture(

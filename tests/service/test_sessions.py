@@ -37,13 +37,8 @@ def send(client: httpx.Client, session_id: str, picture: bytes, **fields: Any) -
     return client.post(f"/sessions/{session_id}/photographs", data=data, files=files)
 
 
-@pytest.fixture(scope="module")
-def plan_id(client: httpx.Client) -> str:
-    return upload(client)
-
-
-def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id, camera_height_m=1.5)
+def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat, camera_height_m=1.5)
     empty = client.get(f"/sessions/{session_id}").json()
     assert (empty["photographs"], empty["mode"], empty["pose"], empty["path"]) == (0, "searching", None, [])
     first = send(client, session_id, sphere, number=1).json()
@@ -64,8 +59,8 @@ def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, p
     assert_problem(client.delete(f"/sessions/{session_id}"), 404, "unknown-session")
 
 
-def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_photograph_out_of_order_is_refused(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
     assert send(client, session_id, sphere, number=1).status_code == 200
     problem = assert_problem(send(client, session_id, sphere, number=1), 409, "photograph-out-of-order")
     assert "number is 1; the next photograph" in problem["detail"]
@@ -110,23 +105,23 @@ def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, 
     ],
 )
 def test_impossible_motion_is_refused(
-    client: httpx.Client, plan_id: str, sphere: bytes, fields: dict[str, Any], slug: str, message: str
+    client: httpx.Client, flat: str, sphere: bytes, fields: dict[str, Any], slug: str, message: str
 ) -> None:
-    session_id = begin(client, plan_id)
+    session_id = begin(client, flat)
     problem = assert_problem(send(client, session_id, sphere, **fields), 422, slug)
     assert message in json.dumps(problem)
     # The session is free and unchanged.
     assert send(client, session_id, sphere, number=1).status_code == 200
 
 
-def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
     assert_problem(send(client, session_id, b"no picture"), 422, "invalid-photograph")
     assert send(client, session_id, sphere, number=1).status_code == 200
 
 
-def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
     answers: list[httpx.Response] = []
     threads = [threading.Thread(target=lambda: answers.append(send(client, session_id, sphere))) for _ in range(4)]
     for thread in threads:
@@ -153,12 +148,12 @@ def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client,
         ({"colour": "red"}, "invalid-request"),
     ],
 )
-def test_impossible_session_is_refused(client: httpx.Client, plan_id: str, fields: dict[str, Any], slug: str) -> None:
-    assert_problem(client.post("/sessions", json={"floorplan_id": plan_id} | fields), 422, slug)
+def test_impossible_session_is_refused(client: httpx.Client, flat: str, fields: dict[str, Any], slug: str) -> None:
+    assert_problem(client.post("/sessions", json={"floorplan_id": flat} | fields), 422, slug)
 
 
-def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id, rooms=["kitchen"])
+def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat, rooms=["kitchen"])
     assert send(client, session_id, sphere).json()["pose"]["room"] == "kitchen"
 
 
@@ -274,9 +269,9 @@ def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, sphere: byt
     assert venue_id in problem["detail"]
 
 
-def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, plan_id: str) -> None:
-    venue_id = venue_of(client, plan_id)
-    for document in ({}, {"floorplan_id": plan_id, "venue_id": venue_id}, {"floorplan_id": plan_id, "level": 0}):
+def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, flat: str) -> None:
+    venue_id = venue_of(client, flat)
+    for document in ({}, {"floorplan_id": flat, "venue_id": venue_id}, {"floorplan_id": flat, "level": 0}):
         assert_problem(client.post("/sessions", json=document), 422, "invalid-request")
     assert_problem(client.post("/sessions", json={"venue_id": venue_id, "level": 7}), 422, "invalid-hint")
     assert_problem(client.post("/sessions", json={"venue_id": "0" * 32}), 404, "unknown-venue")
@@ -333,8 +328,8 @@ def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_pat
         assert max(stored) < 200_000
 
 
-def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_repeated_request_moves_the_camera_once(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
 
     def keyed(key: str, picture: bytes = sphere, **fields: str) -> httpx.Response:
         url, files = f"/sessions/{session_id}/photographs", {"photo": ("p.jpg", picture, "image/jpeg")}
