@@ -20,6 +20,7 @@ from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.venues import venue_plans
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, encode_picture, upload
+from tests.service.test_venue_queries import venue_of
 
 
 def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
@@ -205,12 +206,6 @@ def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: Datab
         assert send(client, session_id, picture, number=1).status_code == 200
         assert_problem(client.get(f"/sessions/{'0' * 32}"), 404, "unknown-session")
         store.close()
-
-
-def venue_of(client: httpx.Client, *plan_ids: str) -> str:
-    """Create a venue with a plan on each level; return its id."""
-    plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
-    return document_of(client.post("/venues", json={"name": "house", "plans": plans}), 201)["id"]
 
 
 def begin_in(client: httpx.Client, venue_id: str, **fields: Any) -> str:
