@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from time import monotonic
 from typing import Any
 
@@ -17,6 +15,7 @@ import httpx
 import pytest
 
 from lalaloc_client import AsyncClient, Client
+from tests.local_servers import QuietHandler, http_server
 from tests.service.conftest import (
     _clean_environment,
     _forked_workers,
@@ -77,7 +76,7 @@ class FailingServer:
 def failing() -> Iterator[FailingServer]:
     """Return a server on a free port; without a planned answer it closes the connection."""
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def _handle(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length", 0)))
             headers = {name.lower(): value for name, value in self.headers.items()}
@@ -95,17 +94,9 @@ def failing() -> Iterator[FailingServer]:
 
         do_GET = do_POST = do_PUT = do_DELETE = _handle
 
-        def log_message(self, format: str, *args: object) -> None: ...
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as http:
-        server = FailingServer(f"http://127.0.0.1:{http.server_address[1]}")
-        thread = threading.Thread(target=http.serve_forever)
-        thread.start()
-        try:
-            yield server
-        finally:
-            http.shutdown()
-            thread.join(10.0)
+    with http_server(Handler) as url:
+        server = FailingServer(url)
+        yield server
 
 
 class _BlockingAdapter:

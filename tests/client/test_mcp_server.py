@@ -21,6 +21,7 @@ from mcp.client.streamable_http import streamable_http_client
 
 from lalaloc_core.bundle import default_bundle
 from service.storage import Store
+from tests.local_servers import free_port
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, encode_picture, wait_for
 from tests.service.test_security import bearer, make_key
 
@@ -163,9 +164,7 @@ def test_service_that_does_not_run_is_named(photograph: Path) -> None:
         assert result.is_error
         assert "127.0.0.1" in _texts(result)[0]
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-    _over_stdio(f"http://127.0.0.1:{port}", talk)
+    _over_stdio(f"http://127.0.0.1:{free_port()}", talk)
 
 
 def test_http_passes_the_callers_key_on_and_reads_no_files(
@@ -175,8 +174,7 @@ def test_http_passes_the_callers_key_on_and_reads_no_files(
         store = Store(database_of(tmp_path / "data"))
         key = make_key(store)
         store.close()
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            port = listener.getsockname()[1]
+        port = free_port()
         command = [*_COMMAND, "--url", str(app.base_url), "--http", f"127.0.0.1:{port}"]
         # A key of the server's own must not serve callers.
         server = subprocess.Popen(command, env={"LALALOC_API_KEY": key, "PATH": ""}, stderr=subprocess.DEVNULL)

@@ -6,7 +6,6 @@ import os
 import pwd
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import uuid
@@ -16,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sqlalchemy
+
+from tests.local_servers import free_port
 
 _DEBIAN = Path("/usr/lib/postgresql")
 _START_S = 60
@@ -109,7 +110,7 @@ def postgres_server(programs: Path) -> Iterator[PostgresServer]:
         if (user := _user()) is not None:
             shutil.chown(parent, user)
         _run([programs / "initdb", "-D", folder, "-U", "postgres", "-A", "trust", "-E", "UTF8", "--no-sync"])
-        server = PostgresServer(programs, folder, _free_port())
+        server = PostgresServer(programs, folder, free_port())
         server.start()
         try:
             yield server
@@ -142,8 +143,3 @@ def _user() -> str | None:
         return None
     pwd.getpwnam("postgres")
     return "postgres"
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return listener.getsockname()[1]

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from service.security.oidc import TokenVerifier
 from service.security.permissions import Identity, Permission
 from service.settings import Settings
 from service.storage.store import Store
+from tests.local_servers import QuietHandler, free_port, http_server
 from tests.service.conftest import FLAT, StartApp, assert_problem, wait_for
 from tests.service.test_security import bearer, make_key
 
@@ -103,12 +104,6 @@ def node_issuer(port: int, *keys: RSAKey) -> Iterator[NodeIssuer]:
         issuer.stop()
 
 
-def _free_port() -> int:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler)
-    server.server_close()
-    return server.server_address[1]
-
-
 def _with_issuer(url: str) -> dict[str, Any]:
     return {"api_keys": True, "oidc_issuer": url, "oidc_audience": AUDIENCE}
 
@@ -116,7 +111,7 @@ def _with_issuer(url: str) -> dict[str, Any]:
 @needs_node
 @pytest.mark.one_replica
 def test_tokens_of_a_certified_issuer(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
-    with node_issuer(_free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
+    with node_issuer(free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
         reader, admin = issuer.token("lalaloc:read"), issuer.token("lalaloc:admin", "lalaloc:write")
         usage = client.get("/usage", headers=bearer(reader))
         assert usage.json()["tenant"] == "acme"
@@ -142,7 +137,7 @@ def test_tokens_of_a_certified_issuer(start_app: StartApp, app_store: Store, tmp
 @pytest.mark.one_replica
 def test_issuer_rotates_its_keys(start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oidc, "_PAUSE_S", 0.2)
-    port = _free_port()
+    port = free_port()
     with start_app(tmp_path, **_with_issuer(f"http://127.0.0.1:{port}")) as client:
 
         def status(token: str) -> int:
@@ -185,7 +180,7 @@ class AnyIssuer:
 
 @pytest.fixture
 def issuer() -> Iterator[AnyIssuer]:
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_GET(self) -> None:
             if self.path == "/keys":
                 content: dict[str, Any] = {"keys": [key.as_dict(private=False) for key in found.keys]}
@@ -200,17 +195,9 @@ def issuer() -> Iterator[AnyIssuer]:
             self.end_headers()
             self.wfile.write(json.dumps(content).encode())
 
-        def log_message(self, *_arguments: Any) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    found = AnyIssuer(f"http://127.0.0.1:{server.server_address[1]}")
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    yield found
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with http_server(Handler) as url:
+        found = AnyIssuer(url)
+        yield found
 
 
 def _signed(key: Key, claims: dict[str, Any] | None = None, **header: Any) -> str:
