@@ -16,7 +16,7 @@ import pytest
 
 from lalaloc_client import AsyncClient, Client
 from tests.local_servers import QuietHandler, http_server
-from tests.service.conftest import (
+from tests.service.conftest import (  # noqa: F401, fixtures
     _clean_environment,
     _forked_workers,
     app_settings,
@@ -28,17 +28,7 @@ from tests.service.conftest import (
 )
 from tests.service.conftest import client as app
 
-__all__ = [
-    "_clean_environment",
-    "_forked_workers",
-    "app",
-    "app_settings",
-    "database_of",
-    "empty_database",
-    "postgres",
-    "sphere",
-    "start_app",
-]
+__all__ = ["app"]
 
 MakeClient = Callable[..., AbstractContextManager[Any]]
 

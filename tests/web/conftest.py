@@ -14,7 +14,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
 
-from tests.service.conftest import (
+from tests.service.conftest import (  # noqa: F401, fixtures
     _clean_environment,
     _forked_workers,
     app_settings,
@@ -24,15 +24,7 @@ from tests.service.conftest import (
 )
 from tests.service.conftest import client as service
 
-__all__ = [
-    "_clean_environment",
-    "_forked_workers",
-    "app_settings",
-    "database_of",
-    "empty_database",
-    "service",
-    "start_app",
-]
+__all__ = ["service"]
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DESKTOP = {"width": 1280, "height": 900}
