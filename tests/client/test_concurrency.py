@@ -25,7 +25,6 @@ APP_SETTINGS = {"max_queries": 4, "max_waiting_queries": 0}
 
 @pytest.fixture(scope="module")
 def plan_id(app: httpx.Client) -> str:
-    """Return the id of a stored plan."""
     return upload(app, FLAT)
 
 

@@ -32,7 +32,6 @@ APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 @pytest.fixture
 def flat(tmp_path: Path) -> Path:
-    """Return the file of a plan."""
     file = tmp_path / "flat.json"
     file.write_text(json.dumps(FLAT))
     return file
@@ -40,7 +39,6 @@ def flat(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def photograph(tmp_path: Path, sphere: bytes) -> Path:
-    """Return the file of a photograph."""
     file = tmp_path / "room.jpg"
     file.write_bytes(sphere)
     return file

@@ -277,7 +277,6 @@ def test_batch_yields_an_answer_per_photograph(service: Any, sphere: bytes, tmp_
 
 @pytest.fixture(scope="module")
 def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Return an app with the shipped model."""
     with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), request_deadline_s=90.0) as started:
         yield started
 

@@ -87,7 +87,6 @@ pytestmark = [
 
 
 def tsc(*arguments: str, cwd: Path) -> None:
-    """Run the compiler."""
     done = subprocess.run(
         ["node", str(PACKAGE / "node_modules/typescript/bin/tsc"), *arguments],
         cwd=cwd,

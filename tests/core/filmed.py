@@ -51,5 +51,4 @@ def encode(frames: Sequence[np.ndarray], path: Path, *options: str) -> bytes:
 
 
 def run(*arguments: str, content: bytes | None = None) -> None:
-    """Run FFmpeg."""
     subprocess.run(["ffmpeg", "-v", "error", "-y", *arguments], input=content, check=True, timeout=120)

@@ -88,7 +88,6 @@ def plan(**changes: Any) -> FloorPlan:
 
 
 def camera(camera_height_m: float) -> Camera:
-    """Return a camera in the middle of the plan's room."""
     return Camera(
         name="",
         position_m=np.array([2.0, 2.0]),

@@ -50,7 +50,6 @@ EXTERNAL_ENTITY = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{_SV
 
 
 def zip_file(files: Mapping[str, bytes | str]) -> bytes:
-    """Return a zip archive of files by name."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():

@@ -33,7 +33,6 @@ def file(tmp_path: Path) -> Path:
 
 
 def _run(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
-    """Run the command in a process of its own."""
     command = "import sys; from lalaloc_core.cli import main; sys.exit(main())"
     return subprocess.run([sys.executable, "-c", command, *arguments], check=False, **streams)
 

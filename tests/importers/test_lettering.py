@@ -66,7 +66,6 @@ class PrintedPlan:
                 self._dimension(start, end, x, is_vertical=True)
 
     def file(self, format: str = "PNG", **options: float) -> bytes:
-        """Return the picture as a file."""
         return picture_file(self.picture, format, **options)
 
     def _pixel(self, x: float, y: float) -> tuple[float, float]:

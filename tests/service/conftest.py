@@ -96,7 +96,6 @@ def sphere() -> bytes:
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[PostgresServer]:
-    """Yield a PostgreSQL server for the tests."""
     programs = postgres_programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed; on Debian and Ubuntu the package is postgresql")
@@ -175,13 +174,11 @@ class InTurn(httpx.BaseTransport):
         self._transport = httpx.HTTPTransport()
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Send a request."""
         url = next(self._urls)
         request.url = request.url.copy_with(host=url.host, port=url.port)
         return self._transport.handle_request(request)
 
     def close(self) -> None:
-        """Close all connections."""
         self._transport.close()
 
 
@@ -341,13 +338,11 @@ def document_of(response: httpx.Response, status: int = 200) -> Any:
 
 
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
-    """Send a query."""
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
     return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
-    """Poll until something holds."""
     deadline = monotonic() + timeout_s
     while not condition():
         assert monotonic() < deadline, "timed out waiting"

@@ -81,7 +81,6 @@ class PostgresServer:
                 os.kill(pid, signal.SIGCONT)
 
     def start(self) -> None:
-        """Start the server."""
         log = self.folder / "log"
         # Tests do not crash the machine, so fsync is not needed.
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
@@ -104,7 +103,6 @@ def postgres_programs() -> Path | None:
 
 @contextmanager
 def postgres_server(programs: Path) -> Iterator[PostgresServer]:
-    """Run a temporary cluster."""
     with tempfile.TemporaryDirectory(prefix="lalaloc-postgres-") as parent:
         folder = Path(parent) / "cluster"
         if (user := _user()) is not None:

@@ -72,7 +72,6 @@ def solved(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> str:
 
 
 def create(client: httpx.Client, plan_id: str, **fields: Any) -> str:
-    """Create an album; return its id."""
     answer = client.post("/albums", json={"floorplan_id": plan_id} | fields)
     assert answer.status_code == 201, answer.text
     assert answer.headers["location"] == f"/albums/{answer.json()['id']}"

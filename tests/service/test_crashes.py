@@ -127,7 +127,6 @@ def test_session_survives_kills_at_any_moment(
 
 
 def small_pictures(count: int) -> list[bytes]:
-    """Return different pictures of the example rooms."""
     names, found = ("kitchen", "bedroom", "study", "living_room"), []
     for number in range(count):
         with Image.open(EXAMPLES / f"{names[number % len(names)]}.jpg") as picture:

@@ -72,7 +72,6 @@ class CountingEncoders(PhotographEncoder):
         self.go_on.set()
 
     def rendered(self, *arguments: Any, **named: Any) -> Any:
-        """Render as the encoders do."""
         result = self._render(*arguments, **named)
         self.embedded += len(result)
         assert self.go_on.wait(30.0)

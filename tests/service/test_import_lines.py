@@ -102,7 +102,6 @@ def test_same_key_stores_the_plan_once_with_and_without_lines(client: httpx.Clie
 
 @pytest.fixture
 def own(start_app: StartApp, tmp_path: Path) -> Iterator[httpx.Client]:
-    """Yield an app for one test."""
     with start_app(tmp_path / "data") as started:
         yield started
 

@@ -267,6 +267,5 @@ def own_database(postgres: PostgresServer) -> str:
 
 
 def run(postgres: PostgresServer, program: str, *arguments: str) -> None:
-    """Run one of PostgreSQL's programs."""
     done = subprocess.run([postgres.programs / program, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -287,7 +287,6 @@ def test_idempotency_key_covers_the_options(client: httpx.Client) -> None:
 
 @pytest.fixture(scope="module")
 def strict(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Start an app with low limits."""
     limits: dict[str, Any] = {
         "max_unpacked_bytes": 1_000_000,
         "max_entities": 3000,

@@ -69,7 +69,6 @@ def _answers(client: httpx.Client) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    """Worker processes of a service."""
     listing = subprocess.run(
         ["ps", "-ww", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
     ).stdout

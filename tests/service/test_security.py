@@ -91,12 +91,10 @@ def make_key(
 
 
 def bearer(key: str) -> dict[str, str]:
-    """Return the header for a key."""
     return {"Authorization": f"Bearer {key}"}
 
 
 def id_of(key: str) -> str:
-    """Return the id in a key's text."""
     return key.split("_")[1]
 
 

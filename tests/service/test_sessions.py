@@ -24,7 +24,6 @@ from tests.service.test_venue_queries import venue_of
 
 
 def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
-    """Begin a session; return its id."""
     answer = client.post("/sessions", json={"floorplan_id": plan_id} | fields)
     assert answer.status_code == 201, answer.text
     assert answer.headers["location"] == f"/sessions/{answer.json()['id']}"
@@ -32,7 +31,6 @@ def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
 
 
 def send(client: httpx.Client, session_id: str, picture: bytes, **fields: Any) -> httpx.Response:
-    """Send a photograph."""
     data = {name: str(value) for name, value in fields.items()}
     files = {"photo": ("p.jpg", picture, "image/jpeg")}
     return client.post(f"/sessions/{session_id}/photographs", data=data, files=files)

@@ -59,7 +59,6 @@ def _url(folder: Path) -> str:
 
 
 def _add(store: Store, plan_id: str = "a" * 32, *, tenant: str = "default", name: str = "Flat 3") -> str:
-    """Add a plan and return the id of its revision."""
     plan = FloorPlan.from_dict({**FLAT, "name": name})
     return store.plans.add(tenant, plan_id, NewPlan(plan, Original(b"{}")), limit=100).revision_id
 

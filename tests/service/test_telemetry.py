@@ -67,7 +67,6 @@ class Log:
 
 @pytest.fixture
 def log() -> Iterator[Log]:
-    """Log lines of the test."""
     attached = Log()
     logger = logging.getLogger(LOGGER_NAME)
     # Another test's app can have set another level for this process.

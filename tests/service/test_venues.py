@@ -20,7 +20,6 @@ ANCHOR = {"latitude": 51.7546, "longitude": -1.2545, "altitude_m": 61.0, "north_
 
 @pytest.fixture(scope="module")
 def plans(client: httpx.Client) -> list[str]:
-    """Upload three plans and return their ids."""
     return [upload(client, FLAT | {"name": f"Flat {number}"}) for number in range(3)]
 
 

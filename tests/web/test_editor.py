@@ -16,7 +16,6 @@ from tests.web.test_answer import _assert_accessible
 
 
 def _click(page: Page, x_m: float, y_m: float) -> None:
-    """Click a place on the plan."""
     page.mouse.click(*_on_screen(page, x_m, y_m))
 
 
