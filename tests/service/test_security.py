@@ -673,9 +673,9 @@ def test_remote_requests_without_keys_are_refused(
     ],
 )
 def test_foreign_pages_without_keys_are_refused(
-    anonymous: httpx.Client, method: str, headers: dict[str, str], status: int
+    client: httpx.Client, method: str, headers: dict[str, str], status: int
 ) -> None:
-    response = anonymous.request(method, "/floorplans", headers=headers, json=FLAT if method == "POST" else None)
+    response = client.request(method, "/floorplans", headers=headers, json=FLAT if method == "POST" else None)
     assert response.status_code == status
     if status == 403:
         assert_problem(response, 403, "exposed-without-keys")
@@ -704,12 +704,6 @@ def test_impossible_allowed_host_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="neither a bare name or address nor"):
         Settings(allowed_hosts=f"localhost,{name}")
     Settings(allowed_hosts="plans.example, 192.0.2.7,2001:db8::1,*")
-
-
-@pytest.fixture(scope="module")
-def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data")) as client:
-        yield client
 
 
 @pytest.mark.parametrize(
