@@ -8,7 +8,7 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image, ImageDraw
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
+from lalaloc_core.importers import ImportOptions, import_plan
 from tests.importers.conftest import dxf_file, shapes
 from tests.painted import picture_file
 
@@ -77,16 +77,10 @@ def test_storeys_of_a_vector_drawing_are_named_with_their_crop(format: str):
     assert room.area == pytest.approx(14.0, abs=0.1)
 
 
-def _read_part(crop: str) -> ImportedPlan:
-    return import_plan(
-        picture_file(_storeys()), ImportOptions.from_text({"crop": crop, "metres_per_pixel": str(SCALE)})
-    )
-
-
 @pytest.mark.parametrize(("crop", "message"), [
     ("1,2,3", "crop has 3 numbers"), ("5,5,5,9", "two opposite corners"), ("0,0,20,20", "has at least 64 x 64"),
     ("900,0,1200,300", "has at least 64 x 64"), ("a,0,1,1", "must be a number"),
 ])  # fmt: skip
 def test_invalid_crop_is_rejected(crop: str, message: str):
     with pytest.raises(InvalidFloorPlanError, match=message):
-        _read_part(crop)
+        import_plan(picture_file(_storeys()), ImportOptions.from_text({"crop": crop, "metres_per_pixel": str(SCALE)}))
