@@ -6,7 +6,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import onnx
@@ -63,11 +63,6 @@ def exported_bundle(folder: Path, config: TrainConfig) -> Bundle:
 def bundle_copy(tiny_bundle: Path, tmp_path: Path) -> Path:
     """Copy of the tiny bundle that a test may damage."""
     return Path(shutil.copytree(tiny_bundle, tmp_path / "copy"))
-
-
-def edit_manifest(folder: Path, **changes: Any) -> None:
-    path = folder / MANIFEST_NAME
-    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
 
 
 class TestExport:
@@ -224,7 +219,8 @@ class TestReading:
         ],
     )
     def test_manifest_with_invalid_entries_is_refused(self, bundle_copy: Path, changes: dict) -> None:
-        edit_manifest(bundle_copy, **changes)
+        path = bundle_copy / MANIFEST_NAME
+        path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
         with pytest.raises(BundleError):
             Bundle.open(bundle_copy)
 

@@ -30,10 +30,6 @@ def refused(document: Any, limits: PlanLimits | None = None) -> InvalidFloorPlan
     return caught.value
 
 
-def with_polygon(polygon: Any) -> dict[str, Any]:
-    return plan_document(rectangle(2.0, 2.0, corner=(50.0, 0.0)), polygon)
-
-
 def test_native_format_is_read() -> None:
     plan = FloorPlan.from_json(json.dumps(EXAMPLE))
     assert (plan.name, plan.camera_height_m, plan.warnings) == ("Flat 3", 1.5, ())
@@ -95,7 +91,7 @@ def test_unnamed_room_gets_a_number() -> None:
     ],
 )
 def test_bad_polygon_error_names_the_room(polygon: Any, reason: str) -> None:
-    error = refused(with_polygon(polygon))
+    error = refused(plan_document(rectangle(2.0, 2.0, corner=(50.0, 0.0)), polygon))
     assert error.room == "room 2"
     assert reason in error.reason
     assert "room 2" in str(error)

@@ -43,12 +43,8 @@ def pinned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder, out
 
 
-def _document(out: Path) -> Any:
-    return json.loads((out / "pins.json").read_text())
-
-
 def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Path]) -> None:
-    pins = _document(pinned[1])
+    pins = json.loads((pinned[1] / "pins.json").read_text())
     rooms = {entry["photograph"]: entry["room"] for entry in pins["photographs"]}
     assert rooms == {
         "broken.jpg": None,

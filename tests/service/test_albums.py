@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import threading
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -333,24 +332,17 @@ def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[by
 
 
 @pytest.mark.slow
-def test_features_take_the_place_of_photographs(
-    client: httpx.Client, plan_id: str, pictures: list[bytes], features_of: Callable[[bytes], bytes]
-) -> None:
+def test_features_take_the_place_of_photographs(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    bundle = Bundle.open(default_bundle())
+    photograph = open_photograph(pictures[0], sphere_size=sphere_size(bundle.manifest))
+    features = FeatureEncoder(bundle, threads=1).features(photograph)
     album_id = create(client, plan_id)
-    (line,) = add(client, album_id, [features_of(pictures[0])], "features")
+    (line,) = add(client, album_id, [features], "features")
     assert (line["status"], line["photograph"]["view"]["width"]) == (201, None)
     wait_until_solved(client, album_id)
     assert photographs(client, album_id)[0]["pin"]["place"] is not None
     (damaged,) = add(client, album_id, [b"LLFT"], "features")
     assert damaged["problem"]["type"] == "urn:lalaloc:problem:invalid-features"
-
-
-@pytest.fixture(scope="module")
-def features_of() -> Callable[[bytes], bytes]:
-    """Return the encoder of a device."""
-    bundle = Bundle.open(default_bundle())
-    encoder, size = FeatureEncoder(bundle, threads=1), sphere_size(bundle.manifest)
-    return lambda content: encoder.features(open_photograph(content, sphere_size=size))
 
 
 def test_stored_album_has_no_picture_position_or_owner(

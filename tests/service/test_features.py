@@ -315,13 +315,6 @@ def _check_absent(mark: bytes, folder: Path, traces: list[bytes]) -> None:
         assert not any(form in content for form in forms), name
 
 
-@pytest.fixture
-def own_bundle(tmp_path: Path) -> Path:
-    folder = tmp_path / "bundle"
-    shutil.copytree(default_bundle(), folder)
-    return folder
-
-
 def test_range_of_a_file_of_the_model_resumes_it(client: httpx.Client) -> None:
     url = "/model/view_encoder.onnx"
     whole = client.get(url)
@@ -368,7 +361,8 @@ def test_packed_networks_of_a_phone_are_small(client: httpx.Client) -> None:
         assert client.get(f"/model/{name}.planes.gz").status_code == 404
 
 
-def test_file_of_the_model_that_changed_is_a_503(start_app: StartApp, tmp_path: Path, own_bundle: Path) -> None:
+def test_file_of_the_model_that_changed_is_a_503(start_app: StartApp, tmp_path: Path) -> None:
+    own_bundle = shutil.copytree(default_bundle(), tmp_path / "bundle")
     with start_app(tmp_path, bundle=own_bundle, request_deadline_s=90.0) as client:
         path = own_bundle / "view_encoder.onnx"
         os.truncate(path, path.stat().st_size // 2)

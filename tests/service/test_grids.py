@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -667,12 +666,8 @@ def test_profile_model_needs_one_grid_for_all_heights(
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         for height_m in (1.6, 1.7, 1.8, 1.9):
-            _localise_at(client, plan_id, sphere, height_m)
+            answer = localise(client, plan_id, sphere, refine="none", camera_height_m=height_m)
+            assert answer.json()["camera_height_m"] == height_m
     with start_app(tmp_path) as client:
         sha256 = client.get("/readyz").json()["model"]["sha256"]
     assert {height for _, height in app_store.grids.poses(sha256, 0.5)} == {1500}
-
-
-def _localise_at(client: httpx.Client, plan_id: str, sphere: bytes, height_m: float) -> None:
-    answer = localise(client, plan_id, sphere, refine="none", camera_height_m=height_m)
-    assert answer.json()["camera_height_m"] == height_m
