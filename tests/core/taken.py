@@ -36,13 +36,8 @@ def take(
     column = (azimuth / TWO_PI + 0.5) % 1.0 * width - 0.5
     row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height - 0.5
     wrapped = np.concatenate([sphere[:, -1:], sphere, sphere[:, :1]], axis=1)
-    return cv2.remap(
-        wrapped,
-        (column + 1.0).astype(np.float32),
-        row.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    map_x, map_y = (column + 1.0).astype(np.float32), row.astype(np.float32)
+    return cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def exif_of(tags: dict[Any, Any]) -> Image.Exif:

@@ -77,13 +77,8 @@ def test_entry_is_small_and_read_as_it_was(bundle: Bundle, photographs: list[Alb
         assert (read.id, read.taken) == (photograph.id, photograph.taken)
         np.testing.assert_array_equal(read.colours, photograph.colours)
         np.testing.assert_array_equal(read.descriptors.bits, photograph.descriptors.bits)
-        assert read.photograph.features is not None
-        assert photograph.photograph.features is not None
-        np.testing.assert_allclose(
-            read.photograph.features.outputs["log_profile"],
-            photograph.photograph.features.outputs["log_profile"],
-            rtol=1e-6,
-        )
+        again, first = (present(row.photograph.features).outputs["log_profile"] for row in (read, photograph))
+        np.testing.assert_allclose(again, first, rtol=1e-6)
     assert len(photographs[-1].descriptors) > 50
     assert not photographs[0].photograph.features or not photographs[0].photograph.features.outputs["ring"].any()
 
@@ -227,11 +222,8 @@ def test_photograph_that_shows_no_wall_is_not_sure(
     assert phone.photograph.features is not None
     outputs = dict(phone.photograph.features.outputs)
     outputs["seen"] = np.full_like(outputs["seen"], 0.0)
-    blind = replace(
-        phone,
-        id="blind",
-        photograph=replace(phone.photograph, features=replace(phone.photograph.features, outputs=outputs)),
-    )
+    features = replace(phone.photograph.features, outputs=outputs)
+    blind = replace(phone, id="blind", photograph=replace(phone.photograph, features=features))
     pin = solve_album(ground, encoder, [blind]).pins[0]
     assert pin.state in ("set_aside", "uncertain")
     assert pin.within_1m < 0.2

@@ -71,11 +71,8 @@ def house(tmp_path: Path) -> Path:
 class TestReading:
     def test_every_fifth_seed_validates_and_the_others_train(self, rooms: Path) -> None:
         dataset = PosedSpheres(rooms)
-        assert [list(dataset.scenes(split)) for split in ("train", "validation", "test")] == [
-            ["2003", "2004"],
-            ["2005"],
-            [],
-        ]
+        scenes = [list(dataset.scenes(split)) for split in ("train", "validation", "test")]
+        assert scenes == [["2003", "2004"], ["2005"], []]
 
     def test_house_validates_only(self, house: Path) -> None:
         dataset = PosedSpheres(house)

@@ -319,15 +319,8 @@ class TestRuns:
         nothing = Checkpoint(stage="image", config=config, weights={})
         monkeypatch.setattr(run, "run_stage", lambda *_, **__: nothing)
         for resume, expected in ((False, 1), (True, 1)):
-            run.train_stage(
-                "image",
-                config,
-                folder,
-                device=CPU,
-                data=dataclasses.replace(FEW, validation_scenes=0),
-                workers=0,
-                resume=resume,
-            )
+            data = dataclasses.replace(FEW, validation_scenes=0)
+            run.train_stage("image", config, folder, device=CPU, data=data, workers=0, resume=resume)
             assert len(loaded) == expected
 
     @pytest.mark.slow
@@ -400,11 +393,8 @@ class TestWarmStart:
         start = load_warm_start(default_bundle(), "image", trunk)
         start.load_into({"image_encoder": encoder})
         trained = start.checkpoint.weights["image_encoder"]
-        loaded = {
-            key: value
-            for key, value in encoder.state_dict().items()
-            if not key.startswith(("to_profile.", "to_edges."))
-        }
+        untrained = ("to_profile.", "to_edges.")
+        loaded = {key: value for key, value in encoder.state_dict().items() if not key.startswith(untrained)}
         assert all(torch.equal(value, trained[key]) for key, value in loaded.items())
 
     @pytest.mark.slow
@@ -474,10 +464,8 @@ class TestWarmStart:
         assert Checkpoint.load(tmp_path / "mean" / "image.pt").step == 1
         assert main([*mean, "--share", "2"]) == 2
         assert main(["lab", "train", "layout", "--out", str(tmp_path), "--set", "image.batch"]) == 2
-        assert (
-            main(["lab", "export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"])
-            == 0
-        )
+        export = ["lab", "export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"]
+        assert main(export) == 0
         assert Bundle.open(tmp_path / "b").manifest.training["image"]["checkpoint"] == "last"
 
 

@@ -65,11 +65,8 @@ def two_rooms(
 ) -> FloorPlan:
     """Return two rooms side by side from `x_m`, with those of a door between them and a window that are of `kinds`."""
     (first, second), door_m = (x_m, x_m + width_m + 0.1), x_m + width_m + 0.05
-    document = plan_document(
-        rectangle(width_m, depth_m, corner=(first, 0.0)),
-        rectangle(second_m, 3.0, corner=(second, 0.0)),
-        ceiling_m=ceiling_m,
-    )
+    rooms = [rectangle(width_m, depth_m, corner=(first, 0.0)), rectangle(second_m, 3.0, corner=(second, 0.0))]
+    document = plan_document(*rooms, ceiling_m=ceiling_m)
     document["rooms"][0]["type"] = "kitchen"
     document["openings"] = [
         {"kind": "door", "line": [[door_m, 1.0], [door_m, 1.9]]},
