@@ -167,11 +167,8 @@ def test_expired_key_on_the_command_line(store: Store, capsys: pytest.CaptureFix
     assert "no valid key" in capsys.readouterr().err
     assert main(["audit", "export", "--tenant", "t"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(line["action"], line["resource"]) for line in lines] == [
-        ("keys create", old),
-        ("keys rotate", old),
-        ("keys revoke", new),
-    ]
+    changes = [(line["action"], line["resource"]) for line in lines]
+    assert changes == [("keys create", old), ("keys rotate", old), ("keys revoke", new)]
     assert lines[1]["detail"]["successor"] == new
     assert all(line["actor"].startswith("cli:") for line in lines)
 

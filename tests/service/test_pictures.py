@@ -60,10 +60,8 @@ def test_png_contains_the_photograph(client: httpx.Client, flat: str, sphere: by
 
 
 def test_picture_shows_both_by_default(client: httpx.Client, flat: str, sphere: bytes) -> None:
-    classes = {
-        element.get("class")
-        for element in ElementTree.fromstring(request_picture(client, flat, sphere, SVG).text).iter()
-    }
+    drawn = ElementTree.fromstring(request_picture(client, flat, sphere, SVG).text)
+    classes = {element.get("class") for element in drawn.iter()}
     assert {"layout", "camera"} <= classes
 
 

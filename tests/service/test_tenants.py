@@ -70,11 +70,8 @@ def _recounted(store: Store, tenant: str) -> None:
 def test_limits_are_set_and_reset(configured_url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tenants", "limit", "acme", "--stored-bytes", "1000", "--cpu-share", "0.5"]) == 0
     assert main(["tenants", "limit", "acme", "--bytes-in-flight", "2000", "--cpu-share", "default"]) == 0
-    assert capsys.readouterr().out.splitlines()[-3:] == [
-        "stored_bytes: 1000",
-        "bytes_in_flight: 2000",
-        "cpu_share: default",
-    ]
+    printed = capsys.readouterr().out.splitlines()[-3:]
+    assert printed == ["stored_bytes: 1000", "bytes_in_flight: 2000", "cpu_share: default"]
     assert main(["tenants", "list", "--json"]) == 0
     [listed] = json.loads(capsys.readouterr().out)
     limits = {"stored_bytes": 1000, "bytes_in_flight": 2000, "cpu_share": None}

@@ -98,10 +98,8 @@ def test_levels_become_a_venue(client: httpx.Client, make: Callable[[], bytes]) 
     assert (venue["name"], venue["plans"], venue["plans_ready"], venue["anchor"]) == ("Duplex", 2, 2, None)
     entries = plans_of(client, venue["id"])
     assert [entry["level"] for entry in entries] == [0.0, 1.0]
-    assert [entry["name"].casefold().replace("story", "level") for entry in entries] == [
-        "duplex – level 0",
-        "duplex – level 1",
-    ]
+    names = [entry["name"].casefold().replace("story", "level") for entry in entries]
+    assert names == ["duplex – level 0", "duplex – level 1"]
     for number, entry in enumerate(entries):
         plan = client.get(f"/floorplans/{entry['floorplan_id']}").json()
         assert (plan["name"], plan["status"]) == (entry["name"], "ready")
@@ -112,10 +110,8 @@ def test_levels_become_a_venue(client: httpx.Client, make: Callable[[], bytes]) 
 def test_levels_of_a_model_are_searched(client: httpx.Client, sphere: bytes) -> None:
     venue = send(client, ifc_house().content(), name="Haus", ceiling_height_m="2.5").json()
     entries = plans_of(client, venue["id"])
-    assert [(entry["name"], entry["level"], entry["rooms"]) for entry in entries] == [
-        ("Haus – EG", 0.0, 2),
-        ("Haus – Obergeschoss", 1.0, 1),
-    ]
+    found = [(entry["name"], entry["level"], entry["rooms"]) for entry in entries]
+    assert found == [("Haus – EG", 0.0, 2), ("Haus – Obergeschoss", 1.0, 1)]
     query = {"venue_id": venue["id"], "refine": "none"}
     answer = client.post("/localise", data=query, files={"photo": ("p.jpg", sphere, "image/jpeg")}).json()
     assert answer["floorplan_id"] in {entry["floorplan_id"] for entry in entries}

@@ -88,10 +88,8 @@ def test_put_replaces_and_patch_changes(client: httpx.Client, plans: list[str]) 
     changed = client.patch(path, json={"plans": [member(plans[0], 3), member(plans[2])], "remove": [plans[1]]})
     assert changed.status_code == 200, changed.text
     assert (changed.json()["name"], changed.json()["anchor"]) == ("old", ANCHOR)
-    assert {entry["floorplan_id"]: entry["level"] for entry in plans_of(client, venue["id"])} == {
-        plans[0]: 3,
-        plans[2]: 0,
-    }
+    levels = {entry["floorplan_id"]: entry["level"] for entry in plans_of(client, venue["id"])}
+    assert levels == {plans[0]: 3, plans[2]: 0}
     assert client.patch(path, json={"anchor": None}).json()["anchor"] is None
     assert client.patch(path, json={"name": "new"}).json()["plans"] == 2
     replaced = client.put(path, json={"plans": [member(plans[1])]}).json()
