@@ -262,11 +262,8 @@ def test_batch_yields_an_answer_per_photograph(service: Any, sphere: bytes, tmp_
     (tmp_path / "hall.jpg").write_bytes(sphere)
     plan = service.wait_until_ready(service.upload_floorplan(FLAT).id, timeout_s=60.0)
     answers = list(service.localise_batch(plan.id, [tmp_path / "hall.jpg", b"no picture", sphere], refine="none"))
-    assert [(answer.index, answer.name, answer.status) for answer in answers] == [
-        (0, "hall.jpg", 200),
-        (1, "photo", 422),
-        (2, "photo", 200),
-    ]
+    found = [(answer.index, answer.name, answer.status) for answer in answers]
+    assert found == [(0, "hall.jpg", 200), (1, "photo", 422), (2, "photo", 200)]
     assert answers[0].result().floorplan_id == plan.id
     with pytest.raises(InvalidError) as caught:
         answers[1].result()

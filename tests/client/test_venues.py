@@ -22,10 +22,8 @@ def test_venue_is_stored_changed_and_deleted(service: Any) -> None:
     assert service.venue(made.id) == made
     assert made.id in [venue.id for venue in service.venues("mill lane", page_size=1)]
     listed = service.venue_plans(made.id, page_size=1)
-    assert [(plan.floorplan_id, plan.level, plan.name) for plan in listed] == [
-        (plans[0], 0.0, "Flat 0"),
-        (plans[1], 1.0, "Flat 1"),
-    ]
+    found = [(plan.floorplan_id, plan.level, plan.name) for plan in listed]
+    assert found == [(plans[0], 0.0, "Flat 0"), (plans[1], 1.0, "Flat 1")]
     assert [plan.floorplan_id for plan in service.venue_plans(made.id, level=1)] == [plans[1]]
     changed = service.change_venue(
         made.id, plans=[VenuePlan(plans[2], 5, "attic")], remove=[plans[0]], if_match=made.etag

@@ -37,12 +37,8 @@ def camera(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     # Each frame four times: the browser plays 30 frames per second, 22° of a turn.
     film.write_bytes(b"".join(frame for frame in frames for _ in range(4)))
     path = next(filter(None, map(shutil.which, _BROWSERS)))
-    arguments = [
-        *_ARGUMENTS,
-        "--use-fake-device-for-media-stream",
-        "--use-fake-ui-for-media-stream",
-        f"--use-file-for-fake-video-capture={film}",
-    ]
+    fakes = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
+    arguments = [*_ARGUMENTS, *fakes, f"--use-file-for-fake-video-capture={film}"]
     launched = browser.browser_type.launch(executable_path=path, args=arguments)
     yield launched
     launched.close()
@@ -50,15 +46,8 @@ def camera(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 @pytest.fixture
 def phone(camera: Browser, service: httpx.Client) -> Iterator[Visit]:
-    yield from visit(
-        camera,
-        service,
-        viewport=PHONE,
-        has_touch=True,
-        is_mobile=True,
-        permissions=PERMISSIONS,
-        reduced_motion="reduce",
-    )
+    options = {"has_touch": True, "is_mobile": True, "permissions": PERMISSIONS, "reduced_motion": "reduce"}
+    yield from visit(camera, service, viewport=PHONE, **options)
 
 
 def _open(visited: Visit) -> Page:
