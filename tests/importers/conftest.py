@@ -86,6 +86,10 @@ def lines(document: dict, kind: str) -> list[shapely.LineString]:
     return [shapely.LineString(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == kind]
 
 
+def names_and_types(plan: ImportedPlan) -> list[tuple[str, str]]:
+    return [(room["name"], room["type"]) for room in plan.document["rooms"]]
+
+
 def assert_same_plan(found: ImportedPlan, expected: dict, *, within_m: float = 2e-3, shift: bool = False) -> None:
     """Compare rooms, holes and openings in any order; with `shift`, after moving the plan as a whole."""
     found_rooms, expected_rooms = shapes(found.document), shapes(expected)
