@@ -98,6 +98,11 @@ def id_of(key: str) -> str:
     return key.split("_")[1]
 
 
+def _settings(folder: Path, database_of: DatabaseOf, bundle: Path, **more: Any) -> Settings:
+    url = database_of(folder)
+    return Settings(data_dir=folder, database_url=url, bundle=bundle, workers=0, log_level="error", **more)
+
+
 @dataclass(frozen=True)
 class Guarded:
     """Running app with keys and a plan of the tenant "ours"."""
@@ -279,15 +284,7 @@ def test_redirect_names_no_host(client: httpx.Client) -> None:
 
 
 def test_route_without_a_scope_is_closed(tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path) -> None:
-    settings = Settings(
-        data_dir=tmp_path,
-        database_url=database_of(tmp_path),
-        bundle=tiny_bundle,
-        workers=0,
-        log_level="error",
-        api_keys=True,
-    )
-    app = create_app(settings)
+    app = create_app(_settings(tmp_path, database_of, tiny_bundle, api_keys=True))
     app.get("/later")(lambda: "forgotten")
     with serve(app) as base_url:
         store = Store(database_of(tmp_path))
@@ -624,15 +621,7 @@ def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | No
 def test_remote_requests_without_keys_are_refused(
     tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, options: dict[str, Any], status: int
 ) -> None:
-    settings = Settings(
-        data_dir=tmp_path,
-        database_url=database_of(tmp_path),
-        bundle=tiny_bundle,
-        workers=0,
-        log_level="error",
-        **options,
-    )
-    app = create_app(settings)
+    app = create_app(_settings(tmp_path, database_of, tiny_bundle, **options))
 
     async def from_network(scope: Scope, receive: Receive, send: Send) -> None:
         # Pretend that the connection came over the network.
