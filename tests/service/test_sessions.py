@@ -30,6 +30,10 @@ def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
     return answer.json()["id"]
 
 
+def _moved(covariance: str) -> dict[str, Any]:
+    return {"forward_m": 1, "turn_deg": 0, "covariance": covariance}
+
+
 def send(client: httpx.Client, session_id: str, picture: bytes, **fields: Any) -> httpx.Response:
     data = {name: str(value) for name, value in fields.items()}
     files = {"photo": ("p.jpg", picture, "image/jpeg")}
@@ -77,27 +81,15 @@ def test_photograph_out_of_order_is_refused(client: httpx.Client, flat: str, sph
         ({"forward_m": 40, "right_m": 40, "turn_deg": 0}, "invalid-motion", "the limit is 50 m"),
         ({"forward_m": 1, "turn_deg": 0, "forward_std_m": -1}, "invalid-motion", "forward_std_m is -1; it must not be"),
         ({"forward_m": 1, "turn_deg": 0, "right_std_m": 60}, "invalid-motion", "of right_m is 60 m; the limit is 50 m"),
+        (_moved(json.dumps([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])), "invalid-motion", "a variance must not be negative"),
         (
-            {"forward_m": 1, "turn_deg": 0, "covariance": json.dumps([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])},
-            "invalid-motion",
-            "a variance must not be negative",
-        ),
-        (
-            {"forward_m": 1, "turn_deg": 0, "covariance": "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"},
+            _moved("[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"),
             "invalid-motion",
             "not positive semidefinite: the smallest eigenvalue of its correlations is -1",
         ),
-        (
-            {"forward_m": 1, "turn_deg": 0, "covariance": "[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]"},
-            "invalid-motion",
-            "not symmetric",
-        ),
-        (
-            {"forward_m": 1, "turn_deg": 0, "covariance": "[[NaN, 0, 0], [0, 1, 0], [0, 0, 1]]"},
-            "invalid-request",
-            "must be finite",
-        ),
-        ({"forward_m": 1, "turn_deg": 0, "covariance": "[[1]]"}, "invalid-request", "covariance"),
+        (_moved("[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]"), "invalid-motion", "not symmetric"),
+        (_moved("[[NaN, 0, 0], [0, 1, 0], [0, 0, 1]]"), "invalid-request", "must be finite"),
+        (_moved("[[1]]"), "invalid-request", "covariance"),
         ({"forward_m": 1}, "invalid-request", "forward_m and turn_deg are needed together"),
         ({"turn_std_deg": 1}, "invalid-request", "need forward_m and turn_deg"),
         ({"number": 0}, "invalid-request", "must be at least 1"),
