@@ -87,15 +87,9 @@ def plan(**changes: Any) -> FloorPlan:
     return FloorPlan.from_dict(document | changes)
 
 
-def camera(camera_height_m: float) -> Camera:
-    return Camera(
-        name="",
-        position_m=np.array([2.0, 2.0]),
-        room_index=0,
-        heading=0.0,
-        camera_height_m=camera_height_m,
-        photographs={},
-    )
+def camera(height_m: float) -> Camera:
+    middle_m = np.array([2.0, 2.0])
+    return Camera(name="", position_m=middle_m, room_index=0, heading=0.0, camera_height_m=height_m, photographs={})
 
 
 class TestLabels:
@@ -359,13 +353,9 @@ class TestWarmStart:
         trained(run, tiny_bundle)
         child = export_run(run, tmp_path / "child", name="child", version="2")
         entry, before = child.manifest.training["image"], parent.manifest.training["image"]
-        assert entry["begun_from"] == {
-            "name": "tiny",
-            "version": "test",
-            "sha256": parent.sha256,
-            "minutes_in_all": before["minutes"],
-            "spheres_in_all": before["spheres"],
-        }
+        ancestor = {"name": "tiny", "version": "test", "sha256": parent.sha256}
+        totals = {"minutes_in_all": before["minutes"], "spheres_in_all": before["spheres"]}
+        assert entry["begun_from"] == ancestor | totals
         batch = SHORT_RING.image.batch
         assert entry["spheres_in_all"] == before["spheres"] + entry["spheres"]
         assert entry["spheres"] == entry["steps"] * batch
@@ -440,19 +430,7 @@ class TestWarmStart:
 
     @pytest.mark.slow
     def test_command_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
-        words = [
-            "lab",
-            "train",
-            "image",
-            "--preset",
-            "tiny",
-            "--workers",
-            "0",
-            "--device",
-            "cpu",
-            "--out",
-            str(tmp_path),
-        ]
+        words = f"lab train image --preset tiny --workers 0 --device cpu --out {tmp_path}".split()
         words += ["--from", str(tiny_bundle), "--set", "image.uses_per_sphere=2", "--set", "image.batch=4"]
         words += ["--validation-homes", "1"]
         assert main([*words, "--steps", "1"]) == 0
