@@ -351,13 +351,9 @@ def test_storeys_that_were_confused_are_exchanged() -> None:
     alone[0, 4:] = -6.0
     walk = np.full((rooms + 1, rooms + 1), math.log(1e-9))
     walk[:4, :4], walk[4:8, 4:8] = math.log(0.25), math.log(0.25)
+    follows, storeys = np.arange(count) > 0, (np.arange(4), np.arange(4, 8))
     evidence = RoomEvidence(
-        alone=alone,
-        walk=walk,
-        follows=np.arange(count) > 0,
-        pairs=np.zeros((count, count)),
-        expected=None,
-        storeys=(np.arange(4), np.arange(4, 8)),
+        alone=alone, walk=walk, follows=follows, pairs=np.zeros((count, count)), expected=None, storeys=storeys
     )
     found = [assign_rooms(evidence, seed)[:, 4:8].sum(axis=1).mean() for seed in range(4)]
     # By the sum over both: -6 for the first photograph against 15 times 0.6.

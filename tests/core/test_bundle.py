@@ -166,11 +166,8 @@ class TestExport:
         scene = scene_of(crooked_flat(), 2, 0)
         profile = torch.empty(2, 64).uniform_(0.5, 5.0)
         heights = (torch.full((2,), 1.5), torch.full((2,), 2.5))
-        np.testing.assert_allclose(
-            encoders.layouts.latents(profile.numpy(), *(h.numpy() for h in heights)),
-            optimiser.encoder(profile, *heights).numpy(),
-            atol=1e-4,
-        )
+        latents = encoders.layouts.latents(profile.numpy(), *(h.numpy() for h in heights))
+        np.testing.assert_allclose(latents, optimiser.encoder(profile, *heights).numpy(), atol=1e-4)
         assert encoders.layouts.poses(scene.plan, scene.poses, scene.heading, 1.5)[0].shape == (2, 128)
 
 

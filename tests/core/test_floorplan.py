@@ -16,12 +16,8 @@ from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from tests.strategies import plan_document, plan_of, plans, rectangle, room_polygons
 
-EXAMPLE = {
-    "name": "Flat 3",
-    "ceiling_height_m": 2.5,
-    "camera_height_m": 1.5,
-    "rooms": [{"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.4}],
-}
+_KITCHEN = {"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.4}
+EXAMPLE = {"name": "Flat 3", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "rooms": [_KITCHEN]}
 
 
 def refused(document: Any, limits: PlanLimits | None = None) -> InvalidFloorPlanError:

@@ -111,14 +111,9 @@ def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
     log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
     kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
     types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
-    return query_of(
-        log_m,
-        0.05,
-        kind,
-        hypotheses,
-        ceiling=PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
-        room_type=PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
-    )
+    ceiling = PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05))
+    room_type = PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types)
+    return query_of(log_m, 0.05, kind, hypotheses, ceiling=ceiling, room_type=room_type)
 
 
 def index_of(parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:

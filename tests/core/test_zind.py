@@ -242,13 +242,8 @@ class TestRooms:
     def test_unusual_inner_walls_are_cut_or_left_out(
         self, tmp_path: Path, internal: Any, area_m2: float, warning: str | None
     ) -> None:
-        write_home(
-            tmp_path / "0002",
-            plan_of(rectangle(5.0, 4.0)),
-            [TrueSphere(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)],
-            np.random.default_rng(3),
-            (4, 8),
-        )
+        true_sphere = TrueSphere(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)
+        write_home(tmp_path / "0002", plan_of(rectangle(5.0, 4.0)), [true_sphere], np.random.default_rng(3), (4, 8))
 
         def change(document: dict[str, Any]) -> None:
             layout = sphere(document)["layout_complete"]
