@@ -113,13 +113,8 @@ def postgres_server(programs: Path) -> Iterator[PostgresServer]:
         try:
             yield server
         finally:
-            subprocess.run(
-                [server.programs / "pg_ctl", "stop", "-m", "immediate", "-D", folder],
-                user=_user(),
-                cwd="/",
-                capture_output=True,
-                check=False,
-            )
+            stop = [server.programs / "pg_ctl", "stop", "-m", "immediate", "-D", folder]
+            subprocess.run(stop, user=_user(), cwd="/", capture_output=True, check=False)
 
 
 def _run(command: list[str | Path]) -> None:

@@ -379,14 +379,9 @@ def test_albums_of_another_tenant_do_not_exist(
         album_id = create(client, upload(client, HOME))
         (line,) = add(client, album_id, pictures[:1])
         path = f"/albums/{album_id}/photographs/{line['photograph']['id']}"
-        for method, address in (
-            ("GET", f"/albums/{album_id}"),
-            ("DELETE", f"/albums/{album_id}"),
-            ("GET", f"/albums/{album_id}/events"),
-            ("GET", f"/albums/{album_id}/photographs"),
-            ("GET", path),
-            ("DELETE", path),
-        ):
+        album = f"/albums/{album_id}"
+        both = [(method, address) for method in ("GET", "DELETE") for address in (album, path)]
+        for method, address in (*both, ("GET", f"{album}/events"), ("GET", f"{album}/photographs")):
             assert_problem(client.request(method, address, headers=other), 404, "unknown-album")
             assert_problem(client.request(method, address, headers=reader), 403, "insufficient-scope")
         assert client.get("/albums", headers=other).json()["albums"] == []

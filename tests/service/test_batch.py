@@ -32,12 +32,8 @@ def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
 
 def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, flat: str, sphere: bytes) -> None:
     lines = lines_of(ask(client, flat, [sphere, b"no picture", bytes(500_001), sphere], heading_deg="90"))
-    assert [(line["index"], line["name"], line["status"]) for line in lines] == [
-        (0, "0.jpg", 200),
-        (1, "1.jpg", 422),
-        (2, "2.jpg", 413),
-        (3, "3.jpg", 200),
-    ]
+    found = [(line["index"], line["name"], line["status"]) for line in lines]
+    assert found == [(0, "0.jpg", 200), (1, "1.jpg", 422), (2, "2.jpg", 413), (3, "3.jpg", 200)]
     assert lines[1]["problem"]["type"] == "urn:lalaloc:problem:invalid-photograph"
     assert "LALALOC_MAX_PHOTOGRAPH_BYTES" in lines[2]["problem"]["detail"]
     alone = localise(client, flat, sphere, refine="none", heading_deg=90).json()

@@ -172,14 +172,9 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
             return True
 
         async def read() -> list[bytes]:
+            look, ended = partial(plan_look, runtime.store, runtime.grids), PlanEvent(status="deleted")
             events = ProgressEvents(
-                partial(plan_look, runtime.store, runtime.grids),
-                PlanEvent(status="deleted"),
-                PLAN_ENDS,
-                runtime.admission,
-                runtime.reads,
-                max_s=0.5,
-                heartbeat_s=0.05,
+                look, ended, PLAN_ENDS, runtime.admission, runtime.reads, max_s=0.5, heartbeat_s=0.05
             )
             return [chunk async for chunk in events.stream(plan_id, authorised)]
 

@@ -64,11 +64,10 @@ def _same(first: httpx.Response, again: httpx.Response) -> bool:
     assert "idempotency-replayed" not in first.headers
     assert again.headers["idempotency-replayed"] == "true"
     names = ("content-type", "location", "etag")
-    return (first.status_code, first.content, [first.headers.get(name) for name in names]) == (
-        again.status_code,
-        again.content,
-        [again.headers.get(name) for name in names],
+    kept, repeated = (
+        (answer.status_code, answer.content, [answer.headers.get(name) for name in names]) for answer in (first, again)
     )
+    return kept == repeated
 
 
 @pytest.fixture
@@ -216,13 +215,8 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
     with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
         plan_id = upload(client, hall, wait=False)
         # The query waits for the plan's grid.
-        query = client.build_request(
-            "POST",
-            "/localise",
-            data={"floorplan_id": plan_id, "refine": "none"},
-            files={"photo": ("p.jpg", sphere)},
-            headers=_keyed("a"),
-        )
+        form: Any = {"data": {"floorplan_id": plan_id, "refine": "none"}, "files": {"photo": ("p.jpg", sphere)}}
+        query = client.build_request("POST", "/localise", headers=_keyed("a"), **form)
         body = query.read()
         head = b"".join(name + b": " + value + b"\r\n" for name, value in query.headers.raw)
         with socket.create_connection((client.base_url.host, client.base_url.port or 0)) as connection:

@@ -60,13 +60,9 @@ class NodeIssuer:
     def __init__(self, port: int, *keys: RSAKey) -> None:
         self.url = f"http://127.0.0.1:{port}"
         self.fetched = 0
+        command = ["node", "issuer.mjs", str(port)]
         self._process = subprocess.Popen(
-            ["node", "issuer.mjs", str(port)],
-            cwd=ISSUER,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            command, cwd=ISSUER, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"keys": [key.as_dict(private=True) for key in keys]}))

@@ -92,12 +92,8 @@ def test_two_replicas_act_as_one_service(
 
 @pytest.mark.slow
 def test_replicas_answer_the_same_album(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
-    shared: dict[str, Any] = {
-        "database_url": postgres.new_database(),
-        "bundle": default_bundle(),
-        "request_deadline_s": 90.0,
-        "sweep_s": 0.2,
-    }
+    shared: dict[str, Any] = {"bundle": default_bundle(), "request_deadline_s": 90.0, "sweep_s": 0.2}
+    shared["database_url"] = postgres.new_database()
     pictures = [(albums.EXAMPLES / name).read_bytes() for name in albums.NAMES[:3]]
     with ExitStack() as second, start_app(tmp_path / "a", **shared) as a:
         b = second.enter_context(start_app(tmp_path / "b", **shared))

@@ -48,12 +48,8 @@ def caddy(folder: Path, upstream: str) -> Iterator[Proxy]:
     }
     log = folder / "caddy.log"
     with log.open("wb") as output:
-        process = subprocess.Popen(
-            [program, "run", "--config", str(CONFIGURATION), "--adapter", "caddyfile"],
-            env=environment,
-            stdout=output,
-            stderr=output,
-        )
+        command = [program, "run", "--config", str(CONFIGURATION), "--adapter", "caddyfile"]
+        process = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
     root = folder / "caddy" / "pki" / "authorities" / "local" / "root.crt"
     try:
         wait_for(lambda: process.poll() is not None or (root.exists() and _has_certificate(secure, root)))

@@ -61,11 +61,8 @@ def test_plans_of_a_venue_are_paged_by_level(client: httpx.Client, plans: list[s
     members = [member(plans[0], 2, name="penthouse"), member(plans[1], -1), member(plans[2], 0.5)]
     venue = make(client, *members)
     found = plans_of(client, venue["id"], limit=1)
-    assert [(entry["floorplan_id"], entry["level"], entry["name"]) for entry in found] == [
-        (plans[1], -1.0, "Flat 1"),
-        (plans[2], 0.5, "Flat 2"),
-        (plans[0], 2.0, "penthouse"),
-    ]
+    placed = [(entry["floorplan_id"], entry["level"], entry["name"]) for entry in found]
+    assert placed == [(plans[1], -1.0, "Flat 1"), (plans[2], 0.5, "Flat 2"), (plans[0], 2.0, "penthouse")]
     assert {entry["status"] for entry in found} == {"ready"}
     assert [entry["floorplan_id"] for entry in plans_of(client, venue["id"], level=0.5)] == [plans[2]]
     broken = client.get(f"/venues/{venue['id']}/plans", params={"cursor": "x" * 32 + "="})
