@@ -88,14 +88,8 @@ def test_photographs_of_a_turn_are_linked_on_the_device(service: Any, home: str)
     found = service.localise_sequence(home, frames, motion="turn", on_device=True, hfov_deg=53.0, refine="none")
     angles = [pose.view.relative_heading for pose in found.poses]
     assert [angle.value_deg for angle in angles] == pytest.approx(sent.relative_heading_deg, abs=0.01)
-    again = service.localise_sequence(
-        home,
-        sent.features,
-        motion="turn",
-        relative_heading_deg=sent.relative_heading_deg,
-        relative_heading_std_deg=sent.relative_heading_std_deg,
-        refine="none",
-    )
+    angles = {name: getattr(sent, name) for name in ("relative_heading_deg", "relative_heading_std_deg")}
+    again = service.localise_sequence(home, sent.features, motion="turn", refine="none", **angles)
     assert again.poses[0].position == found.poses[0].position
     # Of features, nothing overlaps.
     assert service.encode_turn(sent.features).relative_heading_deg is None

@@ -143,11 +143,8 @@ def test_answer_has_every_field(service: Any, app: httpx.Client, sphere: bytes) 
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
     options = {"heading_deg": 90.0, "heading_tolerance_deg": 10.0, "refine": "vdr", "top_k": 2}
     answer = service.localise(plan_id, sphere, **options)
-    document = app.post(
-        "/localise",
-        data={"floorplan_id": plan_id} | {name: str(value) for name, value in options.items()},
-        files={"photo": sphere},
-    ).json()
+    data = {"floorplan_id": plan_id} | {name: str(value) for name, value in options.items()}
+    document = app.post("/localise", data=data, files={"photo": sphere}).json()
     # Only the times differ between the two answers.
     known = dataclasses.asdict(answer) | {"timings_ms": document["timings_ms"]}
     assert {name: value for name, value in json.loads(json.dumps(known)).items() if name in document} == document
@@ -231,11 +228,8 @@ def test_sequence_is_one_query(service: Any, app: httpx.Client, sphere: bytes) -
     answer = service.localise_sequence(
         plan_id, [sphere, sphere], motion="turn", headings_deg=[90.0, None], refine="none", top_k=2
     )
-    document = app.post(
-        "/localise/sequence",
-        data={"floorplan_id": plan_id, "motion": "turn", "headings_deg": "[90, null]", "refine": "none", "top_k": "2"},
-        files=[("photo", sphere), ("photo", sphere)],
-    ).json()
+    data = {"floorplan_id": plan_id, "motion": "turn", "headings_deg": "[90, null]", "refine": "none", "top_k": "2"}
+    document = app.post("/localise/sequence", data=data, files=[("photo", sphere), ("photo", sphere)]).json()
     assert len(answer.poses) == 2
     assert json.loads(json.dumps(dataclasses.asdict(answer))) == document | {"timings_ms": dict(answer.timings_ms)}
     with pytest.raises(InvalidError, match="to a session"):
