@@ -29,10 +29,8 @@ HEADING = 0.5 * np.pi
 
 
 def write_room(folder: Path, seed: int) -> None:
-    openings = [
-        {"kind": "door", "line": [[5.0, 0.5], [5.0, 1.5]]},
-        {"kind": "window", "line": [[0.5, 6.0], [1.5, 6.0]]},
-    ]
+    door, window = [[5.0, 0.5], [5.0, 1.5]], [[0.5, 6.0], [1.5, 6.0]]
+    openings = [{"kind": "door", "line": door}, {"kind": "window", "line": window}]
     room = {
         "seed": seed,
         "kind": "kitchen",

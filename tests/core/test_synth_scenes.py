@@ -356,9 +356,8 @@ def test_no_patch_covers_nothing() -> None:
 @pytest.mark.parametrize("rows", [ROWS, ROWS - 6])
 def test_compression_error_matches_jpeg_files(quality: int, rows: int) -> None:
     picture = noise_picture(3)[:, :rows]
-    picture = (picture + 0.05 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)).double()).clamp(
-        0, 1
-    )
+    noise = torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)).double()
+    picture = (picture + 0.05 * noise).clamp(0, 1)
     pixels = (picture[0] * 255.0).round().to(torch.uint8).numpy()
     file = picture_file(pixels, "JPEG", quality=quality, subsampling=0)
     expected = np.asarray(Image.open(io.BytesIO(file)), dtype=float) / 255.0

@@ -261,9 +261,8 @@ class TestRuns:
         assert Checkpoint.load(folder / "layout.pt").config.architecture == "ring"
         bundle = Bundle.open(folder / "bundle")
         assert bundle.manifest.architecture == "trunk"
-        query = PhotographEncoder(bundle, threads=1).spheres.query(
-            np.zeros((*TINY.image_size, 3), np.uint8), None, CameraHeight(1.5)
-        )
+        black = np.zeros((*TINY.image_size, 3), np.uint8)
+        query = PhotographEncoder(bundle, threads=1).spheres.query(black, None, CameraHeight(1.5))
         expected = losses.opening_prior(checkpoint.averaged["image_encoder"]["opening_share"], 0.5)
         np.testing.assert_allclose(present(query.openings).prior, expected, rtol=1e-5)
 

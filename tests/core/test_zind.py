@@ -222,9 +222,8 @@ class TestRooms:
         sphere = TrueSphere(room_index=0, x_m=1.0, y_m=1.0, heading=0.7)
         write_home(tmp_path / "0002", plan, [sphere], np.random.default_rng(3), (4, 8))
         (room,) = Zind(tmp_path).load(NAME).plan.rooms
-        assert all(
-            same_ring(found, hole, 1e-6) for found, hole in zip(room.holes_m, plan.rooms[0].holes_m, strict=True)
-        )
+        pairs = zip(room.holes_m, plan.rooms[0].holes_m, strict=True)
+        assert all(same_ring(found, hole, 1e-6) for found, hole in pairs)
         assert room.area_m2 == pytest.approx(5.0 * 4.0 - 0.2 - 0.25)
 
     @pytest.mark.parametrize(
