@@ -303,9 +303,8 @@ def test_fitted_text_is_in_the_middle_of_its_points():
         )
     space.add_text("Küche").set_placement((4.4, 1.0), (8.0, 1.0), align=TextEntityAlignment.FIT)
     space.add_text("Bad").dxf.discard("insert")
-    names = {
-        round(room["polygon"][0][0]): room.get("name") for room in import_plan(dxf_file(document)).document["rooms"]
-    }
+    rooms = import_plan(dxf_file(document)).document["rooms"]
+    names = {round(room["polygon"][0][0]): room.get("name") for room in rooms}
     assert sorted(filter(None, names.values())) == ["Küche"]
 
 

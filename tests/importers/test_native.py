@@ -90,9 +90,8 @@ def test_several_plans_keep_their_names_and_are_ordered_by_level():
 
 
 def test_plans_without_names_are_named_after_the_file():
-    content = json.dumps(
-        {"plans": [{**FLAT, "name": "home"}, {"rooms": FLAT["rooms"], "ceiling_height_m": 2.5}]}
-    ).encode()
+    nameless = {"rooms": FLAT["rooms"], "ceiling_height_m": 2.5}
+    content = json.dumps({"plans": [{**FLAT, "name": "home"}, nameless]}).encode()
     plans = import_plans(content, building="street")
     names = [(plan.document["name"], plan.plan().name) for plan in plans]
     assert names == [("home", "home"), ("street – plan 1", "street – plan 1")]
