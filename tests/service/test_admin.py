@@ -365,10 +365,7 @@ def test_entries_cannot_be_changed(store: Store) -> None:
 
 def test_entries_are_deleted_by_age_and_number(store: Store) -> None:
     now = datetime.now(UTC)
-    old = [
-        _entry(created_at=now - timedelta(seconds=DAY_S + 60)),
-        _entry(created_at=now - timedelta(seconds=DAY_S - 60)),
-    ]
+    old = [_entry(created_at=now - timedelta(seconds=DAY_S + late_s)) for late_s in (60, -60)]
     store.audit_log.add(old)
     assert store.audit_log.purge() == 1
     # A flood of unknown callers displaces their own entries only.

@@ -325,10 +325,8 @@ def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[by
         full = next(line for line in lines if line["status"] == 507)
         assert full["problem"]["type"] == "urn:lalaloc:problem:too-many-photographs"
         assert "max_album_photographs" in full["problem"]["detail"]
-        assert (client.get("/limits").json()["max_albums"], client.get("/limits").json()["max_album_photographs"]) == (
-            2,
-            2,
-        )
+        limits = client.get("/limits").json()
+        assert (limits["max_albums"], limits["max_album_photographs"]) == (2, 2)
 
 
 @pytest.mark.slow
@@ -452,9 +450,8 @@ def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: st
     (row,) = photographs(client, album_id)
     place = row["pin"]["place"]
     assert place["level"] == {plan_id: 0.0, upper: 1.0}[place["floorplan_id"]]
-    moved = correct(
-        client, album_id, line["photograph"]["id"], {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": upper}
-    )
+    correction = {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": upper}
+    moved = correct(client, album_id, line["photograph"]["id"], correction)
     assert moved.status_code == 200, moved.text
     wait_until_solved(client, album_id)
     (row,) = photographs(client, album_id, floorplan_id=upper)

@@ -327,9 +327,8 @@ def test_silent_reads_of_a_tenant_leave_a_thread_for_others() -> None:
             await asyncio.sleep(0.05)
             for _ in range(5):
                 assert await reads.run("b", lambda: "read") == "read"
-            assert [type(ended) for ended in await asyncio.gather(*silent, return_exceptions=True)] == [
-                StoreUnavailableError
-            ] * 8
+            ended = await asyncio.gather(*silent, return_exceptions=True)
+            assert [type(error) for error in ended] == [StoreUnavailableError] * 8
             goes_on.set()
         finally:
             goes_on.set()
@@ -391,10 +390,8 @@ def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: P
         assert client.post("/floorplans", json=FLAT).status_code == 201
         with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
             problem = assert_problem(worst.post("/floorplans", json=FLAT), 503, "overloaded")
-            assert (
-                "6 of your requests are in progress, and the rest of the 8 slots is reserved for other tenants."
-                in problem["detail"]
-            )
+            expected = "6 of your requests are in progress, and the rest of the 8 slots is reserved for other tenants."
+            assert expected in problem["detail"]
 
 
 @pytest.mark.one_replica

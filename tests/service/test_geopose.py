@@ -208,9 +208,8 @@ def test_answer_as_a_geopose(client: httpx.Client, sphere: bytes) -> None:
     assert response.headers["vary"] == "Accept"
     assert_quaternion(response.json(), geopose)
     # East is a quarter turn clockwise.
-    assert response.json()["quaternion"] == pytest.approx(
-        {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}, abs=1e-5
-    )
+    expected = {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}
+    assert response.json()["quaternion"] == pytest.approx(expected, abs=1e-5)
     keyed = client.post(
         "/localise", data=fields, files={"photo": sphere}, headers=AS_GEOPOSE | {"Idempotency-Key": "k"}
     )

@@ -174,9 +174,8 @@ def test_plan_of_a_dead_process_is_found_by_the_next(start_app: StartApp, tmp_pa
     with start_app(tmp_path) as client:
         # State after a crash: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": UploadedFile.of(CONTENT)}))
-        claim = IdempotencyKeys(app_store.database, app_store.quota, lease_s=1.0).begin(
-            "default", "POST /floorplans", "a", digest
-        )
+        keys = IdempotencyKeys(app_store.database, app_store.quota, lease_s=1.0)
+        claim = keys.begin("default", "POST /floorplans", "a", digest)
         assert isinstance(claim, Claimed)
         plan_id = claim.token
         headers = _keyed("a") | {"Content-Type": "application/json"}

@@ -111,9 +111,8 @@ def test_tokens_of_a_certified_issuer(start_app: StartApp, app_store: Store, tmp
         reader, admin = issuer.token("lalaloc:read"), issuer.token("lalaloc:admin", "lalaloc:write")
         usage = client.get("/usage", headers=bearer(reader))
         assert usage.json()["tenant"] == "acme"
-        refused = assert_problem(
-            client.post("/floorplans", json=FLAT, headers=bearer(reader)), 403, "insufficient-scope"
-        )
+        response = client.post("/floorplans", json=FLAT, headers=bearer(reader))
+        refused = assert_problem(response, 403, "insufficient-scope")
         assert "'write'; it has: read." in refused["detail"]
         assert client.post("/floorplans", json=FLAT, headers=bearer(admin)).status_code == 201
         # Keys work beside tokens.

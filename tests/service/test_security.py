@@ -85,9 +85,8 @@ def make_key(
 ) -> str:
     """Store a key as the command line does and return its text."""
     secret = new_secret()
-    return key_text(
-        store.keys.create(tenant, "test", hash_of(secret), scopes, rate_per_minute=rate_per_minute).id, secret
-    )
+    key = store.keys.create(tenant, "test", hash_of(secret), scopes, rate_per_minute=rate_per_minute)
+    return key_text(key.id, secret)
 
 
 def bearer(key: str) -> dict[str, str]:
@@ -196,9 +195,8 @@ def test_only_health_works_without_a_valid_key(guarded: Guarded, method: str, pa
 def test_key_without_the_scope_is_refused(guarded: Guarded, method: str, path: str) -> None:
     needed = NEEDED[method, path]
     scopes = tuple(permission for permission in EVERYTHING if permission != needed)
-    problem = assert_problem(
-        guarded.send(method, path, make_key(guarded.store, scopes=scopes)), 403, "insufficient-scope"
-    )
+    response = guarded.send(method, path, make_key(guarded.store, scopes=scopes))
+    problem = assert_problem(response, 403, "insufficient-scope")
     assert f"'{needed}'" in problem["detail"]
 
 

@@ -237,9 +237,8 @@ def test_purge_deletes_all_of_one_tenant(store: Store, capsys: pytest.CaptureFix
     assert store.quota.account("b") == kept
     assert main(["tenants", "purge", "b", "--yes"]) == 0
     with store.database.reading() as connection:
-        left = {
-            table.name: connection.scalar(select(func.count()).select_from(table)) for table in METADATA.sorted_tables
-        }
+        counts = {table.name: select(func.count()).select_from(table) for table in METADATA.sorted_tables}
+        left = {name: connection.scalar(count) for name, count in counts.items()}
     assert {name for name, count in left.items() if count} == {TENANTS.name, AUDIT_LOG.name}
 
 
