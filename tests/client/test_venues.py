@@ -48,10 +48,9 @@ def test_file_of_several_levels_becomes_a_venue(service: Any, tmp_path: Path) ->
         ("12 Mill Lane – story 0", 0.0),
         ("12 Mill Lane – story 1", 1.0),
     ]
-    named = service.upload_venue(two_stories(), name="Home", options={"ceiling_height_m": 2.4}, idempotency_key="a")
-    assert named == service.upload_venue(
-        two_stories(), name="Home", options={"ceiling_height_m": 2.4}, idempotency_key="a"
-    )
+    options = {"ceiling_height_m": 2.4}
+    named = service.upload_venue(two_stories(), name="Home", options=options, idempotency_key="a")
+    assert named == service.upload_venue(two_stories(), name="Home", options=options, idempotency_key="a")
     assert (named.name, service.upload_venue(FLAT).name) == ("Home", "venue")
     with pytest.raises(InvalidError, match="unknown part"):
         service.upload_venue(file, options={"level": "1"})
