@@ -337,6 +337,13 @@ def document_of(response: httpx.Response, status: int = 200) -> Any:
     return response.json()
 
 
+def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
+    """Check that an answer has a JSON document per line, and return these."""
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/x-ndjson"
+    return [json.loads(line) for line in response.text.splitlines()]
+
+
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
     return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})

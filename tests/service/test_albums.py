@@ -29,7 +29,7 @@ from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
-from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, upload, wait_for
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, lines_of, upload, wait_for
 from tests.service.test_security import bearer, make_key
 from tests.strategies import present
 
@@ -84,10 +84,7 @@ def send(client: httpx.Client, album_id: str, files: list[bytes], part: str = "p
 
 def add(client: httpx.Client, album_id: str, files: list[bytes], part: str = "photo") -> list[dict[str, Any]]:
     """Add photographs; return the lines of the answer."""
-    response = send(client, album_id, files, part)
-    assert response.status_code == 200, response.text
-    assert response.headers["content-type"] == "application/x-ndjson"
-    return [json.loads(line) for line in response.text.splitlines()]
+    return lines_of(send(client, album_id, files, part))
 
 
 def photographs(client: httpx.Client, album_id: str, **params: Any) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ import pytest
 
 from service.http.representations import LinesResponse
 from service.storage.store import Store
-from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, lines_of, localise, upload, wait_for
 from tests.service.test_security import bearer, make_key
 
 APP_SETTINGS = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "max_photograph_bytes": 500_000}
@@ -22,12 +22,6 @@ APP_SETTINGS = {"max_batch_photographs": 30, "max_sequence_bytes": 4_000_000, "m
 def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: str) -> httpx.Response:
     files = [("photo", (f"{number}.jpg", picture, "image/jpeg")) for number, picture in enumerate(pictures)]
     return client.post("/localise/batch", data={"floorplan_id": plan_id, "refine": "none"} | fields, files=files)
-
-
-def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
-    assert response.status_code == 200, response.text
-    assert response.headers["content-type"] == "application/x-ndjson"
-    return [json.loads(line) for line in response.text.splitlines()]
 
 
 def test_photographs_are_answered_in_order_and_alone(client: httpx.Client, flat: str, sphere: bytes) -> None:

@@ -222,9 +222,8 @@ def test_limits_refuse_the_whole_file(
 
 def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        mine, theirs = (
-            bearer(make_key(app_store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
-        )
+        keys = [make_key(app_store, tenant=tenant, scopes=("read", "write")) for tenant in ("mine", "theirs")]
+        mine, theirs = map(bearer, keys)
         venue = send(client, geojson(), headers=mine).json()
         assert (counts(client, mine), counts(client, theirs)) == ((2, 1), (0, 0))
         assert_problem(client.get(f"/venues/{venue['id']}", headers=theirs), 404, "unknown-venue")

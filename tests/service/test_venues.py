@@ -214,9 +214,8 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
 
 def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        mine, theirs = (
-            bearer(make_key(app_store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
-        )
+        keys = [make_key(app_store, tenant=tenant, scopes=("read", "write")) for tenant in ("mine", "theirs")]
+        mine, theirs = map(bearer, keys)
         plan_id = client.post("/floorplans", json=FLAT, headers=mine).json()["id"]
         stolen = client.post("/venues", json={"plans": [member(plan_id)]}, headers=theirs)
         assert "does not exist" in assert_problem(stolen, 422, "invalid-request")["detail"]
