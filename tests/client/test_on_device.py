@@ -113,10 +113,8 @@ def test_features_are_sent_as_such(service: Any, home: str, tmp_path: Path) -> N
 
     file = tmp_path / "phone.features"
     assert main(["encode", str(PHONE), "-o", str(file)]) == 0
-    assert (
-        service.localise(home, file, refine="none").room
-        == service.localise(home, PHONE, on_device=True, refine="none").room
-    )
+    on_device = service.localise(home, PHONE, on_device=True, refine="none")
+    assert service.localise(home, file, refine="none").room == on_device.room
     with pytest.raises(InvalidError, match="invalid-features"):
         service.localise(home, file.read_bytes() + b"0", refine="none")
     with pytest.raises(ValueError, match="cannot be in one query"):
