@@ -16,13 +16,9 @@ from lalaloc_core.bundle import Bundle, default_bundle, write_manifest
 from tests import tiny
 
 # Derandomised, without a time limit per example: results depend on the commit only.
+_UNCHECKED = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 settings.register_profile(
-    "tests",
-    deadline=None,
-    derandomize=True,
-    max_examples=50,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+    "tests", deadline=None, derandomize=True, max_examples=50, database=None, suppress_health_check=_UNCHECKED
 )
 settings.load_profile("tests")
 

@@ -1,8 +1,9 @@
-"""Synthetic spheres of empty rectangular rooms: every pixel is floor, wall or ceiling."""
+"""Synthetic spheres of empty rectangular rooms, whose pixels are floor, wall or ceiling, and pictures as files."""
 
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -40,6 +41,12 @@ def painted_room(size_m: tuple[float, float], at_m: tuple[float, float]) -> byte
     colours = np.array([[140.0, 105.0, 75.0], [195.0, 190.0, 182.0], [235.0, 235.0, 230.0]])
     grain = np.random.default_rng(0).normal(0.0, 3.0, (256, 512, 3))
     picture = np.clip(colours[painted_surfaces(size_m, at_m)] + grain, 0.0, 255.0).astype(np.uint8)
+    return picture_file(picture, "JPEG", quality=95)
+
+
+def picture_file(picture: Image.Image | np.ndarray, kind: str = "PNG", **options: Any) -> bytes:
+    """Return a picture as a file; options are those of `Image.save`."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=95)
+    image = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
+    image.save(buffer, kind, **options)
     return buffer.getvalue()

@@ -158,12 +158,10 @@ def write_scene(
 
 
 def write_annotation(folder: Path, document: dict[str, Any]) -> None:
-    """Replace a scene's annotation."""
     (folder / "annotation_3d.json").write_text(json.dumps(document), encoding="utf-8")
 
 
 def write_camera(sphere: Path, x_mm: float, y_mm: float, z_mm: float) -> None:
-    """Replace a camera's position."""
     (sphere / "camera_xyz.txt").write_text(f"{x_mm} {y_mm} {z_mm}\n", encoding="ascii")
 
 

@@ -60,7 +60,6 @@ CONFIGURED: dict[str, str] = BY_KIND["ConfigMap"]["data"]
 
 
 def pinned_versions() -> dict[str, str]:
-    """Return the versions in constraints.txt by name."""
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = [line.split("==") for line in lines if line and not line.startswith("#")]
     return {canonicalize_name(name): version for name, version in pins}

@@ -63,7 +63,6 @@ def unpack(folder: Path, *, views: bool = False) -> Path:
 
 
 def configuration() -> str:
-    """Return the preset that the bundle is trained with."""
     return json.dumps(dataclasses.asdict(PRESETS["tiny"]), sort_keys=True, default=str)
 
 

@@ -64,7 +64,6 @@ def write_home(
     rng: np.random.Generator,
     size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> None:
-    """Write a home of one floor."""
     (folder / "panos").mkdir(parents=True)
     scale_m = float(rng.uniform(0.5, 3.0))
     floor: dict[str, Any] = {}

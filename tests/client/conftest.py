@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from time import monotonic
 from typing import Any
 
@@ -17,7 +15,8 @@ import httpx
 import pytest
 
 from lalaloc_client import AsyncClient, Client
-from tests.service.conftest import (
+from tests.local_servers import QuietHandler, http_server
+from tests.service.conftest import (  # noqa: F401, fixtures
     _clean_environment,
     _forked_workers,
     app_settings,
@@ -29,17 +28,7 @@ from tests.service.conftest import (
 )
 from tests.service.conftest import client as app
 
-__all__ = [
-    "_clean_environment",
-    "_forked_workers",
-    "app",
-    "app_settings",
-    "database_of",
-    "empty_database",
-    "postgres",
-    "sphere",
-    "start_app",
-]
+__all__ = ["app"]
 
 MakeClient = Callable[..., AbstractContextManager[Any]]
 
@@ -77,7 +66,7 @@ class FailingServer:
 def failing() -> Iterator[FailingServer]:
     """Return a server on a free port; without a planned answer it closes the connection."""
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def _handle(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length", 0)))
             headers = {name.lower(): value for name, value in self.headers.items()}
@@ -95,17 +84,9 @@ def failing() -> Iterator[FailingServer]:
 
         do_GET = do_POST = do_PUT = do_DELETE = _handle
 
-        def log_message(self, format: str, *args: object) -> None: ...
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as http:
-        server = FailingServer(f"http://127.0.0.1:{http.server_address[1]}")
-        thread = threading.Thread(target=http.serve_forever)
-        thread.start()
-        try:
-            yield server
-        finally:
-            http.shutdown()
-            thread.join(10.0)
+    with http_server(Handler) as url:
+        server = FailingServer(url)
+        yield server
 
 
 class _BlockingAdapter:

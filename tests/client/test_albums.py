@@ -18,12 +18,8 @@ from tests.core.taken import EXAMPLES
 from tests.service.conftest import HOME
 
 FILES = [EXAMPLES / "kitchen.jpg", EXAMPLES / "bedroom.jpg"]
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    # The tiny model gives no features.
-    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
+# The tiny model gives no features.
+APP_SETTINGS = {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 def test_folder_is_pinned_corrected_and_taken_away(service: Any) -> None:

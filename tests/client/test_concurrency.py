@@ -19,17 +19,12 @@ from tests.service.conftest import FLAT, upload
 
 COUNT = 14
 ONCE = RetryPolicy(attempts=1)
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    # Four concurrent queries, three of them per client, and no queue.
-    return {"max_queries": 4, "max_waiting_queries": 0}
+# Four concurrent queries, three of them per client, and no queue.
+APP_SETTINGS = {"max_queries": 4, "max_waiting_queries": 0}
 
 
 @pytest.fixture(scope="module")
 def plan_id(app: httpx.Client) -> str:
-    """Return the id of a stored plan."""
     return upload(app, FLAT)
 
 

@@ -58,13 +58,8 @@ def test_generated_python_client_localises(
 ) -> None:
     package = tmp_path / "generated_lalaloc"
     arguments = ["generate", "--path", "openapi.yaml", "--meta", "none", "--output-path", str(package)]
-    subprocess.run(
-        [sys.executable, "-m", "openapi_python_client", *arguments],
-        cwd=ROOT,
-        check=True,
-        timeout=300,
-        stdout=subprocess.DEVNULL,
-    )
+    command = [sys.executable, "-m", "openapi_python_client", *arguments]
+    subprocess.run(command, cwd=ROOT, check=True, timeout=300, stdout=subprocess.DEVNULL)
     monkeypatch.syspath_prepend(tmp_path)
 
     def generated(name: str) -> Any:

@@ -21,21 +21,17 @@ from mcp.client.streamable_http import streamable_http_client
 
 from lalaloc_core.bundle import default_bundle
 from service.storage import Store
+from tests.local_servers import free_port
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, encode_picture, wait_for
 from tests.service.test_security import bearer, make_key
 
 _COMMAND = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main; sys.exit(main())", "mcp"]
 _JPEG = "data:image/jpeg;base64,"
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture
 def flat(tmp_path: Path) -> Path:
-    """Return the file of a plan."""
     file = tmp_path / "flat.json"
     file.write_text(json.dumps(FLAT))
     return file
@@ -43,7 +39,6 @@ def flat(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def photograph(tmp_path: Path, sphere: bytes) -> Path:
-    """Return the file of a photograph."""
     file = tmp_path / "room.jpg"
     file.write_bytes(sphere)
     return file
@@ -74,10 +69,8 @@ def test_plan_is_imported_and_photographs_are_localised(app: httpx.Client, flat:
         assert set(tools) == names
         assert all(tool.description for tool in tools.values())
         plan = _said(await client.call_tool("import_plan", {"plan": str(flat)}))
-        assert (plan["status"], [room["name"] for room in plan["rooms"]]) == (
-            "ready",
-            [room["name"] for room in FLAT["rooms"]],
-        )
+        assert plan["status"] == "ready"
+        assert [room["name"] for room in plan["rooms"]] == [room["name"] for room in FLAT["rooms"]]
         listed = _said(await client.call_tool("list_plans", {}))
         assert plan["id"] in {item["id"] for item in listed}
         asked = {"photograph": str(photograph), "floorplan_id": plan["id"], "heading_deg": 30.0}
@@ -167,9 +160,7 @@ def test_service_that_does_not_run_is_named(photograph: Path) -> None:
         assert result.is_error
         assert "127.0.0.1" in _texts(result)[0]
 
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-    _over_stdio(f"http://127.0.0.1:{port}", talk)
+    _over_stdio(f"http://127.0.0.1:{free_port()}", talk)
 
 
 def test_http_passes_the_callers_key_on_and_reads_no_files(
@@ -179,8 +170,7 @@ def test_http_passes_the_callers_key_on_and_reads_no_files(
         store = Store(database_of(tmp_path / "data"))
         key = make_key(store)
         store.close()
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            port = listener.getsockname()[1]
+        port = free_port()
         command = [*_COMMAND, "--url", str(app.base_url), "--http", f"127.0.0.1:{port}"]
         # A key of the server's own must not serve callers.
         server = subprocess.Popen(command, env={"LALALOC_API_KEY": key, "PATH": ""}, stderr=subprocess.DEVNULL)

@@ -19,11 +19,7 @@ from tests.core.taken import EXAMPLES, jpeg
 from tests.service.conftest import upload
 
 KITCHEN, PHONE = EXAMPLES / "kitchen.jpg", EXAMPLES / "phone.jpg"
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"bundle": default_bundle(), "require_features": True, "request_deadline_s": 90.0}
+APP_SETTINGS = {"bundle": default_bundle(), "require_features": True, "request_deadline_s": 90.0}
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +29,6 @@ def home(app: httpx.Client) -> str:
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the folder of the cached model."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "lalaloc" / "models"
 
@@ -93,14 +88,8 @@ def test_photographs_of_a_turn_are_linked_on_the_device(service: Any, home: str)
     found = service.localise_sequence(home, frames, motion="turn", on_device=True, hfov_deg=53.0, refine="none")
     angles = [pose.view.relative_heading for pose in found.poses]
     assert [angle.value_deg for angle in angles] == pytest.approx(sent.relative_heading_deg, abs=0.01)
-    again = service.localise_sequence(
-        home,
-        sent.features,
-        motion="turn",
-        relative_heading_deg=sent.relative_heading_deg,
-        relative_heading_std_deg=sent.relative_heading_std_deg,
-        refine="none",
-    )
+    angles = {name: getattr(sent, name) for name in ("relative_heading_deg", "relative_heading_std_deg")}
+    again = service.localise_sequence(home, sent.features, motion="turn", refine="none", **angles)
     assert again.poses[0].position == found.poses[0].position
     # Of features, nothing overlaps.
     assert service.encode_turn(sent.features).relative_heading_deg is None
@@ -124,10 +113,8 @@ def test_features_are_sent_as_such(service: Any, home: str, tmp_path: Path) -> N
 
     file = tmp_path / "phone.features"
     assert main(["encode", str(PHONE), "-o", str(file)]) == 0
-    assert (
-        service.localise(home, file, refine="none").room
-        == service.localise(home, PHONE, on_device=True, refine="none").room
-    )
+    on_device = service.localise(home, PHONE, on_device=True, refine="none")
+    assert service.localise(home, file, refine="none").room == on_device.room
     with pytest.raises(InvalidError, match="invalid-features"):
         service.localise(home, file.read_bytes() + b"0", refine="none")
     with pytest.raises(ValueError, match="cannot be in one query"):

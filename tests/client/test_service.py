@@ -24,10 +24,7 @@ from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import FLAT, StartApp
 
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 def test_plan_is_stored_listed_and_deleted(service: Any, tmp_path: Path) -> None:
@@ -146,11 +143,8 @@ def test_answer_has_every_field(service: Any, app: httpx.Client, sphere: bytes) 
     plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
     options = {"heading_deg": 90.0, "heading_tolerance_deg": 10.0, "refine": "vdr", "top_k": 2}
     answer = service.localise(plan_id, sphere, **options)
-    document = app.post(
-        "/localise",
-        data={"floorplan_id": plan_id} | {name: str(value) for name, value in options.items()},
-        files={"photo": sphere},
-    ).json()
+    data = {"floorplan_id": plan_id} | {name: str(value) for name, value in options.items()}
+    document = app.post("/localise", data=data, files={"photo": sphere}).json()
     # Only the times differ between the two answers.
     known = dataclasses.asdict(answer) | {"timings_ms": document["timings_ms"]}
     assert {name: value for name, value in json.loads(json.dumps(known)).items() if name in document} == document
@@ -234,11 +228,8 @@ def test_sequence_is_one_query(service: Any, app: httpx.Client, sphere: bytes) -
     answer = service.localise_sequence(
         plan_id, [sphere, sphere], motion="turn", headings_deg=[90.0, None], refine="none", top_k=2
     )
-    document = app.post(
-        "/localise/sequence",
-        data={"floorplan_id": plan_id, "motion": "turn", "headings_deg": "[90, null]", "refine": "none", "top_k": "2"},
-        files=[("photo", sphere), ("photo", sphere)],
-    ).json()
+    data = {"floorplan_id": plan_id, "motion": "turn", "headings_deg": "[90, null]", "refine": "none", "top_k": "2"}
+    document = app.post("/localise/sequence", data=data, files=[("photo", sphere), ("photo", sphere)]).json()
     assert len(answer.poses) == 2
     assert json.loads(json.dumps(dataclasses.asdict(answer))) == document | {"timings_ms": dict(answer.timings_ms)}
     with pytest.raises(InvalidError, match="to a session"):
@@ -265,11 +256,8 @@ def test_batch_yields_an_answer_per_photograph(service: Any, sphere: bytes, tmp_
     (tmp_path / "hall.jpg").write_bytes(sphere)
     plan = service.wait_until_ready(service.upload_floorplan(FLAT).id, timeout_s=60.0)
     answers = list(service.localise_batch(plan.id, [tmp_path / "hall.jpg", b"no picture", sphere], refine="none"))
-    assert [(answer.index, answer.name, answer.status) for answer in answers] == [
-        (0, "hall.jpg", 200),
-        (1, "photo", 422),
-        (2, "photo", 200),
-    ]
+    found = [(answer.index, answer.name, answer.status) for answer in answers]
+    assert found == [(0, "hall.jpg", 200), (1, "photo", 422), (2, "photo", 200)]
     assert answers[0].result().floorplan_id == plan.id
     with pytest.raises(InvalidError) as caught:
         answers[1].result()
@@ -280,7 +268,6 @@ def test_batch_yields_an_answer_per_photograph(service: Any, sphere: bytes, tmp_
 
 @pytest.fixture(scope="module")
 def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Return an app with the shipped model."""
     with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), request_deadline_s=90.0) as started:
         yield started
 

@@ -87,14 +87,8 @@ pytestmark = [
 
 
 def tsc(*arguments: str, cwd: Path) -> None:
-    """Run the compiler."""
-    done = subprocess.run(
-        ["node", str(PACKAGE / "node_modules/typescript/bin/tsc"), *arguments],
-        cwd=cwd,
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=300,
-    )
+    command = ["node", str(PACKAGE / "node_modules/typescript/bin/tsc"), *arguments]
+    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, text=True, timeout=300)
     assert done.returncode == 0, done.stdout
 
 

@@ -22,10 +22,8 @@ def test_venue_is_stored_changed_and_deleted(service: Any) -> None:
     assert service.venue(made.id) == made
     assert made.id in [venue.id for venue in service.venues("mill lane", page_size=1)]
     listed = service.venue_plans(made.id, page_size=1)
-    assert [(plan.floorplan_id, plan.level, plan.name) for plan in listed] == [
-        (plans[0], 0.0, "Flat 0"),
-        (plans[1], 1.0, "Flat 1"),
-    ]
+    found = [(plan.floorplan_id, plan.level, plan.name) for plan in listed]
+    assert found == [(plans[0], 0.0, "Flat 0"), (plans[1], 1.0, "Flat 1")]
     assert [plan.floorplan_id for plan in service.venue_plans(made.id, level=1)] == [plans[1]]
     changed = service.change_venue(
         made.id, plans=[VenuePlan(plans[2], 5, "attic")], remove=[plans[0]], if_match=made.etag
@@ -50,10 +48,9 @@ def test_file_of_several_levels_becomes_a_venue(service: Any, tmp_path: Path) ->
         ("12 Mill Lane – story 0", 0.0),
         ("12 Mill Lane – story 1", 1.0),
     ]
-    named = service.upload_venue(two_stories(), name="Home", options={"ceiling_height_m": 2.4}, idempotency_key="a")
-    assert named == service.upload_venue(
-        two_stories(), name="Home", options={"ceiling_height_m": 2.4}, idempotency_key="a"
-    )
+    options = {"ceiling_height_m": 2.4}
+    named = service.upload_venue(two_stories(), name="Home", options=options, idempotency_key="a")
+    assert named == service.upload_venue(two_stories(), name="Home", options=options, idempotency_key="a")
     assert (named.name, service.upload_venue(FLAT).name) == ("Home", "venue")
     with pytest.raises(InvalidError, match="unknown part"):
         service.upload_venue(file, options={"level": "1"})

@@ -42,7 +42,6 @@ def optimiser(opened_bundle: Bundle) -> PoseRefiner:
 
 @pytest.fixture(scope="session")
 def materials() -> MaterialLibrary:
-    """Library of procedural materials."""
     return MaterialLibrary.create(np.random.default_rng(0))
 
 

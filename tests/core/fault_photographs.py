@@ -44,7 +44,6 @@ class Fault:
 
     @property
     def content(self) -> bytes:
-        """Bytes of the file."""
         return (FOLDER / self.name).read_bytes()
 
     @property
@@ -69,7 +68,6 @@ class Fault:
         assert not any(word in text for word in LIBRARY_WORDS for text in warnings), warnings
 
     def check_refusal(self, text: str) -> None:
-        """Check the message of a refusal."""
         assert self.said is not None
         assert self.said in text, text
         assert not any(word in text for word in LIBRARY_WORDS), text
@@ -104,5 +102,4 @@ CONTRADICTED = Fault(
 
 
 def fault_id(fault: Fault) -> str:
-    """Return the name of a fault's test."""
     return Path(fault.name).stem

@@ -37,19 +37,10 @@ def encode(frames: Sequence[np.ndarray], path: Path, *options: str) -> bytes:
     """Return frames as a film; options are FFmpeg's, by default for H.264."""
     height, width = frames[0].shape[:2]
     source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(RATE), "-i", "-")
-    run(
-        *source,
-        *(options or H264),
-        "-pix_fmt",
-        "yuv420p",
-        "-threads",
-        "1",
-        str(path),
-        content=b"".join(frame.tobytes() for frame in frames),
-    )
+    content = b"".join(frame.tobytes() for frame in frames)
+    run(*source, *(options or H264), "-pix_fmt", "yuv420p", "-threads", "1", str(path), content=content)
     return path.read_bytes()
 
 
 def run(*arguments: str, content: bytes | None = None) -> None:
-    """Run FFmpeg."""
     subprocess.run(["ffmpeg", "-v", "error", "-y", *arguments], input=content, check=True, timeout=120)

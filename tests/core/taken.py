@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from functools import cache
 from pathlib import Path
@@ -14,6 +13,7 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.photograph.cameras import Camera, camera_axes
+from tests.painted import picture_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -36,13 +36,8 @@ def take(
     column = (azimuth / TWO_PI + 0.5) % 1.0 * width - 0.5
     row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height - 0.5
     wrapped = np.concatenate([sphere[:, -1:], sphere, sphere[:, :1]], axis=1)
-    return cv2.remap(
-        wrapped,
-        (column + 1.0).astype(np.float32),
-        row.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    map_x, map_y = (column + 1.0).astype(np.float32), row.astype(np.float32)
+    return cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def exif_of(tags: dict[Any, Any]) -> Image.Exif:
@@ -61,10 +56,8 @@ def jpeg(
     model: str | None = None,
 ) -> bytes:
     """Return a JPEG file with tags of the EXIF IFD as phones write them."""
-    image, tags = Image.fromarray(pixels), exif_of(exif or {})
+    tags = exif_of(exif or {})
     for tag, value in ((0x0112, orientation), (0x010F, maker), (0x0110, model)):
         if value is not None:
             tags[tag] = value
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=92, exif=tags)
-    return buffer.getvalue()
+    return picture_file(pixels, "JPEG", quality=92, exif=tags)

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from datetime import datetime
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +32,8 @@ from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
 from lalaloc_core.photograph.exif import Taken
+from tests.painted import picture_file
+from tests.strategies import present
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("kitchen.jpg", "study.jpg", "bedroom.jpg", "living_room.jpg", "phone.jpg")
@@ -77,13 +78,8 @@ def test_entry_is_small_and_read_as_it_was(bundle: Bundle, photographs: list[Alb
         assert (read.id, read.taken) == (photograph.id, photograph.taken)
         np.testing.assert_array_equal(read.colours, photograph.colours)
         np.testing.assert_array_equal(read.descriptors.bits, photograph.descriptors.bits)
-        assert read.photograph.features is not None
-        assert photograph.photograph.features is not None
-        np.testing.assert_allclose(
-            read.photograph.features.outputs["log_profile"],
-            photograph.photograph.features.outputs["log_profile"],
-            rtol=1e-6,
-        )
+        again, first = (present(row.photograph.features).outputs["log_profile"] for row in (read, photograph))
+        np.testing.assert_allclose(again, first, rtol=1e-6)
     assert len(photographs[-1].descriptors) > 50
     assert not photographs[0].photograph.features or not photographs[0].photograph.features.outputs["ring"].any()
 
@@ -197,9 +193,7 @@ def _facade(seed: int) -> bytes:
     for left in range(120, 520, 85):
         for top in (180, 270):
             draw.rectangle((left, top, left + 50, top + 60), fill=(60, 80, 105), outline=(240, 240, 235), width=5)
-    content = BytesIO()
-    picture.filter(ImageFilter.GaussianBlur(0.7)).save(content, "JPEG")
-    return content.getvalue()
+    return picture_file(picture.filter(ImageFilter.GaussianBlur(0.7)), "JPEG")
 
 
 @pytest.mark.slow
@@ -229,11 +223,8 @@ def test_photograph_that_shows_no_wall_is_not_sure(
     assert phone.photograph.features is not None
     outputs = dict(phone.photograph.features.outputs)
     outputs["seen"] = np.full_like(outputs["seen"], 0.0)
-    blind = replace(
-        phone,
-        id="blind",
-        photograph=replace(phone.photograph, features=replace(phone.photograph.features, outputs=outputs)),
-    )
+    features = replace(phone.photograph.features, outputs=outputs)
+    blind = replace(phone, id="blind", photograph=replace(phone.photograph, features=features))
     pin = solve_album(ground, encoder, [blind]).pins[0]
     assert pin.state in ("set_aside", "uncertain")
     assert pin.within_1m < 0.2
@@ -381,13 +372,9 @@ def test_storeys_that_were_confused_are_exchanged() -> None:
     alone[0, 4:] = -6.0
     walk = np.full((rooms + 1, rooms + 1), math.log(1e-9))
     walk[:4, :4], walk[4:8, 4:8] = math.log(0.25), math.log(0.25)
+    follows, storeys = np.arange(count) > 0, (np.arange(4), np.arange(4, 8))
     evidence = RoomEvidence(
-        alone=alone,
-        walk=walk,
-        follows=np.arange(count) > 0,
-        pairs=np.zeros((count, count)),
-        expected=None,
-        storeys=(np.arange(4), np.arange(4, 8)),
+        alone=alone, walk=walk, follows=follows, pairs=np.zeros((count, count)), expected=None, storeys=storeys
     )
     found = [assign_rooms(evidence, seed)[:, 4:8].sum(axis=1).mean() for seed in range(4)]
     # By the sum over both: -6 for the first photograph against 15 times 0.6.

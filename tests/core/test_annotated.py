@@ -77,12 +77,8 @@ def root(tmp_path: Path) -> Path:
     """Write three photographs, one with two outlines and one of poor quality."""
     write(tmp_path, "hall", alternative_polygon=[[-1.0, -1.0], [5.0, -1.0], [5.0, 2.0], [-1.0, 2.0]])
     write(tmp_path, "den", quality="poor", openings=[], ceiling_above_camera=None)
-    write(
-        tmp_path,
-        "nook",
-        polygon=[[-2.0, -1.5], [2.0, -1.5], [2.0, 0.5], [0.5, 0.5], [0.5, 1.5], [-2.0, 1.5]],
-        openings=[],
-    )
+    nook = [[-2.0, -1.5], [2.0, -1.5], [2.0, 0.5], [0.5, 0.5], [0.5, 1.5], [-2.0, 1.5]]
+    write(tmp_path, "nook", polygon=nook, openings=[])
     return tmp_path
 
 

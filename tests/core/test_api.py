@@ -128,15 +128,10 @@ def test_folder_is_pinned_together(model: LaLaLoc, plan: lalaloc_core.FloorPlan,
     pinned = model.pin(plan, tmp_path, progress=lambda *step: done.append(step))
     rooms = {photograph.name: photograph.pin and photograph.pin.pose for photograph in pinned.photographs}
     assert rooms["broken.jpg"] is None
-    assert {name: pose.room for name, pose in rooms.items() if pose} == {
-        "bedroom.jpg": "bedroom",
-        "copy.jpg": "kitchen",
-        "kitchen.jpg": "kitchen",
-    }
-    assert [note.partition(":")[0] for note in pinned.notes][:2] == [
-        "'broken.jpg' is set aside",
-        "copies of other files, which have the same pin",
-    ]
+    found = {name: pose.room for name, pose in rooms.items() if pose}
+    assert found == {"bedroom.jpg": "bedroom", "copy.jpg": "kitchen", "kitchen.jpg": "kitchen"}
+    notes = [note.partition(":")[0] for note in pinned.notes]
+    assert notes[:2] == ["'broken.jpg' is set aside", "copies of other files, which have the same pin"]
     assert ("read", 4, 4) in done
     assert ("pin", 2, 2) in done
     document = pinned.document()
@@ -153,10 +148,8 @@ def test_camera_is_tracked(model: LaLaLoc, plan: lalaloc_core.FloorPlan) -> None
     with pytest.raises(InvalidPhotographError):
         track.add(b"no picture")
     second = track.add(KITCHEN, Odometry.of_stds(0.0, 0.0, 0.0, (0.02, 0.02, 0.02)))
-    assert [(answer.number, answer.room, answer.mode) for answer in track.answers] == [
-        (1, "kitchen", "tracking"),
-        (2, "kitchen", "tracking"),
-    ]
+    found = [(answer.number, answer.room, answer.mode) for answer in track.answers]
+    assert found == [(1, "kitchen", "tracking"), (2, "kitchen", "tracking")]
     assert off_m(second.position, "kitchen.jpg") < 0.1
     assert second.probability >= first.probability - 0.01
     assert json.loads(json.dumps(track.document()))[1]["motion_contradicted"] == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import struct
@@ -27,6 +26,7 @@ from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
 from tests.growth import assert_no_worse_than_linear
+from tests.painted import picture_file
 from tests.strategies import plan_document, plan_of, plans, rectangle, spiral
 
 
@@ -300,9 +300,7 @@ def test_metadata_are_read_in_linear_time(packet: Callable[[int], bytes]) -> Non
 
 
 def _picture(name: str) -> bytes:
-    buffer = io.BytesIO()
-    Image.new("RGB", (256, 128), (90, 90, 90)).save(buffer, name)
-    return buffer.getvalue()
+    return picture_file(Image.new("RGB", (256, 128), (90, 90, 90)), name)
 
 
 def _segment(marker: int, content: bytes) -> bytes:

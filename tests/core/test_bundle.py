@@ -6,7 +6,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import onnx
@@ -63,11 +63,6 @@ def exported_bundle(folder: Path, config: TrainConfig) -> Bundle:
 def bundle_copy(tiny_bundle: Path, tmp_path: Path) -> Path:
     """Copy of the tiny bundle that a test may damage."""
     return Path(shutil.copytree(tiny_bundle, tmp_path / "copy"))
-
-
-def edit_manifest(folder: Path, **changes: Any) -> None:
-    path = folder / MANIFEST_NAME
-    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
 
 
 class TestExport:
@@ -171,11 +166,8 @@ class TestExport:
         scene = scene_of(crooked_flat(), 2, 0)
         profile = torch.empty(2, 64).uniform_(0.5, 5.0)
         heights = (torch.full((2,), 1.5), torch.full((2,), 2.5))
-        np.testing.assert_allclose(
-            encoders.layouts.latents(profile.numpy(), *(h.numpy() for h in heights)),
-            optimiser.encoder(profile, *heights).numpy(),
-            atol=1e-4,
-        )
+        latents = encoders.layouts.latents(profile.numpy(), *(h.numpy() for h in heights))
+        np.testing.assert_allclose(latents, optimiser.encoder(profile, *heights).numpy(), atol=1e-4)
         assert encoders.layouts.poses(scene.plan, scene.poses, scene.heading, 1.5)[0].shape == (2, 128)
 
 
@@ -224,7 +216,8 @@ class TestReading:
         ],
     )
     def test_manifest_with_invalid_entries_is_refused(self, bundle_copy: Path, changes: dict) -> None:
-        edit_manifest(bundle_copy, **changes)
+        path = bundle_copy / MANIFEST_NAME
+        path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changes), encoding="utf-8")
         with pytest.raises(BundleError):
             Bundle.open(bundle_copy)
 

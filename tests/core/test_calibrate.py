@@ -67,14 +67,8 @@ def result(
     latent_distance: float = 0.1,
 ) -> Prediction:
     """Return a prediction with a position error (m); NaN for no answer."""
-    signals = {
-        "log_odds": log_odds,
-        "cost": cost,
-        "uncertainty": uncertainty,
-        "latent_distance": latent_distance,
-        "cost_to_chance": answer_to_chance + 0.5,
-        "answer_to_chance": answer_to_chance,
-    }
+    signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty, "latent_distance": latent_distance}
+    signals |= {"cost_to_chance": answer_to_chance + 0.5, "answer_to_chance": answer_to_chance}
     if math.isnan(error_m):
         return prediction_of(TRUTH)
     return prediction_of(TRUTH, stages={"lpo": dataclasses.replace(TRUTH, x_m=error_m)}, signals={"lpo": signals})
@@ -292,11 +286,9 @@ class TestHeadingDoubt:
         searched = [answer(f"home-{k}", cost) for k, cost in enumerate(given * (1.0 - gain))]
         known.append(answer("once", 9.0))
         unanswered = dataclasses.replace(result(math.nan), scene="home-7")
-        weights = with_heading_doubt(
-            MatchingWeights(openings=0.3),
-            Answers(own=known[:100], disturbed=known[100:]),
-            Answers(own=searched[:100], disturbed=[*searched[100:], unanswered]),
-        )
+        with_heading = Answers(own=known[:100], disturbed=known[100:])
+        without = Answers(own=searched[:100], disturbed=[*searched[100:], unanswered])
+        weights = with_heading_doubt(MatchingWeights(openings=0.3), with_heading, without)
         assert weights.usual_cost == pytest.approx(np.quantile(given, 0.95))
         assert weights.usual_gain == pytest.approx(np.quantile(gain, 0.995))
         assert weights.openings == 0.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,16 +13,8 @@ from hypothesis import strategies as st
 
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 
-DISTORTED = Perspective(
-    width=640,
-    height=480,
-    fx=500.0,
-    fy=510.0,
-    cx=300.0,
-    cy=250.0,
-    radial=(-0.28, 0.09, -0.01),
-    tangential=(0.002, -0.001),
-)
+_IDEAL = Perspective(width=640, height=480, fx=500.0, fy=510.0, cx=300.0, cy=250.0)
+DISTORTED = replace(_IDEAL, radial=(-0.28, 0.09, -0.01), tangential=(0.002, -0.001))
 FISHEYE = Fisheye(width=640, height=480, fx=200.0, fy=205.0, cx=310.0, cy=245.0, radial=(0.03, -0.01, 0.002, -0.0001))
 CAMERAS: list[Camera] = [
     Perspective.of_hfov(640, 480, math.radians(70.0)),

@@ -15,7 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers import import_plan
 from lalaloc_core.importers.importing import FORMATS
-from tests.strategies import plan_document, rectangle
+from tests.strategies import plan_document, present, rectangle
 
 GEOD = pyproj.Geod(ellps="WGS84")
 # Longitude and latitude of places where longitudes jump, and of a usual place.
@@ -45,8 +45,7 @@ def test_control_points_make_an_anchor_anywhere(place: tuple[float, float]) -> N
         for (x, y), (longitude, latitude) in zip(DRAWN.tolist(), known.to_earth(DRAWN), strict=True)
     ]
     document = plan_document(rectangle(4.0, 3.0)) | {"anchor": {"control_points": points}}
-    found = FloorPlan.from_dict(document).anchor
-    assert found is not None
+    found = present(FloorPlan.from_dict(document).anchor)
     corners = np.array([[0.0, 0.0], [4.0, 3.0], [-50.0, 20.0]])
     assert _distance_m(found.to_earth(corners), known.to_earth(corners)).max() < 1e-3
 

@@ -16,22 +16,14 @@ from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from tests.strategies import plan_document, plan_of, plans, rectangle, room_polygons
 
-EXAMPLE = {
-    "name": "Flat 3",
-    "ceiling_height_m": 2.5,
-    "camera_height_m": 1.5,
-    "rooms": [{"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.4}],
-}
+_KITCHEN = {"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.4}
+EXAMPLE = {"name": "Flat 3", "ceiling_height_m": 2.5, "camera_height_m": 1.5, "rooms": [_KITCHEN]}
 
 
 def refused(document: Any, limits: PlanLimits | None = None) -> InvalidFloorPlanError:
     with pytest.raises(InvalidFloorPlanError) as caught:
         FloorPlan.from_dict(document, limits or PlanLimits())
     return caught.value
-
-
-def with_polygon(polygon: Any) -> dict[str, Any]:
-    return plan_document(rectangle(2.0, 2.0, corner=(50.0, 0.0)), polygon)
 
 
 def test_native_format_is_read() -> None:
@@ -95,7 +87,7 @@ def test_unnamed_room_gets_a_number() -> None:
     ],
 )
 def test_bad_polygon_error_names_the_room(polygon: Any, reason: str) -> None:
-    error = refused(with_polygon(polygon))
+    error = refused(plan_document(rectangle(2.0, 2.0, corner=(50.0, 0.0)), polygon))
     assert error.room == "room 2"
     assert reason in error.reason
     assert "room 2" in str(error)

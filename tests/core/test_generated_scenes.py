@@ -67,14 +67,8 @@ def test_every_photograph_identifies_its_copy() -> None:
         for camera in scene.cameras:
             whole, room = divmod(camera.room_index, rooms)
             away = np.arange(4) - whole
-            seen = render_layout(
-                camera.position_m + away[:, None] * np.array([step_m, 0.0]),
-                np.zeros(4),
-                room + rooms * np.arange(4),
-                plan.geometry,
-                128,
-                camera.camera_height_m,
-            ).kind
+            places, copies = camera.position_m + away[:, None] * np.array([step_m, 0.0]), room + rooms * np.arange(4)
+            seen = render_layout(places, np.zeros(4), copies, plan.geometry, 128, camera.camera_height_m).kind
             lacking = (seen[whole] == OPENING_CLASSES.index("door")) & (seen != seen[whole])
             assert all(lacking[copy].sum() >= 2 for copy in range(4) if copy != whole)
             photographs += 1

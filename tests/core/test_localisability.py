@@ -148,10 +148,8 @@ def test_large_plan_is_predicted_on_a_coarser_grid(manifest: Manifest) -> None:
 
 def test_fewer_photographs_are_found_by_openings_that_may_be_drawn_wrongly(manifest: Manifest) -> None:
     room = {"name": "hall", "polygon": [[0.0, 0.0], [7.0, 0.0], [7.0, 7.0], [0.0, 7.0]], "ceiling_height_m": 2.5}
-    openings = [
-        {"kind": "door", "line": [[1.0, 0.0], [2.0, 0.0]]},
-        {"kind": "window", "line": [[7.0, 4.0], [7.0, 6.5]]},
-    ]
+    door, window = [[1.0, 0.0], [2.0, 0.0]], [[7.0, 4.0], [7.0, 6.5]]
+    openings = [{"kind": "door", "line": door}, {"kind": "window", "line": window}]
     document = {"rooms": [room], "openings": openings, "opening_kinds": []}
     shares = []
     for trust in (1.0, 0.3):

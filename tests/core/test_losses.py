@@ -258,12 +258,8 @@ class TestAccuracy:
 
     def test_limits_are_exclusive(self) -> None:
         accuracy = Accuracy.from_errors(np.array([0.01, 0.05, 0.10, 1.0]))
-        assert [accuracy.within_1cm, accuracy.within_5cm, accuracy.within_10cm, accuracy.within_1m] == [
-            0.0,
-            0.25,
-            0.5,
-            0.75,
-        ]
+        shares = [accuracy.within_1cm, accuracy.within_5cm, accuracy.within_10cm, accuracy.within_1m]
+        assert shares == [0.0, 0.25, 0.5, 0.75]
 
     @given(st.lists(st.floats(0.0, 10.0) | st.just(float("nan")), min_size=1, max_size=30))
     def test_shares_grow_with_the_limit(self, errors: list[float]) -> None:

@@ -327,12 +327,9 @@ class TestCameraHeight:
 def test_terms_add_up_to_the_cost() -> None:
     rng = np.random.default_rng(0)
     seen = SeenThrough(np.array([1, 2]), np.array([3, 5]), np.full(2, DOOR_CODE, np.uint8), np.full(2, 1.5, np.float32))
-    layouts = Layouts(
-        rng.normal(size=(4, 12)).astype(np.float32),
-        np.array([0, 1, 0, 1]),
-        rng.choice([WALL_CODE, DOOR_CODE], (4, 12)).astype(np.uint8),
-        seen,
-    )
+    log_profile = rng.normal(size=(4, 12)).astype(np.float32)
+    kind = rng.choice([WALL_CODE, DOOR_CODE], (4, 12)).astype(np.uint8)
+    layouts = Layouts(log_profile, np.array([0, 1, 0, 1]), kind, seen)
     types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
     query = make_query(
         rng.normal(size=(2, 12)),

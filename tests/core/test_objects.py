@@ -31,6 +31,7 @@ from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.questions import perfect_query
 from tests.core.taken import jpeg, sphere, take
+from tests.strategies import present
 
 FIELD_DEG = 80.0
 # Bed of the hotel room: azimuth from the sphere's centre.
@@ -74,8 +75,7 @@ def plan(*types: str) -> FloorPlan:
 
 
 def test_bed_is_seen_where_it_stands() -> None:
-    shown = query((view("hotel_room", BED_DEG - 15.0), 0.0)).objects
-    assert shown is not None
+    shown = present(query((view("hotel_room", BED_DEG - 15.0), 0.0)).objects)
     beds = [seen for seen in shown.objects if seen.name in ("four-poster bed", "quilt", "pillows", "couch")]
     assert beds
     assert math.degrees(beds[0].azimuth) == pytest.approx(15.0, abs=25.0)
@@ -83,8 +83,7 @@ def test_bed_is_seen_where_it_stands() -> None:
 
 
 def test_low_confidence_of_a_photograph_without_household_objects_has_its_reason() -> None:
-    room = query((view("hotel_room", BED_DEG), 0.0)).objects
-    assert room is not None
+    room = present(query((view("hotel_room", BED_DEG), 0.0)).objects)
     assert room.outside < 0.0
     assert outside_odds(np.full(63, 0.0005)) > 3.0
     outside = replace(room, outside=3.0)
@@ -154,8 +153,7 @@ def test_views_of_one_spot_share_their_objects() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640), (1280, 320), (200, 900)])
 def test_thumbnails_have_a_bounded_size(width: int, height: int) -> None:
-    thumbnail = view("hotel_room", BED_DEG, width, height).thumbnail
-    assert thumbnail is not None
+    thumbnail = present(view("hotel_room", BED_DEG, width, height).thumbnail)
     rows, columns = thumbnail.shape[:2]
     assert rows % 32 == columns % 32 == 0
     assert 0.7 < rows * columns / (320 * 256) < 1.3
@@ -171,8 +169,7 @@ def test_features_carry_objects_and_files_of_version_1_are_read() -> None:
     assert [seen.name for seen in found.objects] == [seen.name for seen in expected.objects]
     for seen, other in zip(found.objects, expected.objects, strict=True):
         assert (seen.azimuth, seen.probability) == pytest.approx((other.azimuth, other.probability))
-    objects = bundle().manifest.objects
-    assert objects is not None
+    objects = present(bundle().manifest.objects)
     arrays = 2 * 4 * len(objects.names)
     first = content[:4] + struct.pack("<H", 1) + content[6:-arrays]
     assert query((read_features(first, bundle()), 0.0)).objects is None
@@ -232,8 +229,7 @@ def test_stove_ahead_and_the_stove_that_is_drawn_tell_the_heading() -> None:
     grid = build_grid(drawn, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     for azimuth_deg, expected_deg in ((0.0, 90.0), (90.0, 0.0)):
         asked = seen_from_the_middle(drawn, SeenObject("stove", 0.9, math.radians(azimuth_deg)))
-        cost = PlaceCost.of(drawn, asked, NO_HINTS, 1.0, np.array([[2.0, 1.5], [7.0, 1.5]]), np.array([0, 1]))
-        assert cost is not None
+        cost = present(PlaceCost.of(drawn, asked, NO_HINTS, 1.0, np.array([[2.0, 1.5], [7.0, 1.5]]), np.array([0, 1])))
         best = int(cost.of_poses(np.array([0]))[0].argmin())
         assert math.degrees(asked.roll[best]) == pytest.approx(expected_deg)
         # In a room without the stove all headings cost the same.

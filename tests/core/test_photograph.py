@@ -26,6 +26,7 @@ from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
+from tests.painted import picture_file
 
 Tag = ExifTags.Base
 MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
@@ -46,9 +47,7 @@ def view_of(camera: Camera, name: str = "living_room", heading_deg: float = 0.0)
 
 
 def with_xmp(pixels: np.ndarray, properties: str) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "JPEG", xmp=GPANO.format(properties).encode())
-    return buffer.getvalue()
+    return picture_file(pixels, "JPEG", xmp=GPANO.format(properties).encode())
 
 
 class TestProjection:
@@ -343,9 +342,7 @@ class TestPatches:
         """Sampling without filtering would turn stripes into moiré."""
         stripes = np.zeros((1512, 2016, 3), np.uint8)
         stripes[:, ::2] = 254
-        buffer = io.BytesIO()
-        Image.fromarray(stripes).save(buffer, "PNG")
-        (patch,) = opened(buffer.getvalue(), hfov_deg=67.0, pitch_deg=0.0, roll_deg=0.0).patches
+        (patch,) = opened(picture_file(stripes), hfov_deg=67.0, pitch_deg=0.0, roll_deg=0.0).patches
         assert patch.pixels[patch.seen].std() < 4.0
 
     def test_verticals_of_a_tilted_photograph_become_vertical(self) -> None:

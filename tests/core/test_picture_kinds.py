@@ -17,6 +17,8 @@ from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.drawing.sketch_drawing import naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.photograph import StatedCamera, open_photograph
+from tests.painted import picture_file
+from tests.strategies import present
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PHOTOGRAPHS = sorted([*EXAMPLES.glob("*.jpg"), *EXAMPLES.glob("real/*.jpg")])
@@ -30,8 +32,7 @@ def test_photographs_are_not_taken_for_drawings() -> None:
 
 @pytest.mark.parametrize("shade", [255, 128, 0])
 def test_plain_pictures_are_neither(shade: int) -> None:
-    tones = Tones.of(np.full((300, 400), shade, np.uint8))
-    assert tones is not None
+    tones = present(Tones.of(np.full((300, 400), shade, np.uint8)))
     assert not tones.is_drawing
     assert not tones.is_photograph
     assert Tones.of(np.zeros((8, 900), np.uint8)) is None
@@ -41,8 +42,7 @@ def test_plain_pictures_are_neither(shade: int) -> None:
 def test_drawn_and_scanned_plans_are_not_taken_for_photographs(style: Style) -> None:
     drawn = draw_plan(style, 3)
     content = drawn.jpeg() if style == "scanned" else drawn.png()
-    tones = Tones.of(np.asarray(Image.open(io.BytesIO(content)).convert("L")))
-    assert tones is not None
+    tones = present(Tones.of(np.asarray(Image.open(io.BytesIO(content)).convert("L"))))
     assert not tones.is_photograph
 
 
@@ -55,9 +55,8 @@ def test_plans_with_coloured_rooms_are_drawings(style: Style) -> None:
     for x, y in rng.integers(picture.size, size=(60, 2)).tolist():
         if np.asarray(picture)[y, x].min() > 235:
             ImageDraw.floodfill(picture, (x, y), tuple(rng.integers(150, 245, 3).tolist()), thresh=30)
-    stream = io.BytesIO()
-    picture.resize((picture.width // 2, picture.height // 2)).save(stream, "JPEG", quality=70)
-    assert is_drawing(np.asarray(Image.open(stream)))
+    content = picture_file(picture.resize((picture.width // 2, picture.height // 2)), "JPEG", quality=70)
+    assert is_drawing(np.asarray(Image.open(io.BytesIO(content))))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -76,11 +75,10 @@ def test_plan_given_as_a_photograph_is_refused(stated: StatedCamera | None) -> N
     # Also one that is twice as wide as high, like a sphere.
     wide = Image.new("RGB", (2 * picture.height, picture.height), "white")
     wide.paste(picture.resize((picture.height, picture.height)))
-    stream = io.BytesIO()
-    (picture if stated is not None else wide).save(stream, "PNG")
+    content = picture_file(picture if stated is not None else wide)
     stated = stated or StatedCamera(projection="equirectangular")
     with pytest.raises(InvalidPhotographError, match="is a drawing or a page of text, not a photograph"):
-        open_photograph(stream.getvalue(), sphere_size=(256, 512), stated=stated)
+        open_photograph(content, sphere_size=(256, 512), stated=stated)
 
 
 def test_errors_name_a_page_of_text() -> None:

@@ -20,6 +20,7 @@ from lalaloc_core.draw.canvas import document, words
 from lalaloc_core.draw.pdf import write_pdf
 from lalaloc_core.photograph.placed_copy import Place, placed_copy
 from lalaloc_core.shown_text import no_formula, printable
+from tests.painted import picture_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLACE = Place(room="Küche", level="Ground & first", latitude=-33.8568, longitude=151.2153, direction_deg=271.24)
@@ -42,20 +43,11 @@ def pinned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder, out
 
 
-def _document(out: Path) -> Any:
-    return json.loads((out / "pins.json").read_text())
-
-
 def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Path]) -> None:
-    pins = _document(pinned[1])
+    pins = json.loads((pinned[1] / "pins.json").read_text())
     rooms = {entry["photograph"]: entry["room"] for entry in pins["photographs"]}
-    assert rooms == {
-        "broken.jpg": None,
-        "kitchen.jpg": "kitchen",
-        "phone.jpg": "living room",
-        "study copy.jpg": "study",
-        "study.jpg": "study",
-    }
+    places = {"kitchen.jpg": "kitchen", "phone.jpg": "living room", "study copy.jpg": "study", "study.jpg": "study"}
+    assert rooms == {"broken.jpg": None} | places
     notes = " ".join(pins["notes"])
     assert "'broken.jpg' is set aside: the photograph is not a readable JPEG" in notes
     assert "copies of other files, which have the same pin: 1" in notes
@@ -201,9 +193,7 @@ def test_missing_plan_is_named(plan: str, tmp_path: Path, capsys: pytest.Capture
 
 def _picture(kind: str, **options: Any) -> bytes:
     rng = np.random.default_rng(0)
-    content = io.BytesIO()
-    Image.fromarray(rng.integers(0, 256, (96, 128, 3), np.uint8)).save(content, kind, **options)
-    return content.getvalue()
+    return picture_file(rng.integers(0, 256, (96, 128, 3), np.uint8), kind, **options)
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG"])

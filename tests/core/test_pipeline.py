@@ -56,10 +56,6 @@ def random_pose(plan: FloorPlan, seed: int) -> PoseSet:
     return random_poses(plan, 1, np.random.default_rng(seed))
 
 
-def error_m(found: Localisation, pose: PoseSet) -> float:
-    return float(np.linalg.norm(found.candidates[0].position_m - pose.position_m[0]))
-
-
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
     def test_each_stage_is_more_accurate(
@@ -71,7 +67,7 @@ class TestAccuracy:
             query = layout_query(encoders, flat, pose, by_profile=by_profile)
             for refine, distances in errors.items():
                 found = search(query, refine=refine)
-                distances.append(error_m(found, pose))
+                distances.append(float(np.linalg.norm(found.candidates[0].position_m - pose.position_m[0])))
         median = {refine: float(np.median(distances)) for refine, distances in errors.items()}
         assert median["lpo"] < 0.005 < median["vdr"] < median["none"] < 0.5
         assert np.mean(np.array(errors["lpo"]) < 0.01) >= 0.8

@@ -29,10 +29,8 @@ HEADING = 0.5 * np.pi
 
 
 def write_room(folder: Path, seed: int) -> None:
-    openings = [
-        {"kind": "door", "line": [[5.0, 0.5], [5.0, 1.5]]},
-        {"kind": "window", "line": [[0.5, 6.0], [1.5, 6.0]]},
-    ]
+    door, window = [[5.0, 0.5], [5.0, 1.5]], [[0.5, 6.0], [1.5, 6.0]]
+    openings = [{"kind": "door", "line": door}, {"kind": "window", "line": window}]
     room = {
         "seed": seed,
         "kind": "kitchen",
@@ -71,11 +69,8 @@ def house(tmp_path: Path) -> Path:
 class TestReading:
     def test_every_fifth_seed_validates_and_the_others_train(self, rooms: Path) -> None:
         dataset = PosedSpheres(rooms)
-        assert [list(dataset.scenes(split)) for split in ("train", "validation", "test")] == [
-            ["2003", "2004"],
-            ["2005"],
-            [],
-        ]
+        scenes = [list(dataset.scenes(split)) for split in ("train", "validation", "test")]
+        assert scenes == [["2003", "2004"], ["2005"], []]
 
     def test_house_validates_only(self, house: Path) -> None:
         dataset = PosedSpheres(house)

@@ -180,14 +180,8 @@ class TestSignals:
         query = dataclasses.replace(PLAIN, profile=profile)
         posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0, NOWHERE)
         found = signals_of(query, candidate(5.0, 0.4), posterior, 0.6, 0.8)
-        expected = Signals(
-            log_odds=math.log(4.0),
-            cost=0.4,
-            uncertainty=-2.5,
-            latent_distance=0.3,
-            cost_to_chance=math.log(0.61 / 0.81),
-            answer_to_chance=math.log(0.41 / 0.81),
-        )
+        chances = {"cost_to_chance": math.log(0.61 / 0.81), "answer_to_chance": math.log(0.41 / 0.81)}
+        expected = Signals(log_odds=math.log(4.0), cost=0.4, uncertainty=-2.5, latent_distance=0.3, **chances)
         assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
 
     @pytest.mark.parametrize("profile", [None, PredictedProfile(np.zeros((1, 4)), np.full((1, 4), np.inf))])

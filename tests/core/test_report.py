@@ -134,7 +134,6 @@ def page_of(*runs: Path, out: Path) -> tuple[Page, str]:
 
 @pytest.fixture(scope="module")
 def text(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Report on `mixed`."""
     folder = tmp_path_factory.mktemp("report")
     return page_of(run_folder(folder / "run", mixed()), out=folder / "report.html")[1]
 

@@ -68,19 +68,9 @@ class PlaceEncoders(LayoutEncoder):
     """Fake encoder: the latent of a pose is a direction that depends smoothly on its position."""
 
     def __init__(self) -> None:
-        self.manifest = Manifest(
-            name="places",
-            version="1",
-            architecture="paper",
-            layout_config={},
-            profile_columns=1,
-            image_height=1,
-            image_width=2,
-            image_mean=[],
-            image_std=[],
-            latent_size=4,
-            ring_sectors=0,
-        )
+        sizes: dict[str, Any] = {"image_height": 1, "image_width": 2, "profile_columns": 1, "latent_size": 4}
+        sizes |= {"ring_sectors": 0, "layout_config": {}, "image_mean": [], "image_std": []}
+        self.manifest = Manifest(name="places", version="1", architecture="paper", **sizes)
 
     def poses(
         self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"], camera_height_m: float

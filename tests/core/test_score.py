@@ -302,12 +302,8 @@ class TestSummary:
 def layout_run(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run of layout queries of two generated homes, one of them made wrong."""
     folder = RunFolder(tmp_path_factory.mktemp("worst"))
-    info = run_info(
-        split="validation",
-        settings={"refine": "none"},
-        generated={"homes": 2, "shots_per_home": 2, "furniture": "empty"},
-        bundle=str(tiny_bundle),
-    )
+    generated = {"homes": 2, "shots_per_home": 2, "furniture": "empty"}
+    info = run_info(split="validation", settings={"refine": "none"}, generated=generated, bundle=str(tiny_bundle))
     predictions = run_evaluation(folder, info, workers=0)
     folder.replace([replace(predictions[0], stages={}), *predictions[1:]])
     return folder.path

@@ -360,12 +360,8 @@ class TestMethod:
     def test_alignment_outside_keeps_its_start_room(self) -> None:
         # The scan of a large room does not fit a small one, so the camera ends outside.
         small, large = plan_of(rectangle(1.0, 1.0)), plan_of(rectangle(8.0, 8.0))
-        question = question_at(
-            small,
-            (0.9, 0.9),
-            photograph=BareRoom(large, (7.5, 7.5), 0.0),
-            grid=PoseSet(np.full((1, 2), 0.5), np.zeros(1, int)),
-        )
+        photograph, grid = BareRoom(large, (7.5, 7.5), 0.0), PoseSet(np.full((1, 2), 0.5), np.zeros(1, int))
+        question = question_at(small, (0.9, 0.9), photograph=photograph, grid=grid)
         found = Icp().locate(question).stages["icp"]
         assert small.room_index_at(np.array([[found.x_m, found.y_m]])).tolist() == [-1]
         assert found.room_index == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator
 from functools import cache
@@ -20,6 +19,8 @@ from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, fi
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import jpeg, sphere, take
 from tests.core.test_photo_sphere import encoded, xmp
+from tests.painted import picture_file
+from tests.strategies import present
 
 PART: dict[str, object] = {
     "FullPanoWidthPixels": 1024,
@@ -113,8 +114,7 @@ def unusable(sphere: np.ndarray) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", NAMES)
 def test_sphere_is_taken_out_of_its_bars(name: str) -> None:
     sphere = small(name)
-    whole = opened(jpeg(sphere)).sphere
-    assert whole is not None
+    whole = present(opened(jpeg(sphere)).sphere)
     for words, pixels in usable(sphere).items():
         view = opened(jpeg(pixels))
         assert (view.projection, view.projection_source) == ("equirectangular", "estimated"), words
@@ -166,8 +166,7 @@ def test_statement_turns_a_refusal_into_a_warning() -> None:
 @pytest.mark.parametrize("orientation", [6, 8])
 def test_orientation_of_a_sphere_is_ignored(orientation: int) -> None:
     view = opened(jpeg(small("kitchen"), orientation=orientation))
-    whole = opened(jpeg(small("kitchen"))).sphere
-    assert whole is not None
+    whole = present(opened(jpeg(small("kitchen"))).sphere)
     assert view.sphere is not None
     assert np.abs(view.sphere.astype(int) - whole).mean() < 3.0
     assert f"Exif orientation {orientation}, which is ignored" in view.warnings[0]
@@ -232,9 +231,7 @@ class TestParts:
 
 def test_photograph_is_taken_out_of_its_bars() -> None:
     view = take(small("study"), Perspective.of_hfov(640, 400, math.radians(80.0)))
-    buffer = io.BytesIO()
-    Image.fromarray(barred(view, 60, 0)).save(buffer, "PNG")
-    found = opened(buffer.getvalue())
+    found = opened(picture_file(barred(view, 60, 0)))
     assert found.projection == "perspective"
     assert "within bars, 23% of the picture, as in a screenshot" in found.warnings[0]
     assert found.camera is not None
@@ -256,11 +253,11 @@ def test_black_zenith_and_nadir_are_of_the_sphere() -> None:
 def test_orientation_of_a_picture_that_was_turned_is_ignored(
     size: tuple[int, int], stated: tuple[int, int], is_ignored: bool
 ) -> None:
-    exif, content = Image.Exif(), io.BytesIO()
+    exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.ExifImageWidth: stated[0], ExifTags.Base.ExifImageHeight: stated[1]}
-    Image.new("RGB", size).save(content, "JPEG", exif=exif.tobytes())
-    with opened_picture(content.getvalue(), PhotographLimits()) as file:
+    content = picture_file(Image.new("RGB", size), "JPEG", exif=exif.tobytes())
+    with opened_picture(content, PhotographLimits()) as file:
         assert (file.orientation, len(file.warnings)) == ((1, 1) if is_ignored else (6, 0))
 
 

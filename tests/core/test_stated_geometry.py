@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,16 +51,8 @@ def test_calibration_of_the_stored_picture_is_turned(orientation: int) -> None:
     assert "the middle of a picture on its side, not of the upright one of 480 x 640" in text
     assert found.cx is not None
     assert found.cy is not None
-    upright = Perspective(
-        width=480,
-        height=640,
-        fx=found.fx,
-        fy=found.fy,
-        cx=found.cx + 0.5,
-        cy=found.cy + 0.5,
-        radial=(found.k1, found.k2, found.k3),
-        tangential=(found.p1, found.p2),
-    )
+    ideal = Perspective(width=480, height=640, fx=found.fx, fy=found.fy, cx=found.cx + 0.5, cy=found.cy + 0.5)
+    upright = replace(ideal, radial=(found.k1, found.k2, found.k3), tangential=(found.p1, found.p2))
     pixels = np.random.default_rng(0).uniform((50, 50), (590, 430), (50, 2))
     right, forward, up = stored.rays(pixels).T
     # A quarter turn of picture and rays together.

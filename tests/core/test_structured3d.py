@@ -53,10 +53,6 @@ def sphere_of(root: Path, room_index: int = 0) -> Path:
     return root / NAME / "2D_rendering" / room_id(room_index) / "panorama"
 
 
-def read_document(root: Path) -> dict[str, Any]:
-    return json.loads((root / NAME / "annotation_3d.json").read_text())
-
-
 def annotation_of(folder: Path, document: dict[str, Any]) -> Annotation:
     write_annotation(folder, document)
     return read_annotation(folder / "annotation_3d.json", NAME)
@@ -298,7 +294,7 @@ class TestBadAnnotation:
     def test_bad_annotation_is_refused(
         self, root: Path, change: Callable[[dict[str, Any]], None], room: str | None, reasons: list[str]
     ) -> None:
-        document = read_document(root)
+        document = json.loads((root / NAME / "annotation_3d.json").read_text())
         change(document)
         write_annotation(root / NAME, document)
         error = refused(root, *reasons, room=room)

@@ -36,6 +36,7 @@ from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import Sun
 from lalaloc_core.learn.synth.scene.shells import ceiling_boxes
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot, sample_shots, stage_rooms
+from tests.painted import picture_file
 from tests.strategies import seeds
 
 
@@ -352,13 +353,11 @@ def test_no_patch_covers_nothing() -> None:
 @pytest.mark.parametrize("rows", [ROWS, ROWS - 6])
 def test_compression_error_matches_jpeg_files(quality: int, rows: int) -> None:
     picture = noise_picture(3)[:, :rows]
-    picture = (picture + 0.05 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)).double()).clamp(
-        0, 1
-    )
+    noise = torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)).double()
+    picture = (picture + 0.05 * noise).clamp(0, 1)
     pixels = (picture[0] * 255.0).round().to(torch.uint8).numpy()
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "JPEG", quality=quality, subsampling=0)
-    expected = np.asarray(Image.open(file), dtype=float) / 255.0
+    file = picture_file(pixels, "JPEG", quality=quality, subsampling=0)
+    expected = np.asarray(Image.open(io.BytesIO(file)), dtype=float) / 255.0
     ours = compress(torch.from_numpy(pixels)[None] / 255.0, torch.tensor([float(quality)]))[0].numpy()
     loss, difference = np.abs(expected - pixels / 255.0).mean(), np.abs(expected - ours).mean()
     assert difference < 0.35 * loss + 0.002

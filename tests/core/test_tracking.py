@@ -250,9 +250,8 @@ class TestLevels:
         assert max(kept.by_plan, key=kept.by_plan.__getitem__) == "plan 1"
 
     def test_stairs_are_taken_rather_than_walls(self, encoders: PhotographEncoder) -> None:
-        ground = building(
-            encoders, [level_of(LOWER, STAIRS, stairs="stairs"), level_of(UPPER, STAIRS, stairs="stairs")]
-        )
+        levels = [level_of(outline, STAIRS, stairs="stairs") for outline in (LOWER, UPPER)]
+        ground = building(encoders, levels)
         moves = Odometry.of_stds(0.5, 0.0, 0.0, EXACT)
         arrived = []
         for place in ((1.0, 1.0), (5.0, 1.2)):

@@ -276,11 +276,9 @@ class TestStreams:
         stage = TINY.layout
         anchors = stage.homes_per_step * stage.anchors_per_home
         size = 1 + stage.triplets.positives + stage.triplets.negatives
-        assert {key: tuple(value.shape) for key, value in batch.items()} == {
-            "profile_m": (anchors, size, TINY.profile_columns),
-            "camera_height_m": (anchors, size),
-            "ceiling_height_m": (anchors, size),
-        }
+        shapes = {key: tuple(value.shape) for key, value in batch.items()}
+        heights = dict.fromkeys(("camera_height_m", "ceiling_height_m"), (anchors, size))
+        assert shapes == {"profile_m": (anchors, size, TINY.profile_columns), **heights}
         assert all(value.dtype == torch.float32 for value in batch.values())
         assert bool(torch.isfinite(batch["profile_m"]).all())
         assert bool((batch["camera_height_m"] < batch["ceiling_height_m"]).all())

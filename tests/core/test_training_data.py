@@ -82,14 +82,9 @@ class TestDrawing:
         ):
             scene = data.load(f"scene {grey // 40}")
             camera = scene.cameras[grey % 40 // 10]
-            expected = profiles_at(
-                scene.plan,
-                np.asarray(camera.position_m)[None],
-                np.array([camera.room_index]),
-                np.array([heading]),
-                CONFIG.profile_columns,
-                np.float32,
-            )[0]
+            place, room = np.asarray(camera.position_m)[None], np.array([camera.room_index])
+            columns = CONFIG.profile_columns
+            expected = profiles_at(scene.plan, place, room, np.array([heading]), columns, np.float32)[0]
             np.testing.assert_allclose(profile, expected, rtol=1e-4)
             assert height.item() == pytest.approx(camera.camera_height_m)
 
@@ -118,14 +113,9 @@ class TestDrawing:
         batch = next(load_batches(LayoutBatches(CONFIG, source), 0))
         cameras = [camera for name in data.scenes("train") for camera in data.load(name).cameras]
         plan = crooked_flat()
-        profiles = profiles_at(
-            plan,
-            np.stack([camera.position_m for camera in cameras]),
-            np.array([camera.room_index for camera in cameras]),
-            np.zeros(len(cameras)),
-            CONFIG.profile_columns,
-            np.float32,
-        )
+        places = np.stack([camera.position_m for camera in cameras])
+        rooms = np.array([camera.room_index for camera in cameras])
+        profiles = profiles_at(plan, places, rooms, np.zeros(len(cameras)), CONFIG.profile_columns, np.float32)
         for anchor, heights in zip(batch["profile_m"][:, 0].numpy(), batch["camera_height_m"], strict=True):
             distance = np.abs(profiles - anchor).max(axis=1)
             assert distance.min() < 1e-4
@@ -189,11 +179,8 @@ class TestRuns:
     def test_resuming_on_other_data_is_refused(self, data: OwnData) -> None:
         folder = data.root.parent / "run"
         trained = train_stage("layout", CONFIG, folder, device=CPU, data=TrainingData(dataset=data), workers=0)
-        assert (
-            Checkpoint.load(folder / "layout.pt").data
-            == trained.data
-            == {"description": data.description, "scenes": SCENES}
-        )
+        expected = {"description": data.description, "scenes": SCENES}
+        assert Checkpoint.load(folder / "layout.pt").data == trained.data == expected
         assert {"val_within_1m", "val_median_cm"} <= set(trained.metrics)
         with pytest.raises(CheckpointError, match="homes generated while training"):
             train_stage("layout", CONFIG, folder, device=CPU, workers=0, resume=True)

@@ -87,16 +87,9 @@ def plan(**changes: Any) -> FloorPlan:
     return FloorPlan.from_dict(document | changes)
 
 
-def camera(camera_height_m: float) -> Camera:
-    """Return a camera in the middle of the plan's room."""
-    return Camera(
-        name="",
-        position_m=np.array([2.0, 2.0]),
-        room_index=0,
-        heading=0.0,
-        camera_height_m=camera_height_m,
-        photographs={},
-    )
+def camera(height_m: float) -> Camera:
+    middle_m = np.array([2.0, 2.0])
+    return Camera(name="", position_m=middle_m, room_index=0, heading=0.0, camera_height_m=height_m, photographs={})
 
 
 class TestLabels:
@@ -268,9 +261,8 @@ class TestRuns:
         assert Checkpoint.load(folder / "layout.pt").config.architecture == "ring"
         bundle = Bundle.open(folder / "bundle")
         assert bundle.manifest.architecture == "trunk"
-        query = PhotographEncoder(bundle, threads=1).spheres.query(
-            np.zeros((*TINY.image_size, 3), np.uint8), None, CameraHeight(1.5)
-        )
+        black = np.zeros((*TINY.image_size, 3), np.uint8)
+        query = PhotographEncoder(bundle, threads=1).spheres.query(black, None, CameraHeight(1.5))
         expected = losses.opening_prior(checkpoint.averaged["image_encoder"]["opening_share"], 0.5)
         np.testing.assert_allclose(present(query.openings).prior, expected, rtol=1e-5)
 
@@ -320,15 +312,8 @@ class TestRuns:
         nothing = Checkpoint(stage="image", config=config, weights={})
         monkeypatch.setattr(run, "run_stage", lambda *_, **__: nothing)
         for resume, expected in ((False, 1), (True, 1)):
-            run.train_stage(
-                "image",
-                config,
-                folder,
-                device=CPU,
-                data=dataclasses.replace(FEW, validation_scenes=0),
-                workers=0,
-                resume=resume,
-            )
+            data = dataclasses.replace(FEW, validation_scenes=0)
+            run.train_stage("image", config, folder, device=CPU, data=data, workers=0, resume=resume)
             assert len(loaded) == expected
 
     @pytest.mark.slow
@@ -367,13 +352,9 @@ class TestWarmStart:
         trained(run, tiny_bundle)
         child = export_run(run, tmp_path / "child", name="child", version="2")
         entry, before = child.manifest.training["image"], parent.manifest.training["image"]
-        assert entry["begun_from"] == {
-            "name": "tiny",
-            "version": "test",
-            "sha256": parent.sha256,
-            "minutes_in_all": before["minutes"],
-            "spheres_in_all": before["spheres"],
-        }
+        ancestor = {"name": "tiny", "version": "test", "sha256": parent.sha256}
+        totals = {"minutes_in_all": before["minutes"], "spheres_in_all": before["spheres"]}
+        assert entry["begun_from"] == ancestor | totals
         batch = SHORT_RING.image.batch
         assert entry["spheres_in_all"] == before["spheres"] + entry["spheres"]
         assert entry["spheres"] == entry["steps"] * batch
@@ -401,11 +382,8 @@ class TestWarmStart:
         start = load_warm_start(default_bundle(), "image", trunk)
         start.load_into({"image_encoder": encoder})
         trained = start.checkpoint.weights["image_encoder"]
-        loaded = {
-            key: value
-            for key, value in encoder.state_dict().items()
-            if not key.startswith(("to_profile.", "to_edges."))
-        }
+        untrained = ("to_profile.", "to_edges.")
+        loaded = {key: value for key, value in encoder.state_dict().items() if not key.startswith(untrained)}
         assert all(torch.equal(value, trained[key]) for key, value in loaded.items())
 
     @pytest.mark.slow
@@ -451,19 +429,7 @@ class TestWarmStart:
 
     @pytest.mark.slow
     def test_command_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
-        words = [
-            "lab",
-            "train",
-            "image",
-            "--preset",
-            "tiny",
-            "--workers",
-            "0",
-            "--device",
-            "cpu",
-            "--out",
-            str(tmp_path),
-        ]
+        words = f"lab train image --preset tiny --workers 0 --device cpu --out {tmp_path}".split()
         words += ["--from", str(tiny_bundle), "--set", "image.uses_per_sphere=2", "--set", "image.batch=4"]
         words += ["--validation-homes", "1"]
         assert main([*words, "--steps", "1"]) == 0
@@ -475,10 +441,8 @@ class TestWarmStart:
         assert Checkpoint.load(tmp_path / "mean" / "image.pt").step == 1
         assert main([*mean, "--share", "2"]) == 2
         assert main(["lab", "train", "layout", "--out", str(tmp_path), "--set", "image.batch"]) == 2
-        assert (
-            main(["lab", "export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"])
-            == 0
-        )
+        export = ["lab", "export", "--run", str(tmp_path), "--out", str(tmp_path / "b"), "--version", "1", "--last"]
+        assert main(export) == 0
         assert Bundle.open(tmp_path / "b").manifest.training["image"]["checkpoint"] == "last"
 
 

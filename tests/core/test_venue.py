@@ -65,11 +65,8 @@ def two_rooms(
 ) -> FloorPlan:
     """Return two rooms side by side from `x_m`, with those of a door between them and a window that are of `kinds`."""
     (first, second), door_m = (x_m, x_m + width_m + 0.1), x_m + width_m + 0.05
-    document = plan_document(
-        rectangle(width_m, depth_m, corner=(first, 0.0)),
-        rectangle(second_m, 3.0, corner=(second, 0.0)),
-        ceiling_m=ceiling_m,
-    )
+    rooms = [rectangle(width_m, depth_m, corner=(first, 0.0)), rectangle(second_m, 3.0, corner=(second, 0.0))]
+    document = plan_document(*rooms, ceiling_m=ceiling_m)
     document["rooms"][0]["type"] = "kitchen"
     document["openings"] = [
         {"kind": "door", "line": [[door_m, 1.0], [door_m, 1.9]]},
@@ -114,14 +111,9 @@ def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
     log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
     kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
     types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
-    return query_of(
-        log_m,
-        0.05,
-        kind,
-        hypotheses,
-        ceiling=PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
-        room_type=PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
-    )
+    ceiling = PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05))
+    room_type = PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types)
+    return query_of(log_m, 0.05, kind, hypotheses, ceiling=ceiling, room_type=room_type)
 
 
 def index_of(parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
@@ -471,10 +463,8 @@ def test_search_sent_to_another_machine_has_the_same_costs(prototype_sets: list[
     search.costs.opening_loss(claims_of(FAMILIES - 1))
     sent = pickle.dumps(search)
     assert len(sent) < 2 * alone
-    np.testing.assert_array_equal(
-        pickle.loads(sent).costs.opening_loss(claims_of(FAMILIES - 1)),
-        search.costs.opening_loss(claims_of(FAMILIES - 1)),
-    )
+    loss = search.costs.opening_loss(claims_of(FAMILIES - 1))
+    np.testing.assert_array_equal(pickle.loads(sent).costs.opening_loss(claims_of(FAMILIES - 1)), loss)
 
 
 @pytest.mark.parametrize(

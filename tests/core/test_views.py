@@ -39,6 +39,7 @@ from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import Photograph
 from lalaloc_core.render.sampling import PoseSet
 from tests.core.test_bundle import exported_bundle
+from tests.strategies import present
 
 TINY = PRESETS["tiny-trunk"]
 SHORT = dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, steps=2, batch=4))
@@ -148,8 +149,7 @@ class TestEncoder:
         # Earlier weights have no objects.
         encoder.load_state_dict(ViewNetwork(TINY.view, TINY.ring).state_dict())
         image = torch.randint(0, 256, (2, 64, 64, 4), dtype=torch.uint8)
-        found = encoder(image, torch.ones(2)).objects
-        assert found is not None
+        found = present(encoder(image, torch.ones(2)).objects)
         assert found.shape == (2, 3 + len(ROOM_TYPES))
         losses.objects(found, torch.tensor([[0.9, 0.1, 0.0]] * 2), torch.tensor([3, UNKNOWN])).backward()
         parts = {name.split(".")[0] for name, p in encoder.named_parameters() if p.grad is not None and p.grad.any()}
@@ -182,8 +182,7 @@ class TestTraining:
             ViewEncoder(origin)
         bundle = export_into(origin.folder, run, tmp_path / "out", version="2")
         bundle.check()
-        stored = Bundle.open(bundle.folder).manifest.view
-        assert stored is not None
+        stored = present(Bundle.open(bundle.folder).manifest.view)
         assert (stored.sectors, stored.image_width) == (4, 64)
         image = np.random.default_rng(0).integers(0, 256, (64, 64, 4), dtype=np.uint8)
         image[..., 3] = 255
@@ -199,8 +198,7 @@ class TestTraining:
         assert np.array_equal(query.profile.seen[3], np.roll(expected, 3))
         # An uncertain tilt widens the predictions: numerically, by the distance of an edge seen at another elevation.
         tilt, error = math.radians(3.0), math.sqrt(math.radians(3.0) ** 2 - math.radians(0.7) ** 2)
-        tilted = encoder.query_of_outputs(outputs, [(0.0, tilt)], None, EXACT).profile
-        assert tilted is not None
+        tilted = present(encoder.query_of_outputs(outputs, [(0.0, tilt)], None, EXACT).profile)
         log_m, seen = query.profile.log_m[0, expected], np.exp(query.profile.log_scale[0, expected])
         elevation = np.arctan(EXACT.height_m / np.exp(log_m))
         moved = np.log(np.tan(elevation + 1e-4) / np.tan(elevation)) / 1e-4 * error

@@ -23,6 +23,7 @@ from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.questions import perfect_query
 from tests.core.taken import jpeg, sphere, take
+from tests.strategies import present
 
 HYPOTHESES = 72
 
@@ -66,8 +67,7 @@ def apart_deg(first: float, second: float) -> float:
 @pytest.mark.parametrize(("name", "walls_deg"), [("living_room", 60.0), ("real/hotel_room", 30.0)])
 def test_direction_turns_with_the_camera(name: str, walls_deg: float) -> None:
     for heading in (50.0, 75.0, 100.0, 125.0):
-        walls = view(name, heading).wall_direction
-        assert walls is not None
+        walls = present(view(name, heading).wall_direction)
         assert apart_deg(math.degrees(walls.value) + heading, walls_deg) < 2.0
         assert walls.source == "estimated"
 
@@ -100,8 +100,7 @@ def test_headings_across_the_walls_cost_more_than_those_along_them() -> None:
     plan = rooms(0.0, 30.0)
     asked = perfect_query(encoder(), plan, (0.0, 0.0), hypotheses=HYPOTHESES)
     asked = replace(asked, wall_directions=(WallDirection(math.radians(10.0), math.radians(1.0)),))
-    cost = PlaceCost.of(plan, asked, NO_HINTS, 1.0, np.array([[0.0, 0.0], [10.0, 0.0]]), np.array([0, 1]))
-    assert cost is not None
+    cost = present(PlaceCost.of(plan, asked, NO_HINTS, 1.0, np.array([[0.0, 0.0], [10.0, 0.0]]), np.array([0, 1])))
     by_heading = cost.of_poses(np.arange(2))
     heading_deg = np.degrees(asked.roll)
     for room, turned_deg in enumerate((0.0, 30.0)):
@@ -136,8 +135,7 @@ def test_uncertain_directions_tell_nothing_and_several_count_by_their_mean() -> 
         return PlaceCost.of(plan, told, NO_HINTS, 1.0, np.zeros((1, 2)), np.zeros(1, int))
 
     def cost(*directions: WallDirection) -> np.ndarray:
-        told = found(*directions)
-        assert told is not None
+        told = present(found(*directions))
         return told.of_poses(np.array([0]))
 
     assert found(WallDirection(0.0, math.radians(20.0))) is None

@@ -132,11 +132,8 @@ def expected_pixels(
 class TestDataset:
     def test_splits_match_the_partition(self, root: Path) -> None:
         dataset = Zind(root)
-        assert [dataset.scenes(split) for split in ("train", "validation", "test")] == [
-            ["0000/floor_01"],
-            ["0001/floor_01"],
-            [NAME],
-        ]
+        scenes = [dataset.scenes(split) for split in ("train", "validation", "test")]
+        assert scenes == [["0000/floor_01"], ["0001/floor_01"], [NAME]]
         assert dataset.description == "ZInD"
         assert dataset.appearances == (Appearance(),)
         assert pickle.loads(pickle.dumps(dataset)) == dataset
@@ -222,17 +219,11 @@ class TestRooms:
         document = plan_document(rectangle(5.0, 4.0))
         document["rooms"][0]["holes"] = [rectangle(0.1, 2.0, corner=(2.4, 1.0)), rectangle(0.5, 0.5, corner=(4.0, 0.5))]
         plan = FloorPlan.from_dict(document)
-        write_home(
-            tmp_path / "0002",
-            plan,
-            [TrueSphere(room_index=0, x_m=1.0, y_m=1.0, heading=0.7)],
-            np.random.default_rng(3),
-            (4, 8),
-        )
+        sphere = TrueSphere(room_index=0, x_m=1.0, y_m=1.0, heading=0.7)
+        write_home(tmp_path / "0002", plan, [sphere], np.random.default_rng(3), (4, 8))
         (room,) = Zind(tmp_path).load(NAME).plan.rooms
-        assert all(
-            same_ring(found, hole, 1e-6) for found, hole in zip(room.holes_m, plan.rooms[0].holes_m, strict=True)
-        )
+        pairs = zip(room.holes_m, plan.rooms[0].holes_m, strict=True)
+        assert all(same_ring(found, hole, 1e-6) for found, hole in pairs)
         assert room.area_m2 == pytest.approx(5.0 * 4.0 - 0.2 - 0.25)
 
     @pytest.mark.parametrize(
@@ -250,13 +241,8 @@ class TestRooms:
     def test_unusual_inner_walls_are_cut_or_left_out(
         self, tmp_path: Path, internal: Any, area_m2: float, warning: str | None
     ) -> None:
-        write_home(
-            tmp_path / "0002",
-            plan_of(rectangle(5.0, 4.0)),
-            [TrueSphere(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)],
-            np.random.default_rng(3),
-            (4, 8),
-        )
+        true_sphere = TrueSphere(room_index=0, x_m=3.0, y_m=3.0, heading=0.0)
+        write_home(tmp_path / "0002", plan_of(rectangle(5.0, 4.0)), [true_sphere], np.random.default_rng(3), (4, 8))
 
         def change(document: dict[str, Any]) -> None:
             layout = sphere(document)["layout_complete"]
@@ -420,11 +406,8 @@ def zind(tmp_path: Path) -> Path:
 def test_zind_openings_are_in_the_plan_once(zind: Path) -> None:
     plan = Zind(zind).load(f"0000/{FLOOR}").plan
     assert [opening.kind for opening in plan.openings] == ["door", "window"]
-    assert sorted((face.room, face.wall, face.behind) for face in plan.opening_faces) == [
-        (0, 0, -1),
-        (0, 1, 1),
-        (1, 3, 0),
-    ]
+    faces = sorted((face.room, face.wall, face.behind) for face in plan.opening_faces)
+    assert faces == [(0, 0, -1), (0, 1, 1), (1, 3, 0)]
     np.testing.assert_allclose(np.sort(plan.openings[0].line_m[:, 1]), [0.5, 1.4], atol=1e-9)
     assert plan.openings[1].sill_m == pytest.approx(0.9)
     assert plan.openings[1].head_m == pytest.approx(2.1)
@@ -451,7 +434,5 @@ def test_first_of_overlapping_openings_is_kept() -> None:
 
     entries, warnings = opening_entries([drawn(0, 1), drawn(0.1, 0.9, 0.2), drawn(0.8, 2), drawn(3, 3.01)], {})
     assert [entry["line"] for entry in entries] == [[[0.0, 0.0], [0.0, 1.0]]]
-    assert [warning.split(" is left out")[1][:20] for warning in warnings] == [
-        ": it overlaps anothe",
-        ": the minimum is 0.0",
-    ]
+    reasons = [warning.split(" is left out")[1][:20] for warning in warnings]
+    assert reasons == [": it overlaps anothe", ": the minimum is 0.0"]

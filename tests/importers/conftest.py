@@ -50,7 +50,6 @@ EXTERNAL_ENTITY = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{_SV
 
 
 def zip_file(files: Mapping[str, bytes | str]) -> bytes:
-    """Return a zip archive of files by name."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
@@ -85,6 +84,10 @@ def shapes(document: dict) -> list[shapely.Polygon]:
 def lines(document: dict, kind: str) -> list[shapely.LineString]:
     """Return the openings of a kind as lines."""
     return [shapely.LineString(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == kind]
+
+
+def names_and_types(plan: ImportedPlan) -> list[tuple[str, str]]:
+    return [(room["name"], room["type"]) for room in plan.document["rooms"]]
 
 
 def assert_same_plan(found: ImportedPlan, expected: dict, *, within_m: float = 2e-3, shift: bool = False) -> None:

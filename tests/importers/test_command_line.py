@@ -33,7 +33,6 @@ def file(tmp_path: Path) -> Path:
 
 
 def _run(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
-    """Run the command in a process of its own."""
     command = "import sys; from lalaloc_core.cli import main; sys.exit(main())"
     return subprocess.run([sys.executable, "-c", command, *arguments], check=False, **streams)
 
@@ -68,9 +67,8 @@ def test_plan_is_written_although_the_reader_of_the_report_left(file: Path, tmp_
 
 @pytest.mark.slow
 def test_export_to_dxf_logs_nothing(file: Path, tmp_path: Path):
-    run = _run(
-        "plan", "export", str(file), "--format", "dxf", "--out", str(tmp_path / "flat.dxf"), stderr=subprocess.PIPE
-    )
+    out = str(tmp_path / "flat.dxf")
+    run = _run("plan", "export", str(file), "--format", "dxf", "--out", out, stderr=subprocess.PIPE)
     assert (run.returncode, run.stderr) == (0, b"")
 
 

@@ -24,11 +24,8 @@ def row_of_rooms(doors: int, windows: int, kind: str = "door", rooms: int = 6) -
     openings = [{"kind": kind, "line": [[x0 + 1, 4.05], [x0 + 1.9, 4.05]]} for x0, _ in squares[:doors]]
     openings += [{"kind": "window", "line": [[x0 + 1, 0], [x0 + 2, 0]]} for x0, _ in squares[:windows]]
     types = ["living"] * rooms + ["corridor"]
-    return {
-        "ceiling_height_m": 2.5,
-        "rooms": [{"polygon": outline, "type": kind} for outline, kind in zip(outlines, types, strict=True)],
-        "openings": openings,
-    }
+    rooms_of_row = [{"polygon": outline, "type": kind} for outline, kind in zip(outlines, types, strict=True)]
+    return {"ceiling_height_m": 2.5, "rooms": rooms_of_row, "openings": openings}
 
 
 def trust_of(document: dict[str, Any]) -> dict[str, float]:

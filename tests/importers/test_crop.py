@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
-
 import pytest
 import shapely
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image, ImageDraw
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
+from lalaloc_core.importers import ImportOptions, import_plan
 from tests.importers.conftest import dxf_file, shapes
+from tests.painted import picture_file
 
 SCALE = 0.02
 
@@ -27,19 +26,15 @@ def _storeys() -> Image.Image:
     return page
 
 
-def _file(page: Image.Image, format: str = "PNG", **options: float) -> bytes:
-    stream = io.BytesIO()
-    page.save(stream, format, **options)
-    return stream.getvalue()
-
-
 def test_largest_of_several_storeys_is_read_and_the_others_are_named():
-    plan = import_plan(_file(_storeys()), ImportOptions(metres_per_pixel=SCALE))
+    plan = import_plan(picture_file(_storeys()), ImportOptions(metres_per_pixel=SCALE))
     assert len(plan.document["rooms"]) == 2
     (warning,) = (warning for warning in plan.report.warnings if "storeys seem to be drawn" in warning)
     assert "only the first was read" in warning
     crop = warning.split("m² at crop=")[2].split(";")[0]
-    other = import_plan(_file(_storeys()), ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop}))
+    other = import_plan(
+        picture_file(_storeys()), ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop})
+    )
     (room,) = shapes(other.document)
     assert room.area == pytest.approx(15.6, abs=0.5)
     # Coordinates stay those of the whole picture.
@@ -47,7 +42,7 @@ def test_largest_of_several_storeys_is_read_and_the_others_are_named():
 
 
 def test_crop_of_a_scanned_page_is_in_points_from_its_lower_left_corner():
-    scan = _file(_storeys(), "PDF", resolution=72.0)
+    scan = picture_file(_storeys(), "PDF", resolution=72.0)
     plan = import_plan(scan, ImportOptions(metres_per_pixel=SCALE, crop=(780.0, 370.0, 450.0, 90.0)))
     assert len(plan.document["rooms"]) == 1
     assert shapes(plan.document)[0].area == pytest.approx(15.6, abs=0.5)
@@ -82,14 +77,10 @@ def test_storeys_of_a_vector_drawing_are_named_with_their_crop(format: str):
     assert room.area == pytest.approx(14.0, abs=0.1)
 
 
-def _read_part(crop: str) -> ImportedPlan:
-    return import_plan(_file(_storeys()), ImportOptions.from_text({"crop": crop, "metres_per_pixel": str(SCALE)}))
-
-
 @pytest.mark.parametrize(("crop", "message"), [
     ("1,2,3", "crop has 3 numbers"), ("5,5,5,9", "two opposite corners"), ("0,0,20,20", "has at least 64 x 64"),
     ("900,0,1200,300", "has at least 64 x 64"), ("a,0,1,1", "must be a number"),
 ])  # fmt: skip
 def test_invalid_crop_is_rejected(crop: str, message: str):
     with pytest.raises(InvalidFloorPlanError, match=message):
-        _read_part(crop)
+        import_plan(picture_file(_storeys()), ImportOptions.from_text({"crop": crop, "metres_per_pixel": str(SCALE)}))

@@ -21,6 +21,7 @@ from lalaloc_core.importers.drawing.drawing_scale import _AT_SHEET
 from tests.importers.conftest import dxf_file, lines, shapes, zip_file
 from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import SETTINGS, _picture
+from tests.strategies import present
 
 _SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1200 900" data-metres-per-unit="0.01">{}</svg>'
 
@@ -197,16 +198,14 @@ def _box(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
 def test_gallery_over_a_neighbour_is_no_floor():
     # The upper half of a room reaches over its neighbour, 2.6 m above the floor.
     faces = [_box(0, 0, 4, 3, 0), _box(4, 0, 6, 3, 2.6), _box(0, 0, 6, 3, 5)]
-    floor = find_floor(faces, lambda: None)
-    assert floor is not None
+    floor = present(find_floor(faces, lambda: None))
     assert sum(part.area for part in floor.parts) == pytest.approx(12.0)
     assert floor.higher_m2 == pytest.approx(6.0)
 
 
 def test_steep_rows_of_seats_are_one_floor():
     faces = [_box(0, float(row), 10, row + 1.0, 0.4 * row) for row in range(8)] + [_box(0, 0, 10, 8, 9)]
-    floor = find_floor(faces, lambda: None)
-    assert floor is not None
+    floor = present(find_floor(faces, lambda: None))
     assert sum(part.area for part in floor.parts) == pytest.approx(80.0)
     assert floor.rise_m == pytest.approx(2.8)
 
@@ -304,9 +303,8 @@ def test_fitted_text_is_in_the_middle_of_its_points():
         )
     space.add_text("Küche").set_placement((4.4, 1.0), (8.0, 1.0), align=TextEntityAlignment.FIT)
     space.add_text("Bad").dxf.discard("insert")
-    names = {
-        round(room["polygon"][0][0]): room.get("name") for room in import_plan(dxf_file(document)).document["rooms"]
-    }
+    rooms = import_plan(dxf_file(document)).document["rooms"]
+    names = {round(room["polygon"][0][0]): room.get("name") for room in rooms}
     assert sorted(filter(None, names.values())) == ["Küche"]
 
 

@@ -213,11 +213,8 @@ def _osm_xml(elements: list[dict]) -> bytes:
 
 
 def _osm_geojson(elements: list[dict]) -> bytes:
-    rooms = [
-        _feature([NODES[key] for key in element["nodes"][:-1]], **element["tags"])
-        for element in elements
-        if "indoor" in element["tags"]
-    ]
+    tagged = [element for element in elements if "indoor" in element["tags"]]
+    rooms = [_feature([NODES[key] for key in element["nodes"][:-1]], **element["tags"]) for element in tagged]
     points = [_feature(list(NODES[key]), "Point", **tags) for key, tags in NODE_TAGS.items()]
     return _collection(*rooms, *points)
 

@@ -38,6 +38,7 @@ from lalaloc_core.importers.formats import dxf, pdf_page
 from lalaloc_core.importers.picture import lettering, wall_mask
 from lalaloc_core.importers.picture.ink import read_ink
 from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
+from tests.painted import picture_file
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
@@ -47,8 +48,26 @@ def _assert_rejected(content: bytes, message: str, **limits: object) -> None:
         import_plans(content, ImportOptions(metres_per_pixel=0.01), ImportLimits(**limits))  # type: ignore[arg-type]
 
 
-def test_nested_xml_entities():
-    _assert_rejected(NESTED_ENTITIES, "declares entities")
+DOCTYPE = '<!DOCTYPE svg SYSTEM "http://127.0.0.1:1/x.dtd">'
+HOSTILE: dict[str, tuple[bytes, str]] = {
+    "nested XML entities": (NESTED_ENTITIES, "declares entities"),
+    "external XML entities": (EXTERNAL_ENTITY, "entities"),
+    "external doctype": (f"{DOCTYPE}{SVG.format('')}".encode(), "refers to other files|no room"),
+    "recursive use": (SVG.format('<g id="a"><use href="#a"/></g>').encode(), "refers to itself"),
+    "nested elements": (SVG.format("<g>" * 500 + "</g>" * 500).encode(), "nested more than"),
+    "nested JSON": (("[" * 100_000 + "]" * 100_000).encode(), "nested"),
+    "too many pixels": (large_picture(100_000), "pixels|cannot be read"),
+    "truncated picture": (picture_file(Image.new("L", (200, 200), 255))[:90], "cannot be read"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), HOSTILE.values(), ids=HOSTILE)
+def test_hostile_file_is_refused(content: bytes, message: str):
+    _assert_rejected(content, message)
+
+
+def test_file_above_the_size_limit():
+    _assert_rejected(b"{" + b" " * 200, "the limit is 100 ", max_plan_bytes=100)
 
 
 def test_references_to_many_entities_are_not_searched_one_by_one():
@@ -71,19 +90,14 @@ def test_rooms_within_rooms_are_counted_before_they_are_compared(monkeypatch: py
     _assert_rejected(json.dumps(document).encode(), "600 rooms lie over one another")
 
 
-def test_external_xml_entities():
-    _assert_rejected(EXTERNAL_ENTITY, "entities")
-
-
-def test_external_doctype():
-    document = f'<!DOCTYPE svg SYSTEM "http://127.0.0.1:1/x.dtd">{SVG.format("")}'
-    _assert_rejected(document.encode(), "refers to other files|no room")
+def _nested_uses() -> str:
+    uses = [f'<use xlink:href="#g{i - 1}"/>' * 10 for i in range(1, 12)]
+    groups = "".join(f'<g id="g{i}">{use}</g>' for i, use in enumerate(uses, 1))
+    return f'<rect id="g0" width="1" height="1"/>{groups}'
 
 
 def test_nested_uses():
-    uses = [f'<use xlink:href="#g{i - 1}"/>' * 10 for i in range(1, 12)]
-    groups = "".join(f'<g id="g{i}">{use}</g>' for i, use in enumerate(uses, 1))
-    _assert_rejected(SVG.format(f'<rect id="g0" width="1" height="1"/>{groups}').encode(), "entities")
+    _assert_rejected(SVG.format(_nested_uses()).encode(), "entities")
 
 
 @pytest.mark.parametrize(
@@ -98,22 +112,8 @@ def test_nested_uses():
     ],
 )
 def test_nested_uses_with_unusual_references(target: str, hidden: str):
-    uses = [f'<use xlink:href="#g{i - 1}"/>' * 10 for i in range(1, 12)]
-    groups = "".join(f'<g id="g{i}">{use}</g>' for i, use in enumerate(uses, 1))
-    drawn = f'<defs><rect id="g0" width="1" height="1"/>{groups}</defs>{hidden}<use {target}/>'
+    drawn = f"<defs>{_nested_uses()}</defs>{hidden}<use {target}/>"
     _assert_rejected(SVG.format(drawn).encode(), "entities")
-
-
-def test_recursive_use():
-    _assert_rejected(SVG.format('<g id="a"><use href="#a"/></g>').encode(), "refers to itself")
-
-
-def test_deeply_nested_elements():
-    _assert_rejected(SVG.format("<g>" * 500 + "</g>" * 500).encode(), "nested more than")
-
-
-def test_deeply_nested_json():
-    _assert_rejected(("[" * 100_000 + "]" * 100_000).encode(), "nested")
 
 
 def test_zip_above_the_unpacked_limit():
@@ -135,15 +135,19 @@ def test_zip_with_too_many_files_or_a_password():
     _assert_rejected(bytes(content), "encrypted")
 
 
-def test_nested_blocks():
+@pytest.mark.parametrize("is_empty", [False, True])
+def test_nested_blocks(is_empty: bool):
     document = new_dxf()
-    document.blocks.new("B0").add_line((0, 0), (1, 1))
+    lowest = document.blocks.new("B0")
+    if not is_empty:
+        lowest.add_line((0, 0), (1, 1))
     for level in range(1, 8):
         block = document.blocks.new(f"B{level}")
         for x in range(10):
             block.add_blockref(f"B{level - 1}", (x, 0))
-    document.modelspace().add_blockref("B7", (0, 0), dxfattribs={"row_count": 100, "column_count": 100})
-    _assert_rejected(dxf_file(document), "entities")
+    array = {} if is_empty else {"row_count": 100, "column_count": 100}
+    document.modelspace().add_blockref("B7", (0, 0), dxfattribs=array)
+    _assert_rejected(dxf_file(document), "more than 300000 entities" if is_empty else "entities")
 
 
 def _dxf_text(*pairs: tuple[int, object]) -> bytes:
@@ -162,17 +166,6 @@ def test_repeated_empty_block(rows: int, columns: int):
     content = _dxf_insert(rows, columns)
     assert len(content) < 241
     _assert_rejected(content, "more than 300000 entities")
-
-
-def test_nested_empty_blocks():
-    document = new_dxf()
-    document.blocks.new("B0")
-    for level in range(1, 8):
-        block = document.blocks.new(f"B{level}")
-        for x in range(10):
-            block.add_blockref(f"B{level - 1}", (x, 0))
-    document.modelspace().add_blockref("B7", (0, 0))
-    _assert_rejected(dxf_file(document), "more than 300000 entities")
 
 
 def test_time_is_checked_at_every_empty_block():
@@ -203,20 +196,6 @@ def test_curves_beyond_the_stated_size_have_few_points(monkeypatch: pytest.Monke
             import_plans(content, ImportOptions(units="mm"))
     assert len(counts) == 4
     assert max(counts) <= 2 * counts[0]
-
-
-def test_picture_with_too_many_pixels():
-    _assert_rejected(large_picture(100_000), "pixels|cannot be read")
-
-
-def test_truncated_picture():
-    stream = io.BytesIO()
-    Image.new("L", (200, 200), 255).save(stream, "PNG")
-    _assert_rejected(stream.getvalue()[:90], "cannot be read")
-
-
-def test_file_above_the_size_limit():
-    _assert_rejected(b"{" + b" " * 200, "the limit is 100 ", max_plan_bytes=100)
 
 
 def test_import_above_the_time_limit():
@@ -392,16 +371,16 @@ def test_yaml_that_repeats_values_is_refused(lines: str):
     _assert_rejected(zip_file({"map.yaml": yaml, "a.pgm": b"P5\n1 1\n255\n0"}), "an alias .* or a merge key")
 
 
-def test_placement_in_itself_is_named():
+@pytest.mark.parametrize(
+    ("title", "message"),
+    [
+        ("a placement in itself", "the IfcLocalPlacement #7 is relative to itself"),
+        ("a number of 1.E400", "the number 1.E400; the limit is 1.E100"),
+    ],
+)
+def test_fault_of_a_model_is_named(title: str, message: str):
     pytest.importorskip("ifcopenshell")
-    plan = next(plan for plan in HOSTILE_PLANS if plan.title == "a placement in itself")
-    _assert_rejected(plan.make(1000), "the IfcLocalPlacement #7 is relative to itself")
-
-
-def test_large_number_of_a_model_is_named():
-    pytest.importorskip("ifcopenshell")
-    plan = next(plan for plan in HOSTILE_PLANS if plan.title == "a number of 1.E400")
-    _assert_rejected(plan.make(1000), "the number 1.E400; the limit is 1.E100")
+    _assert_rejected(_hostile("ifc", title).make(1000), message)
 
 
 def _hostile(format: str, title: str) -> HostilePlan:
@@ -409,25 +388,21 @@ def _hostile(format: str, title: str) -> HostilePlan:
 
 
 @pytest.mark.parametrize(
-    ("format", "title", "message"),
+    ("title", "message"),
     [
-        (
-            "svg",
-            "declarations for all",
-            r"styles, classes, transforms and paths of the SVG's \d+ elements, with copies",
-        ),
-        ("svg", "a rule of one class", r"style rules of the SVG repeat declarations of more than \d+ characters"),
-        ("svg", "a transform around all", r"transforms count 12 times"),
-        ("svg", "copies of a path", r"paths 100 times"),
-        ("svg", "copies of classes", r"\d+ characters .*; the limit is \d+ for its size"),
-        ("svg", "symbols of symbols", r"the file of \d+ bytes draws more than \d+ shapes, the limit for its size"),
+        ("declarations for all", r"styles, classes, transforms and paths of the SVG's \d+ elements, with copies"),
+        ("a rule of one class", r"style rules of the SVG repeat declarations of more than \d+ characters"),
+        ("a transform around all", r"transforms count 12 times"),
+        ("copies of a path", r"paths 100 times"),
+        ("copies of classes", r"\d+ characters .*; the limit is \d+ for its size"),
+        ("symbols of symbols", r"the file of \d+ bytes draws more than \d+ shapes, the limit for its size"),
     ],
 )
 def test_svg_is_refused_before_its_library_multiplies_what_it_reads(
-    monkeypatch: pytest.MonkeyPatch, format: str, title: str, message: str
+    monkeypatch: pytest.MonkeyPatch, title: str, message: str
 ):
     monkeypatch.setattr(svgelements.SVG, "parse", pytest.fail)
-    _assert_rejected(_hostile(format, title).make(100_000), message)
+    _assert_rejected(_hostile("svg", title).make(100_000), message)
 
 
 def test_style_sheets_reach_the_library_without_what_does_not_end(monkeypatch: pytest.MonkeyPatch):

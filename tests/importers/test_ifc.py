@@ -11,7 +11,7 @@ import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan, import_plans
-from tests.importers.conftest import lines, shapes
+from tests.importers.conftest import lines, names_and_types, shapes
 
 ifcopenshell = pytest.importorskip("ifcopenshell")
 
@@ -60,12 +60,8 @@ class _Model:
         )
 
     def contain(self, *elements: Any) -> None:
-        self.file.create_entity(
-            "IfcRelContainedInSpatialStructure",
-            ifcopenshell.guid.new(),
-            RelatedElements=list(elements),
-            RelatingStructure=self.storey,
-        )
+        relation = {"RelatedElements": list(elements), "RelatingStructure": self.storey}
+        self.file.create_entity("IfcRelContainedInSpatialStructure", ifcopenshell.guid.new(), **relation)
 
     def content(self) -> bytes:
         return self.file.to_string().encode()
@@ -111,10 +107,7 @@ def test_levels_without_a_room_are_left_out():
 
 def test_ifc_elements_give_rooms_openings_and_holes():
     plan = import_plan(ifc_flat().content())
-    assert [(room["name"], room["type"]) for room in plan.document["rooms"]] == [
-        ("Küche", "kitchen"),
-        ("Wohnen", "living"),
-    ]
+    assert names_and_types(plan) == [("Küche", "kitchen"), ("Wohnen", "living")]
     assert [room.area for room in shapes(plan.document)] == pytest.approx([12.0 - 0.16, 14.7 - 0.09], abs=1e-3)
     assert plan.document["ceiling_height_m"] == pytest.approx(2.6)
     (door,), (window,) = lines(plan.document, "door"), lines(plan.document, "window")
@@ -159,10 +152,8 @@ def test_spaces_of_no_storey_belong_to_the_one_at_their_height():
     model.prism("IfcSpace", _box(0, 0, 4000, 3000), 3000, 2600, LongName="Bad")
     model.prism("IfcSpace", _box(0, 0, 4000, 3000), -9000, 2600, LongName="Keller")
     plans = import_plans(model.content())
-    assert [(plan.level and plan.level.name, plan.document["rooms"][0]["name"]) for plan in plans] == [
-        ("EG", "Küche"),
-        ("OG", "Bad"),
-    ]
+    found = [(plan.level and plan.level.name, plan.document["rooms"][0]["name"]) for plan in plans]
+    assert found == [("EG", "Küche"), ("OG", "Bad")]
     assert any(use.layer == "IfcSpace" and "ignored" in use.used_as for use in plans[0].report.layers)
 
 
@@ -254,10 +245,8 @@ def test_parts_of_a_high_curtain_wall_belong_to_the_storey_at_their_height():
     ]
     model.file.create_entity("IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=wall, RelatedObjects=windows)
     ground, upper = import_plans(model.content())
-    assert [opening.get("name") for opening in ground.document["openings"] if opening["kind"] == "window"] == [
-        None,
-        "below",
-    ]
+    names = [opening.get("name") for opening in ground.document["openings"] if opening["kind"] == "window"]
+    assert names == [None, "below"]
     assert [opening["name"] for opening in upper.document["openings"]] == ["above"]
 
 
@@ -291,10 +280,7 @@ def test_terminals_furniture_and_stairs_become_fixtures() -> None:
         model.prism("IfcFurniture", box(1500, 500, 900, 900), 0, 450, Name="Chair"),
         model.prism("IfcStairFlight", box(4300, 100, 1000, 2800), 0, 2600, Name="S"),
     ]
-    model.file.create_entity(
-        "IfcRelContainedInSpatialStructure", ifcopenshell.guid.new(), RelatedElements=elements,
-        RelatingStructure=model.storey,
-    )  # fmt: skip
-    plan = import_plan(model.file.to_string().encode())
+    model.contain(*elements)
+    plan = import_plan(model.content())
     assert [fixture["kind"] for fixture in plan.document["fixtures"]] == ["toilet", "stairs"]
     assert {room["name"]: room.get("type") for room in plan.document["rooms"]} == {"1": "bathroom", "2": "stairs"}

@@ -6,7 +6,7 @@ import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, detect_format, import_plan, import_plans
-from tests.importers.conftest import lines, shapes
+from tests.importers.conftest import lines, names_and_types, shapes
 
 Box = tuple[float, float, float, float]
 
@@ -83,10 +83,7 @@ def test_solids_become_rooms_and_boundaries_doors():
     content = _document(*ROOMS, DOOR, _transition(PATH, "B1"))
     assert detect_format(content) == "indoorgml"
     plan = import_plan(content)
-    assert [(room["name"], room["type"]) for room in plan.document["rooms"]] == [
-        ("Kitchen", "kitchen"),
-        ("Corridor", "corridor"),
-    ]
+    assert names_and_types(plan) == [("Kitchen", "kitchen"), ("Corridor", "corridor")]
     assert [room.area for room in shapes(plan.document)] == pytest.approx([12.0, 14.4])
     assert plan.document["ceiling_height_m"] == pytest.approx(2.6)
     (door,) = lines(plan.document, "door")

@@ -26,6 +26,7 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.picture import lettering
 from lalaloc_core.importers.picture.lettering import read_texts
 from tests.importers.conftest import shapes
+from tests.painted import picture_file
 
 FONT = Path(lettering.__file__).parents[2] / "draw" / "fonts" / "DejaVuSans.ttf"
 # Enough time for all texts on a busy machine.
@@ -65,10 +66,7 @@ class PrintedPlan:
                 self._dimension(start, end, x, is_vertical=True)
 
     def file(self, format: str = "PNG", **options: float) -> bytes:
-        """Return the picture as a file."""
-        stream = io.BytesIO()
-        self.picture.save(stream, format, **options)
-        return stream.getvalue()
+        return picture_file(self.picture, format, **options)
 
     def _pixel(self, x: float, y: float) -> tuple[float, float]:
         return (x + self.margin_m) * self.px_per_m, self.picture.height - (y + self.margin_m) * self.px_per_m

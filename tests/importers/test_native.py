@@ -78,11 +78,8 @@ def _street(*levels: object) -> list[dict]:
 def test_several_plans_keep_their_names_and_are_ordered_by_level():
     content = json.dumps({"plans": [*_street(2, -1.5), {**FLAT, "name": "home 2"}]}).encode()
     plans = import_plans(content, ImportOptions(ceiling_height_m=2.4), building="street")
-    assert [(plan.document["name"], plan.level and plan.level.number) for plan in plans] == [
-        ("home 1", -1.5),
-        ("home 2", 0.0),
-        ("home 0", 2.0),
-    ]
+    levels = [(plan.document["name"], plan.level and plan.level.number) for plan in plans]
+    assert levels == [("home 1", -1.5), ("home 2", 0.0), ("home 0", 2.0)]
     assert all(plan.document["rooms"] == json.loads(json.dumps(FLAT["rooms"])) for plan in plans)
     assert begins_with_plans(b"\xef\xbb\xbf " + content)
     # A service's own process leaves them to a worker.
@@ -93,14 +90,11 @@ def test_several_plans_keep_their_names_and_are_ordered_by_level():
 
 
 def test_plans_without_names_are_named_after_the_file():
-    content = json.dumps(
-        {"plans": [{**FLAT, "name": "home"}, {"rooms": FLAT["rooms"], "ceiling_height_m": 2.5}]}
-    ).encode()
+    nameless = {"rooms": FLAT["rooms"], "ceiling_height_m": 2.5}
+    content = json.dumps({"plans": [{**FLAT, "name": "home"}, nameless]}).encode()
     plans = import_plans(content, building="street")
-    assert [(plan.document["name"], plan.plan().name) for plan in plans] == [
-        ("home", "home"),
-        ("street – plan 1", "street – plan 1"),
-    ]
+    names = [(plan.document["name"], plan.plan().name) for plan in plans]
+    assert names == [("home", "home"), ("street – plan 1", "street – plan 1")]
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,9 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import find_skew
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
-from tests.importers.conftest import lines, shapes
+from tests.importers.conftest import lines, names_and_types, shapes
 from tests.importers.test_fault_files import FOLDER
+from tests.painted import picture_file
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
 # Homes that are read well; the benchmark also contains others.
@@ -55,9 +56,8 @@ def test_drawings_of_plan_svg_are_read_back(coloured: bool):
     svg = plan_svg(flat)
     left, top, width, height = (float(number) for number in re.findall(r'viewBox="([^"]+)"', svg)[0].split())
     picture = Image.open(io.BytesIO(rasterise(svg)))
-    stream = io.BytesIO()
-    (picture if coloured else picture.convert("LA")).save(stream, "PNG")
-    plan = import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=width / picture.width)).document
+    content = picture_file(picture if coloured else picture.convert("LA"))
+    plan = import_plan(content, ImportOptions(metres_per_pixel=width / picture.width)).document
     # The origin of a picture is its lower left corner.
     origin = np.array([left, -top - height])
 
@@ -88,9 +88,7 @@ def open_hall(gap_m: float = 2.4) -> bytes:
     # Without a symbol so wide a gap is no opening, and the room to the right stays open.
     if gap_m:
         pen.rectangle((660, 375, 660 + 100 * gap_m, 410), fill=255)
-    stream = io.BytesIO()
-    page.save(stream, "PNG")
-    return stream.getvalue()
+    return picture_file(page)
 
 
 @pytest.mark.parametrize("gap_m", [0.0, 2.4])
@@ -146,9 +144,7 @@ def test_furniture_at_outlined_walls_is_no_wall(is_hatched: bool):
         pen.rectangle((x, 745, x + 40, 780), outline=0)
     pen.rectangle((1020, 500, 1080, 700), outline=0)
     pen.line((1050, 500, 1050, 700), fill=0)
-    stream = io.BytesIO()
-    page.save(stream, "PNG")
-    (room,) = shapes(import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=0.01)).document)
+    (room,) = shapes(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document)
     assert shapely.hausdorff_distance(room, shapely.box(1.2, 1.2, 10.8, 7.8)) < 0.06
 
 
@@ -163,9 +159,7 @@ def test_single_line_is_a_window_outside_and_a_passage_inside():
     ]:
         pen.rectangle(box, fill=255)
         pen.line(line, fill=0, width=2)
-    stream = io.BytesIO()
-    page.save(stream, "PNG")
-    plan = import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=0.01))
+    plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01))
     assert len(plan.document["rooms"]) == 2
     (window,) = lines(plan.document, "window")
     assert window.length == pytest.approx(1.2, abs=0.03)
@@ -204,12 +198,10 @@ def test_picture_without_scale_gets_that_of_its_doors(drawn: dict[Style, DrawnPl
 
 
 def test_picture_without_scale_and_doors_is_rejected():
-    stream = io.BytesIO()
     page = Image.new("RGB", (600, 400), "white")
     ImageDraw.Draw(page).rectangle((60, 60, 540, 340), outline="black", width=12)
-    page.save(stream, "PNG")
     with pytest.raises(InvalidFloorPlanError, match=r"the picture gives no scale, and too few doors.*known_distance"):
-        import_plan(stream.getvalue())
+        import_plan(picture_file(page))
 
 
 @pytest.mark.slow
@@ -225,9 +217,7 @@ def test_known_distance_sets_the_scale(drawn: dict[Style, DrawnPlan]):
 def test_scan_resolution_and_paper_scale_set_the_scale(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     # 80 pixels to a metre are 1:125 at 254 dots per inch.
-    stream = io.BytesIO()
-    Image.fromarray(plan.picture).save(stream, "PNG", dpi=(254, 254))
-    by_paper = import_plan(stream.getvalue(), ImportOptions(scale=125.0))
+    by_paper = import_plan(picture_file(plan.picture, dpi=(254, 254)), ImportOptions(scale=125.0))
     assert by_paper.report.metres_per_unit == pytest.approx(plan.metres_per_pixel, rel=1e-3)
     with pytest.raises(InvalidFloorPlanError, match="no size on paper"):
         import_plan(plan.png(), ImportOptions(scale=125.0))
@@ -242,10 +232,8 @@ def test_wrong_scale_is_rejected(drawn: dict[Style, DrawnPlan], factor: float):
 
 
 def test_empty_picture_is_rejected():
-    stream = io.BytesIO()
-    Image.new("RGB", (400, 300), "white").save(stream, "PNG")
     with pytest.raises(InvalidFloorPlanError, match="no walls that enclose a room"):
-        import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=0.01))
+        import_plan(picture_file(Image.new("RGB", (400, 300), "white")), ImportOptions(metres_per_pixel=0.01))
 
 
 @pytest.mark.parametrize("degrees", [-6.0, 0.0, 2.5])
@@ -295,10 +283,7 @@ def test_pdf_with_lines_is_read_as_a_drawing():
     plan = import_plan(vector_pdf())
     assert plan.report.scale_source == "1:100, written in the drawing"
     assert plan.report.is_draft
-    assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
-        ("Kitchen", "kitchen"),
-        ("Wohnzimmer", "living"),
-    }
+    assert sorted(names_and_types(plan)) == [("Kitchen", "kitchen"), ("Wohnzimmer", "living")]
     assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.35 * 5.0, 4.55 * 5.0], rel=5e-3)
     (door,) = lines(plan.document, "door")
     assert door.length == pytest.approx(0.9, abs=0.02)
@@ -307,14 +292,13 @@ def test_pdf_with_lines_is_read_as_a_drawing():
 @pytest.mark.slow
 def test_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
-    stream = io.BytesIO()
-    Image.fromarray(plan.picture).save(stream, "PDF", resolution=254.0)
-    imported = import_plan(stream.getvalue(), ImportOptions(scale=125.0))
+    content = picture_file(plan.picture, "PDF", resolution=254.0)
+    imported = import_plan(content, ImportOptions(scale=125.0))
     assert len(imported.document["rooms"]) == len(plan.rooms)
     assert "page 1 was read as a picture" in imported.report.notes
     with pytest.raises(InvalidFloorPlanError, match="page is 2; the PDF has 1 pages"):
-        import_plan(stream.getvalue(), ImportOptions(scale=125.0, page=2))
-    assert "estimated" in import_plan(stream.getvalue()).report.scale_source
+        import_plan(content, ImportOptions(scale=125.0, page=2))
+    assert "estimated" in import_plan(content).report.scale_source
 
 
 @pytest.mark.slow
@@ -350,7 +334,5 @@ def test_white_rooms_with_dark_walls_on_a_transparent_ground_are_rooms():
     draw = ImageDraw.Draw(picture)
     draw.rectangle((300, 300, 1100, 800), fill="white", outline="black", width=20)
     draw.rectangle((690, 300, 709, 800), fill="black")
-    content = io.BytesIO()
-    picture.save(content, "PNG")
-    draft = import_plan(content.getvalue(), ImportOptions(metres_per_pixel=0.01))
+    draft = import_plan(picture_file(picture), ImportOptions(metres_per_pixel=0.01))
     assert sorted(room.area for room in shapes(draft.document)) == pytest.approx([17.1, 17.1], abs=0.8)

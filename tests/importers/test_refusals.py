@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import random
 import re
@@ -19,6 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportOptions, export_plan, import_plans
 from tests.importers.conftest import FLAT
+from tests.painted import picture_file
 
 # Addresses, objects, tracebacks, names of libraries and of their errors, and the same word twice.
 INTERNAL = re.compile(
@@ -43,9 +43,7 @@ def _whole(format: str) -> bytes:
         return pdf(b"".join(b"%.2f %.2f m %.2f %.2f l S\n" % (*a, *b) for a, b in chords(20, 700.0)))
     if format == "dwg":
         return b"AC1032" + bytes(range(250))
-    stream = io.BytesIO()
-    Image.new("L", (80, 80), 255).save(stream, "PNG")
-    return stream.getvalue()
+    return picture_file(Image.new("L", (80, 80), 255))
 
 
 def _damaged(content: bytes, count: int) -> Iterator[bytes]:

@@ -22,6 +22,7 @@ from lalaloc_core.importers import ImportOptions, detect_format, export_plan, im
 from lalaloc_core.importers.common.geometry import MapFrame
 from lalaloc_core.importers.formats.ros import write
 from tests.importers.conftest import FLAT, lines, shapes, zip_file
+from tests.painted import picture_file
 
 SETTINGS = {"image": "map.pgm", "resolution": 0.05, "origin": [0.0, 0.0, 0.0], "negate": 0}
 
@@ -36,9 +37,7 @@ def _cells(content: bytes) -> np.ndarray:
 
 
 def _picture(gray: np.ndarray, kind: str = "PPM") -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(gray).save(stream, kind)
-    return stream.getvalue()
+    return picture_file(gray, kind)
 
 
 def _scanned() -> np.ndarray:

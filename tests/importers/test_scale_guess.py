@@ -11,6 +11,7 @@ from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
 from lalaloc_core.importers.drawing.scale_guess import Measures, combine, guess_scale, tread_spacings
 from tests.importers.test_lettering import LIMITS, PrintedPlan
+from tests.strategies import present
 
 
 def _flight(treads: int, spacing: float, width: float = 1.0) -> list[shapely.LineString]:
@@ -27,8 +28,7 @@ def test_more_doors_make_the_scale_more_certain():
 
 def test_written_areas_outweigh_doors():
     areas = [(12.0, 12.0e4), (20.0, 20.4e4), (9.0, 8.9e4), (7.0, 70.0e4)]
-    guess = combine(Measures(leaves=[88.0, 90.0, 91.0], areas=areas), 0.012)
-    assert guess is not None
+    guess = present(combine(Measures(leaves=[88.0, 90.0, 91.0], areas=areas), 0.012))
     assert guess.metres_per_unit == pytest.approx(0.01, rel=0.015)
     assert guess.std < 0.03
     assert {clue.kind: clue.count for clue in guess.clues} == {"leaf": 3, "area": 3}
@@ -53,8 +53,7 @@ def test_drawing_is_read_again_at_the_scale_that_was_found():
         scales.append(scale)
         return Measures(leaves=[82.0, 84.0, 88.0, 90.0])
 
-    guess = guess_scale(sketch, 0.02, Budget())
-    assert guess is not None
+    guess = present(guess_scale(sketch, 0.02, Budget()))
     assert len(scales) == 2
     assert abs(math.log(scales[1] / guess.metres_per_unit)) < 0.04
 

@@ -96,7 +96,6 @@ def sphere() -> bytes:
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[PostgresServer]:
-    """Yield a PostgreSQL server for the tests."""
     programs = postgres_programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed; on Debian and Ubuntu the package is postgresql")
@@ -175,20 +174,20 @@ class InTurn(httpx.BaseTransport):
         self._transport = httpx.HTTPTransport()
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Send a request."""
         url = next(self._urls)
         request.url = request.url.copy_with(host=url.host, port=url.port)
         return self._transport.handle_request(request)
 
     def close(self) -> None:
-        """Close all connections."""
         self._transport.close()
 
 
 @pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    """Settings of a module's app; a module that needs others has a fixture of this name."""
-    return {}
+def app_settings(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Return the `APP_SETTINGS` of a module, which may name the fixture of its bundle."""
+    settings: dict[str, Any] = getattr(request.module, "APP_SETTINGS", {})
+    bundle = settings.get("bundle")
+    return settings | ({"bundle": request.getfixturevalue(bundle)} if isinstance(bundle, str) else {})
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +197,12 @@ def client(
     """Yield one app for the tests of a module, which do not disturb each other."""
     with start_app(tmp_path_factory.mktemp("data"), **app_settings) as started:
         yield started
+
+
+@pytest.fixture(scope="module")
+def flat(client: httpx.Client) -> str:
+    """Return the id of `FLAT` in the app of a module."""
+    return upload(client)
 
 
 @pytest.fixture(scope="module")
@@ -244,6 +249,16 @@ def open_store(url: str) -> Iterator[OpenStore]:
 def store(tmp_path: Path, empty_database: Path) -> Iterator[Store]:
     """Yield an empty store on SQLite."""
     with closing(Store(f"sqlite:///{shutil.copy(empty_database, tmp_path / 'test.sqlite3')}")) as opened:
+        yield opened
+
+
+@pytest.fixture
+def app_store(database_of: DatabaseOf, empty_database: Path, tmp_path: Path) -> Iterator[Store]:
+    """Yield the store of the app whose data folder is `tmp_path`."""
+    url = database_of(tmp_path)
+    if url.startswith("sqlite"):
+        shutil.copy(empty_database, tmp_path)
+    with closing(Store(url)) as opened:
         yield opened
 
 
@@ -297,9 +312,7 @@ def tiled_plan(side: int, *, openings: bool = False) -> dict[str, Any]:
 
 def upload(client: httpx.Client, plan: dict[str, Any] | None = None, *, wait: bool = True) -> str:
     """Upload a plan, wait until it is ready, return its id."""
-    response = client.post("/floorplans", json=plan or FLAT)
-    assert response.status_code == 201, response.text
-    plan_id = response.json()["id"]
+    plan_id = document_of(client.post("/floorplans", json=plan or FLAT), 201)["id"]
     if wait:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
     return plan_id
@@ -318,14 +331,25 @@ def original_of(store: Store, plan_id: str) -> bytes:
     return content
 
 
+def document_of(response: httpx.Response, status: int = 200) -> Any:
+    """Check the status of an answer, and return its document."""
+    assert response.status_code == status, response.text
+    return response.json()
+
+
+def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
+    """Check that an answer has a JSON document per line, and return these."""
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/x-ndjson"
+    return [json.loads(line) for line in response.text.splitlines()]
+
+
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
-    """Send a query."""
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
     return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
-    """Poll until something holds."""
     deadline = monotonic() + timeout_s
     while not condition():
         assert monotonic() < deadline, "timed out waiting"

@@ -6,7 +6,6 @@ import os
 import pwd
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import uuid
@@ -16,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sqlalchemy
+
+from tests.local_servers import free_port
 
 _DEBIAN = Path("/usr/lib/postgresql")
 _START_S = 60
@@ -80,7 +81,6 @@ class PostgresServer:
                 os.kill(pid, signal.SIGCONT)
 
     def start(self) -> None:
-        """Start the server."""
         log = self.folder / "log"
         # Tests do not crash the machine, so fsync is not needed.
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
@@ -103,24 +103,18 @@ def postgres_programs() -> Path | None:
 
 @contextmanager
 def postgres_server(programs: Path) -> Iterator[PostgresServer]:
-    """Run a temporary cluster."""
     with tempfile.TemporaryDirectory(prefix="lalaloc-postgres-") as parent:
         folder = Path(parent) / "cluster"
         if (user := _user()) is not None:
             shutil.chown(parent, user)
         _run([programs / "initdb", "-D", folder, "-U", "postgres", "-A", "trust", "-E", "UTF8", "--no-sync"])
-        server = PostgresServer(programs, folder, _free_port())
+        server = PostgresServer(programs, folder, free_port())
         server.start()
         try:
             yield server
         finally:
-            subprocess.run(
-                [server.programs / "pg_ctl", "stop", "-m", "immediate", "-D", folder],
-                user=_user(),
-                cwd="/",
-                capture_output=True,
-                check=False,
-            )
+            stop = [server.programs / "pg_ctl", "stop", "-m", "immediate", "-D", folder]
+            subprocess.run(stop, user=_user(), cwd="/", capture_output=True, check=False)
 
 
 def _run(command: list[str | Path]) -> None:
@@ -142,8 +136,3 @@ def _user() -> str | None:
         return None
     pwd.getpwnam("postgres")
     return "postgres"
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return listener.getsockname()[1]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
 
 from service.settings import Settings
+from tests.local_servers import free_port
 
 # One replica each, but several that search, so that requests are routed, and two shards of the index of venues.
 REPLICAS = {"ingress_max": 1, "encoder_max": 1, "search_min": 2, "search_max": 2, "lpo_max": 1, "index_shards": 2}
@@ -44,8 +44,7 @@ def ray_cluster() -> Iterator[str]:
             if attempt == _ATTEMPTS:
                 raise
     try:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            port = free.getsockname()[1]
+        port = free_port()
         serve.start(http_options={"host": "127.0.0.1", "port": port})
         yield f"http://127.0.0.1:{port}"
         serve.shutdown()

@@ -27,7 +27,7 @@ from service.settings import Settings
 from service.storage.records import ANONYMOUS, AuditEntry
 from service.storage.store import Store
 from service.storage.tables import API_KEYS, AUDIT_LOG
-from tests.service.conftest import DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, document_of, upload, wait_for
 from tests.service.test_security import bearer, id_of, make_key
 
 NEW_KEY = {"tenant": "acme", "name": "camera 7", "scopes": ["read", "localise"]}
@@ -41,12 +41,10 @@ def store(configured_url: str) -> Iterator[Store]:
 
 
 @pytest.fixture
-def admin(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> Iterator[httpx.Client]:
+def admin(start_app: StartApp, app_store: Store, tmp_path: Path) -> Iterator[httpx.Client]:
     """Yield a client with a key that has all scopes."""
     with start_app(tmp_path, api_keys=True, key_cache_s=0.0, rate_burst=0) as client:
-        opened = Store(database_of(tmp_path))
-        client.headers.update(bearer(make_key(opened, tenant="ours")))
-        opened.close()
+        client.headers.update(bearer(make_key(app_store, tenant="ours")))
         yield client
 
 
@@ -58,9 +56,7 @@ def _created(client: httpx.Client, **changes: Any) -> dict[str, Any]:
 
 
 def _entries(client: httpx.Client, **query: str) -> list[dict[str, Any]]:
-    answer = client.get("/admin/audit", params=query)
-    assert answer.status_code == 200, answer.text
-    return answer.json()["entries"]
+    return document_of(client.get("/admin/audit", params=query))["entries"]
 
 
 def _entry(actor: str = "a", **values: Any) -> AuditEntry:
@@ -100,7 +96,7 @@ def test_pages_list_every_key_once(admin: httpx.Client) -> None:
     assert found == made[::-1]
 
 
-def test_both_keys_are_valid_during_the_overlap(admin: httpx.Client, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_both_keys_are_valid_during_the_overlap(admin: httpx.Client, app_store: Store, tmp_path: Path) -> None:
     old = _created(admin, expires_in_s=1000)
     rotated = admin.post(f"/admin/keys/{old['id']}/rotation", json={"overlap_s": 600})
     assert rotated.status_code == 201
@@ -121,11 +117,9 @@ def test_both_keys_are_valid_during_the_overlap(admin: httpx.Client, database_of
     after = admin.post(f"/admin/keys/{old['id']}/rotation", json={"overlap_s": 90 * 86400}).json()
     assert lifetime_s(after) == 1000
     assert lifetime_s(old) < 1000
-    opened = Store(database_of(tmp_path))
-    with opened.database.writing() as connection:
+    with app_store.database.writing() as connection:
         past = datetime.now(UTC) - timedelta(seconds=1)
         connection.execute(update(API_KEYS).where(API_KEYS.c.id == old["id"]).values(expires_at=past))
-    opened.close()
     problem = assert_problem(admin.get("/limits", headers=bearer(old["key"])), 401, "unauthenticated")
     assert "expired at" in problem["detail"]
     # Another secret with the same id reveals nothing.
@@ -173,11 +167,8 @@ def test_expired_key_on_the_command_line(store: Store, capsys: pytest.CaptureFix
     assert "no valid key" in capsys.readouterr().err
     assert main(["audit", "export", "--tenant", "t"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(line["action"], line["resource"]) for line in lines] == [
-        ("keys create", old),
-        ("keys rotate", old),
-        ("keys revoke", new),
-    ]
+    changes = [(line["action"], line["resource"]) for line in lines]
+    assert changes == [("keys create", old), ("keys rotate", old), ("keys revoke", new)]
     assert lines[1]["detail"]["successor"] == new
     assert all(line["actor"].startswith("cli:") for line in lines)
 
@@ -308,13 +299,9 @@ def test_log_is_read_in_pages_and_filtered(admin: httpx.Client) -> None:
 
 
 @pytest.mark.one_replica
-def test_every_refusal_says_what_to_do_and_has_an_entry(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
-) -> None:
+def test_every_refusal_says_what_to_do_and_has_an_entry(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, key_cache_s=0.0, rate_burst=0, require_features=True) as client:
-        opened = Store(database_of(tmp_path))
-        client.headers["Authorization"] = bearer(make_key(opened))["Authorization"]
-        opened.close()
+        client.headers["Authorization"] = bearer(make_key(app_store))["Authorization"]
         plan = {"floorplan_id": upload(client)}
         keys = {name: _created(client, **changes) for name, changes in (
             ("reader", {"scopes": ["read"]}), ("slow", {"rate_per_minute": 1}), ("revoked", {}),
@@ -378,10 +365,7 @@ def test_entries_cannot_be_changed(store: Store) -> None:
 
 def test_entries_are_deleted_by_age_and_number(store: Store) -> None:
     now = datetime.now(UTC)
-    old = [
-        _entry(created_at=now - timedelta(seconds=DAY_S + 60)),
-        _entry(created_at=now - timedelta(seconds=DAY_S - 60)),
-    ]
+    old = [_entry(created_at=now - timedelta(seconds=DAY_S + late_s)) for late_s in (60, -60)]
     store.audit_log.add(old)
     assert store.audit_log.purge() == 1
     # A flood of unknown callers displaces their own entries only.

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import threading
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,8 +28,10 @@ from service.schemas.albums import PinAnswer
 from service.storage.store import Store
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import FLAT, HOME, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.painted import picture_file
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, lines_of, upload, wait_for
 from tests.service.test_security import bearer, make_key
+from tests.strategies import present
 
 ANCHORED = {**HOME, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0}
 NAMES = ("living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg")
@@ -51,9 +52,7 @@ def pictures() -> list[bytes]:
         exif[0x010F], exif[0x0110], exif[0x013B] = "Maker", "Model X", "Erika Mustermann"
         exif.get_ifd(0x8769)[0x9003] = f"2026:05:01 10:0{number}:00"
         exif.get_ifd(0x8825)[2] = (48.0, 8.0, 14.0)
-        buffer = io.BytesIO()
-        Image.open(EXAMPLES / name).save(buffer, "JPEG", quality=95, exif=exif)
-        found.append(buffer.getvalue())
+        found.append(picture_file(Image.open(EXAMPLES / name), "JPEG", quality=95, exif=exif))
     return found
 
 
@@ -72,7 +71,6 @@ def solved(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> str:
 
 
 def create(client: httpx.Client, plan_id: str, **fields: Any) -> str:
-    """Create an album; return its id."""
     answer = client.post("/albums", json={"floorplan_id": plan_id} | fields)
     assert answer.status_code == 201, answer.text
     assert answer.headers["location"] == f"/albums/{answer.json()['id']}"
@@ -86,10 +84,7 @@ def send(client: httpx.Client, album_id: str, files: list[bytes], part: str = "p
 
 def add(client: httpx.Client, album_id: str, files: list[bytes], part: str = "photo") -> list[dict[str, Any]]:
     """Add photographs; return the lines of the answer."""
-    response = send(client, album_id, files, part)
-    assert response.status_code == 200, response.text
-    assert response.headers["content-type"] == "application/x-ndjson"
-    return [json.loads(line) for line in response.text.splitlines()]
+    return lines_of(send(client, album_id, files, part))
 
 
 def photographs(client: httpx.Client, album_id: str, **params: Any) -> list[dict[str, Any]]:
@@ -327,18 +322,17 @@ def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[by
         full = next(line for line in lines if line["status"] == 507)
         assert full["problem"]["type"] == "urn:lalaloc:problem:too-many-photographs"
         assert "max_album_photographs" in full["problem"]["detail"]
-        assert (client.get("/limits").json()["max_albums"], client.get("/limits").json()["max_album_photographs"]) == (
-            2,
-            2,
-        )
+        limits = client.get("/limits").json()
+        assert (limits["max_albums"], limits["max_album_photographs"]) == (2, 2)
 
 
 @pytest.mark.slow
-def test_features_take_the_place_of_photographs(
-    client: httpx.Client, plan_id: str, pictures: list[bytes], features_of: Callable[[bytes], bytes]
-) -> None:
+def test_features_take_the_place_of_photographs(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    bundle = Bundle.open(default_bundle())
+    photograph = open_photograph(pictures[0], sphere_size=sphere_size(bundle.manifest))
+    features = FeatureEncoder(bundle, threads=1).features(photograph)
     album_id = create(client, plan_id)
-    (line,) = add(client, album_id, [features_of(pictures[0])], "features")
+    (line,) = add(client, album_id, [features], "features")
     assert (line["status"], line["photograph"]["view"]["width"]) == (201, None)
     wait_until_solved(client, album_id)
     assert photographs(client, album_id)[0]["pin"]["place"] is not None
@@ -346,33 +340,22 @@ def test_features_take_the_place_of_photographs(
     assert damaged["problem"]["type"] == "urn:lalaloc:problem:invalid-features"
 
 
-@pytest.fixture(scope="module")
-def features_of() -> Callable[[bytes], bytes]:
-    """Return the encoder of a device."""
-    bundle = Bundle.open(default_bundle())
-    encoder, size = FeatureEncoder(bundle, threads=1), sphere_size(bundle.manifest)
-    return lambda content: encoder.features(open_photograph(content, sphere_size=size))
-
-
 def test_stored_album_has_no_picture_position_or_owner(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path) as client:
         album_id = create(client, upload(client, HOME))
         add(client, album_id, pictures[:1])
         wait_until_solved(client, album_id)
         assert "Mustermann" not in json.dumps(photographs(client, album_id))
-        store = Store(database_of(tmp_path))
-        store.album_jobs.release(album_id, "")
-        with store.database.writing() as connection:
+        app_store.album_jobs.release(album_id, "")
+        with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(solved_number=0))
-        job = store.album_jobs.claim(album_id, "test", 10.0)
-        assert job is not None
+        job = present(app_store.album_jobs.claim(album_id, "test", 10.0))
         (part,) = job.photographs
         assert len(part.entry) <= 20_000
         for secret in (b"Mustermann", b"\xff\xd8\xff", b"GPS"):
             assert secret not in part.entry
-        store.close()
 
 
 def test_model_without_features_has_no_albums(tiny_bundle: Path, start_app: StartApp, tmp_path: Path) -> None:
@@ -382,48 +365,40 @@ def test_model_without_features_has_no_albums(tiny_bundle: Path, start_app: Star
 
 
 def test_albums_of_another_tenant_do_not_exist(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        store = Store(database_of(tmp_path))
-        own, other = bearer(make_key(store, tenant="one")), bearer(make_key(store, tenant="two"))
-        reader = bearer(make_key(store, tenant="one", scopes=("read",)))
+        own, other = bearer(make_key(app_store, tenant="one")), bearer(make_key(app_store, tenant="two"))
+        reader = bearer(make_key(app_store, tenant="one", scopes=("read",)))
         client.headers.update(own)
         album_id = create(client, upload(client, HOME))
         (line,) = add(client, album_id, pictures[:1])
         path = f"/albums/{album_id}/photographs/{line['photograph']['id']}"
-        for method, address in (
-            ("GET", f"/albums/{album_id}"),
-            ("DELETE", f"/albums/{album_id}"),
-            ("GET", f"/albums/{album_id}/events"),
-            ("GET", f"/albums/{album_id}/photographs"),
-            ("GET", path),
-            ("DELETE", path),
-        ):
+        album = f"/albums/{album_id}"
+        both = [(method, address) for method in ("GET", "DELETE") for address in (album, path)]
+        for method, address in (*both, ("GET", f"{album}/events"), ("GET", f"{album}/photographs")):
             assert_problem(client.request(method, address, headers=other), 404, "unknown-album")
             assert_problem(client.request(method, address, headers=reader), 403, "insufficient-scope")
         assert client.get("/albums", headers=other).json()["albums"] == []
         used = client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"]
         assert used > 0
         assert client.get("/usage", headers=other).json()["stored_bytes"]["by_kind"]["albums"] == 0
-        store.quota.recount()
+        app_store.quota.recount()
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == used
         assert client.delete(f"/albums/{album_id}").status_code == 204
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == 0
-        actions = [entry.action for entry in store.audit_log.page(limit=50)]
+        actions = [entry.action for entry in app_store.audit_log.page(limit=50)]
         assert "DELETE /albums/{album_id}" in actions
-        store.close()
 
 
 def test_photographs_count_against_the_storage_quota(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path) as client:
-        store = Store(database_of(tmp_path))
         album_id = create(client, upload(client))
         (first,) = add(client, album_id, pictures[:1])
         used = client.get("/usage").json()["stored_bytes"]["used"]
-        store.tenants.change_limits("default", stored_bytes=used + 3000)
+        app_store.tenants.change_limits("default", stored_bytes=used + 3000)
         wait_for(lambda: client.get("/usage").json()["stored_bytes"]["limit"] == used + 3000)
         kept, refused = add(client, album_id, pictures[:2])
         assert (kept["status"], refused["status"]) == (200, 507)
@@ -432,25 +407,22 @@ def test_photographs_count_against_the_storage_quota(
         # A deleted photograph makes room for another one.
         assert client.delete(f"/albums/{album_id}/photographs/{first['photograph']['id']}").status_code == 204
         assert [line["status"] for line in add(client, album_id, pictures[1:2])] == [201]
-        store.close()
 
 
 def test_album_goes_with_its_plan_and_expires(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes]
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path, album_ttl_s=1.0) as client:
-        store = Store(database_of(tmp_path))
         plan_id = upload(client)
         expiring = create(client, plan_id)
         add(client, expiring, pictures[:1])
         wait_for(lambda: client.get(f"/albums/{expiring}").status_code == 404)
         assert client.get("/albums").json()["albums"] == []
-        assert store.albums.purge() == 1
+        assert app_store.albums.purge() == 1
         with_plan = create(client, plan_id)
         assert client.delete(f"/floorplans/{plan_id}").status_code == 204
         assert_problem(client.get(f"/albums/{with_plan}"), 404, "unknown-album")
-        assert store.quota.account("default").used.albums == 0
-        store.close()
+        assert app_store.quota.account("default").used.albums == 0
 
 
 def test_events_follow_an_album_until_it_is_solved(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
@@ -469,17 +441,14 @@ def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: st
     upper = upload(client, {**HOME, "name": "Upper"})
     plans = [{"floorplan_id": plan_id, "level": 0}, {"floorplan_id": upper, "level": 1}]
     venue = client.post("/venues", json={"plans": plans}).json()
-    answer = client.post("/albums", json={"venue_id": venue["id"]})
-    assert answer.status_code == 201, answer.text
-    album_id = answer.json()["id"]
+    album_id = document_of(client.post("/albums", json={"venue_id": venue["id"]}), 201)["id"]
     (line,) = add(client, album_id, pictures[:1])
     wait_until_solved(client, album_id)
     (row,) = photographs(client, album_id)
     place = row["pin"]["place"]
     assert place["level"] == {plan_id: 0.0, upper: 1.0}[place["floorplan_id"]]
-    moved = correct(
-        client, album_id, line["photograph"]["id"], {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": upper}
-    )
+    correction = {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": upper}
+    moved = correct(client, album_id, line["photograph"]["id"], correction)
     assert moved.status_code == 200, moved.text
     wait_until_solved(client, album_id)
     (row,) = photographs(client, album_id, floorplan_id=upper)
@@ -532,14 +501,13 @@ def test_correction_of_a_room_that_is_gone_is_left_out(client: httpx.Client, pic
 
 @pytest.mark.slow
 def test_album_of_another_model_can_only_be_read(
-    client: httpx.Client, database_of: DatabaseOf, start_app: StartApp, tmp_path: Path, pictures: list[bytes]
+    client: httpx.Client, app_store: Store, start_app: StartApp, tmp_path: Path, pictures: list[bytes]
 ) -> None:
     with start_app(tmp_path) as own:
         album_id = create(own, upload(own, HOME))
         (line,) = add(own, album_id, pictures[:1])
         wait_until_solved(own, album_id)
-        store = Store(database_of(tmp_path))
-        with store.database.writing() as connection:
+        with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(model_sha256="0" * 64))
         assert own.get(f"/albums/{album_id}").json()["state"] == "outdated"
         assert photographs(own, album_id)[0]["pin"]["place"] is not None
@@ -547,13 +515,12 @@ def test_album_of_another_model_can_only_be_read(
         assert "create a new album" in problem["detail"]
         assert_problem(correct(own, album_id, line["photograph"]["id"], None), 409, "album-outdated")
         assert own.delete(f"/albums/{album_id}").status_code == 204
-        store.close()
 
 
 @pytest.mark.slow
 @pytest.mark.one_replica
 def test_expired_lease_is_taken_over(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, go_on = threading.Event(), threading.Event()
     solve = album_search.solve_album
@@ -568,22 +535,19 @@ def test_expired_lease_is_taken_over(
         album_id = create(client, upload(client, HOME))
         add(client, album_id, pictures[:1])
         assert begun.wait(60.0)
-        store = Store(database_of(tmp_path))
         # Held by the app: another replica gets nothing, nor does it store what it found.
-        assert store.album_jobs.due(client.get(f"/albums/{album_id}").json()["model_sha256"], [], 9) == []
-        assert store.album_jobs.claim(album_id, "other", 10.0) is None
-        with store.database.writing() as connection:
+        assert app_store.album_jobs.due(client.get(f"/albums/{album_id}").json()["model_sha256"], [], 9) == []
+        assert app_store.album_jobs.claim(album_id, "other", 10.0) is None
+        with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(lease_until_s=0.0))
-        job = store.album_jobs.claim(album_id, "other", 10.0)
-        assert job is not None
+        job = present(app_store.album_jobs.claim(album_id, "other", 10.0))
         assert job.attempts == 2
         go_on.set()
         # The app lost the lease, so its result is dropped until the other one releases it.
         pins = {part.id: '{"state": "set_aside"}' for part in job.photographs}
-        assert not store.album_jobs.finish(job, "third", "0" * 32, pins=pins, solution=None)
-        store.album_jobs.release(album_id, "other")
+        assert not app_store.album_jobs.finish(job, "third", "0" * 32, pins=pins, solution=None)
+        app_store.album_jobs.release(album_id, "other")
         wait_until_solved(client, album_id)
-        store.close()
 
 
 @pytest.mark.slow

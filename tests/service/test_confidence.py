@@ -18,8 +18,8 @@ from PIL import Image
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
-from tests.painted import painted_room
-from tests.service.conftest import localise, upload
+from tests.painted import painted_room, picture_file
+from tests.service.conftest import document_of, localise, upload
 
 HOMES = 12
 FIRST_HOME = 1000
@@ -47,7 +47,7 @@ def shots() -> list[Shot]:
     for number in range(FIRST_HOME, FIRST_HOME + HOMES):
         scene = source.load(f"validation-{number:05d}")
         camera = scene.cameras[0]
-        picture = png(camera.photographs[source.appearances[0]].image(HEIGHT, WIDTH))
+        picture = picture_file(camera.photographs[source.appearances[0]].image(HEIGHT, WIDTH))
         # One grid per home is enough if the plan has the height of the camera.
         plan = {**scene.plan.to_dict(), "camera_height_m": round(camera.camera_height_m, 2)}
         height_m = plan["camera_height_m"]
@@ -73,15 +73,9 @@ def right(shipped: httpx.Client, shots: list[Shot], homes: list[str], given: boo
     return [ask(shipped, home, shot.picture, shot.heading_deg if given else None) for shot, home in pairs]
 
 
-def png(image: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
 def blank(value: int) -> bytes:
     """Return a picture of a wall directly in front of the camera."""
-    return png(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
+    return picture_file(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
 
 
 def outdoors(sky: tuple[int, int, int], ground: tuple[int, int, int]) -> bytes:
@@ -89,7 +83,7 @@ def outdoors(sky: tuple[int, int, int], ground: tuple[int, int, int]) -> bytes:
     up = np.linspace(1.0, -1.0, HEIGHT)[:, None, None]
     colours = np.where(up > 0.0, np.array(sky) + 60.0 * (1.0 - up), np.array(ground) * (0.7 - 0.3 * up))
     grain = np.random.default_rng(0).normal(0.0, 6.0, (HEIGHT, WIDTH, 3))
-    return png(np.clip(colours + grain, 0.0, 255.0).astype(np.uint8))
+    return picture_file(np.clip(colours + grain, 0.0, 255.0).astype(np.uint8))
 
 
 PICTURES_OF_NO_ROOM = {
@@ -104,9 +98,7 @@ def ask(client: httpx.Client, plan_id: str, picture: bytes, heading_deg: float |
     """Return an answer of the last stage."""
     if heading_deg is not None:
         fields["heading_deg"] = heading_deg
-    response = localise(client, plan_id, picture, **fields)
-    assert response.status_code == 200, response.text
-    answer = response.json()
+    answer = document_of(localise(client, plan_id, picture, **fields))
     assert answer["stage"] == "lpo"
     return answer
 
@@ -149,7 +141,7 @@ def test_changed_sphere_is_not_trusted(
     for shot, home in zip(shots, homes, strict=True):
         changed = change(np.array(Image.open(io.BytesIO(shot.picture))))
         answers.append(
-            ask(shipped, home, png(changed), shot.heading_deg if given else None, projection="equirectangular")
+            ask(shipped, home, picture_file(changed), shot.heading_deg if given else None, projection="equirectangular")
         )
     # Some rooms look similar upside down, and some parts of a room look like a room.
     assert np.mean(confidences(answers) < 0.1) > 0.6

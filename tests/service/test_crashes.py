@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import random
@@ -21,11 +20,12 @@ from PIL import Image
 from lalaloc_core.bundle import default_bundle
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
+from tests.painted import picture_file
 from tests.service import test_albums as albums
 from tests.service.conftest import upload, wait_for
 from tests.service.test_process import children
 from tests.service.test_sessions import begin, send
-from tests.service.test_stopping import RunningService, running_service
+from tests.service.test_stopping import running_service
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -39,11 +39,6 @@ def settings(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, str]:
 
 def database_of(settings: dict[str, str], tmp_path: Path) -> str:
     return settings.get("DATABASE_URL", f"sqlite:///{tmp_path / 'data' / 'lalaloc.sqlite3'}")
-
-
-def kill(service: RunningService) -> None:
-    service.process.kill()
-    service.process.wait(60.0)
 
 
 @pytest.mark.slow
@@ -70,7 +65,8 @@ def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
         # A number out of order claims nothing, and is refused differently while the photograph holds the claim.
         probe = partial(send, service.client, session_id, sphere, number=9)
         wait_for(lambda: probe().json()["type"] == "urn:lalaloc:problem:session-busy")
-        kill(service)
+        service.process.kill()
+        service.process.wait(60.0)
         sender.join(60.0)
         assert lost
     with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
@@ -127,13 +123,11 @@ def test_session_survives_kills_at_any_moment(
 
 
 def small_pictures(count: int) -> list[bytes]:
-    """Return different pictures of the example rooms."""
     names, found = ("kitchen", "bedroom", "study", "living_room"), []
     for number in range(count):
-        buffer = io.BytesIO()
         with Image.open(EXAMPLES / f"{names[number % len(names)]}.jpg") as picture:
-            picture.resize((512 + 2 * (number // len(names)), 256)).save(buffer, "JPEG", quality=90)
-        found.append(buffer.getvalue())
+            small = picture.resize((512 + 2 * (number // len(names)), 256))
+        found.append(picture_file(small, "JPEG", quality=90))
     return found
 
 

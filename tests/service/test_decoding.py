@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import multiprocessing
 import os
@@ -23,6 +22,7 @@ from service.decoding import decoder as decoding
 from service.storage.database import Database
 from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
+from tests.painted import picture_file
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
 pytestmark = pytest.mark.one_replica
@@ -75,9 +75,7 @@ def black_png(width: int, height: int) -> bytes:
 
 
 def black(width: int, height: int, kind: str, **options: object) -> bytes:
-    buffer = io.BytesIO()
-    Image.new("RGB", (width, height)).save(buffer, kind, **options)
-    return buffer.getvalue()
+    return picture_file(Image.new("RGB", (width, height)), kind, **options)
 
 
 @pytest.mark.slow
@@ -179,17 +177,15 @@ def test_gps_metadata_is_neither_stored_nor_logged(
     exif = Image.Exif()
     exif.get_ifd(0x8825).update({1: "N", 2: tuple(IFDRational(n, 9973) for n in (479_111, 81_003, 7_177))})
     exif[0x010E] = "at home, Ringelnatterweg 7"
-    picture, portrait = io.BytesIO(), io.BytesIO()
-    Image.new("RGB", (512, 256)).save(picture, "JPEG", exif=exif)
-    Image.new("RGB", (256, 512)).save(portrait, "JPEG", exif=exif)
+    picture, portrait = black(512, 256, "JPEG", exif=exif), black(256, 512, "JPEG", exif=exif)
     with start_app(tmp_path, log_level="debug") as client:
         # After the start of the app, which configures logging.
         monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
         plan_id = upload(client)
-        assert localise(client, plan_id, picture.getvalue(), **BLACK).status_code == 200
-        assert localise(client, plan_id, portrait.getvalue(), **QUICK).status_code == 422
+        assert localise(client, plan_id, picture, **BLACK).status_code == 200
+        assert localise(client, plan_id, portrait, **QUICK).status_code == 422
     assert any("localise" in str(vars(record)) for record in caplog.records)
-    assert b"Ringelnatterweg" in picture.getvalue()
+    assert b"Ringelnatterweg" in picture
     logged = "".join(str(vars(record)) for record in caplog.records).encode()
     stored = b"".join(file.read_bytes() for file in tmp_path.rglob("*") if file.is_file())
     with Database(database_of(tmp_path)).reading() as connection:

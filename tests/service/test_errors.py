@@ -21,10 +21,8 @@ def _all_subclasses(cls: type[Exception]) -> set[type[Exception]]:
 
 def _own_errors() -> list[type[Exception]]:
     owners = ("lalaloc_core.errors", "service.")
-    return sorted(
-        (error for error in _all_subclasses(LaLaLocError) if error.__module__.startswith(owners)),
-        key=lambda e: e.__name__,
-    )
+    own = [error for error in _all_subclasses(LaLaLocError) if error.__module__.startswith(owners)]
+    return sorted(own, key=lambda error: error.__name__)
 
 
 @pytest.mark.parametrize("error", _own_errors(), ids=lambda error: error.__name__)

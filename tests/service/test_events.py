@@ -22,7 +22,7 @@ from service.http.events import PLAN_ENDS, ProgressEvents, plan_look
 from service.schemas.stored_plans import PlanEvent
 from service.settings import Settings
 from service.storage.store import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, serve, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
 from tests.service.test_security import bearer, id_of, make_key
 
@@ -172,14 +172,9 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
             return True
 
         async def read() -> list[bytes]:
+            look, ended = partial(plan_look, runtime.store, runtime.grids), PlanEvent(status="deleted")
             events = ProgressEvents(
-                partial(plan_look, runtime.store, runtime.grids),
-                PlanEvent(status="deleted"),
-                PLAN_ENDS,
-                runtime.admission,
-                runtime.reads,
-                max_s=0.5,
-                heartbeat_s=0.05,
+                look, ended, PLAN_ENDS, runtime.admission, runtime.reads, max_s=0.5, heartbeat_s=0.05
             )
             return [chunk async for chunk in events.stream(plan_id, authorised)]
 
@@ -189,15 +184,14 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_stream_ends_when_its_key_is_revoked(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The plan stays in preparation until the key is revoked, however busy the machine is.
     revoked = threading.Event()
     embed = builder.embed
     monkeypatch.setattr(builder, "embed", lambda *args, **options: (revoked.wait(60.0), embed(*args, **options))[1])
     with start_app(tmp_path, api_keys=True, key_cache_s=0.1, **SLOW) as client:
-        store = Store(database_of(tmp_path))
-        other, key = make_key(store), make_key(store)
+        other, key = make_key(app_store), make_key(app_store)
         client.headers.update(bearer(other))
         plan_id = upload(client, HALL, wait=False)
         with client.stream("GET", f"/floorplans/{plan_id}/events", headers=bearer(key)) as response:
@@ -206,10 +200,9 @@ def test_stream_ends_when_its_key_is_revoked(
             end = monotonic() + 2.5
             while monotonic() < end:
                 next(chunks)
-            store.keys.revoke(id_of(key))
+            app_store.keys.revoke(id_of(key))
             assert b"event: ready" not in b"".join(chunks)
         revoked.set()
-        store.close()
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
 WORST = "127.0.0.2"
 
@@ -327,9 +327,8 @@ def test_silent_reads_of_a_tenant_leave_a_thread_for_others() -> None:
             await asyncio.sleep(0.05)
             for _ in range(5):
                 assert await reads.run("b", lambda: "read") == "read"
-            assert [type(ended) for ended in await asyncio.gather(*silent, return_exceptions=True)] == [
-                StoreUnavailableError
-            ] * 8
+            ended = await asyncio.gather(*silent, return_exceptions=True)
+            assert [type(error) for error in ended] == [StoreUnavailableError] * 8
             goes_on.set()
         finally:
             goes_on.set()
@@ -391,19 +390,15 @@ def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: P
         assert client.post("/floorplans", json=FLAT).status_code == 201
         with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
             problem = assert_problem(worst.post("/floorplans", json=FLAT), 503, "overloaded")
-            assert (
-                "6 of your requests are in progress, and the rest of the 8 slots is reserved for other tenants."
-                in problem["detail"]
-            )
+            expected = "6 of your requests are in progress, and the rest of the 8 slots is reserved for other tenants."
+            assert expected in problem["detail"]
 
 
 @pytest.mark.one_replica
-def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     # Larger than the socket buffers.
     content, plan_id = bytes(8 * 2**20), "a" * 32
-    store = Store(database_of(tmp_path))
-    store.plans.add("default", plan_id, NewPlan(FloorPlan.from_dict(FLAT), Original(content)), limit=1)
-    store.close()
+    app_store.plans.add("default", plan_id, NewPlan(FloorPlan.from_dict(FLAT), Original(content)), limit=1)
     with start_app(tmp_path, max_reads=8) as client, ExitStack() as attack:
         path = f"/floorplans/{plan_id}/original"
         for _ in range(10):

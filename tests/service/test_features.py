@@ -29,7 +29,7 @@ from lalaloc_core.photograph import Photograph, open_photograph
 from service.routes import model_files
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import HOME, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import HOME, StartApp, assert_problem, upload, wait_for
 from tests.service.test_process import children
 from tests.service.test_security import bearer, make_key
 from tests.service.test_stopping import running_service
@@ -37,6 +37,7 @@ from tests.service.test_telemetry import collector
 
 KITCHEN, PHONE = ((EXAMPLES / name).read_bytes() for name in ("kitchen.jpg", "phone.jpg"))
 PREFIX = struct.Struct("<4sHI")
+APP_SETTINGS = {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 class Device:
@@ -57,11 +58,6 @@ class Device:
 @pytest.fixture(scope="module")
 def device() -> Device:
     return Device()
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 @pytest.fixture(scope="module")
@@ -319,13 +315,6 @@ def _check_absent(mark: bytes, folder: Path, traces: list[bytes]) -> None:
         assert not any(form in content for form in forms), name
 
 
-@pytest.fixture
-def own_bundle(tmp_path: Path) -> Path:
-    folder = tmp_path / "bundle"
-    shutil.copytree(default_bundle(), folder)
-    return folder
-
-
 def test_range_of_a_file_of_the_model_resumes_it(client: httpx.Client) -> None:
     url = "/model/view_encoder.onnx"
     whole = client.get(url)
@@ -372,7 +361,8 @@ def test_packed_networks_of_a_phone_are_small(client: httpx.Client) -> None:
         assert client.get(f"/model/{name}.planes.gz").status_code == 404
 
 
-def test_file_of_the_model_that_changed_is_a_503(start_app: StartApp, tmp_path: Path, own_bundle: Path) -> None:
+def test_file_of_the_model_that_changed_is_a_503(start_app: StartApp, tmp_path: Path) -> None:
+    own_bundle = shutil.copytree(default_bundle(), tmp_path / "bundle")
     with start_app(tmp_path, bundle=own_bundle, request_deadline_s=90.0) as client:
         path = own_bundle / "view_encoder.onnx"
         os.truncate(path, path.stat().st_size // 2)
@@ -401,12 +391,10 @@ def test_features_of_a_turn_without_angles_are_warned_about(client: httpx.Client
 
 
 def test_every_part_of_a_file_is_sent_beside_other_clients(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
+    start_app: StartApp, app_store: Store, tmp_path: Path
 ) -> None:
     with start_app(tmp_path, bundle=default_bundle(), api_keys=True, rate_per_minute=0) as client:
-        store = Store(database_of(tmp_path))
-        client.headers.update(bearer(make_key(store)))
-        store.close()
+        client.headers.update(bearer(make_key(app_store)))
         # On one connection: parsing is charged to its address until a request has a tenant, which is another client.
         for _ in range(12):
             assert client.get("/model/view_encoder.onnx", timeout=20.0).status_code == 200

@@ -15,21 +15,12 @@ from tests.service.conftest import FLAT, StartApp, assert_problem, upload
 
 pytestmark = needs_ffmpeg
 QUICK = {"refine": "none", "top_k": "1", "hfov_deg": "53", "motion": "turn"}
+APP_SETTINGS = {"bundle": "tiny_view_bundle", "max_film_bytes": 2_000_000, "max_sequence_bytes": 3_000_000}
 
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return encode(turn()[:31], tmp_path_factory.mktemp("film") / "turn.mp4")
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle, "max_film_bytes": 2_000_000, "max_sequence_bytes": 3_000_000}
-
-
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    return upload(client)
 
 
 def send(

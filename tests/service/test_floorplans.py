@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 from lalaloc_core.floorplan import FloorPlan
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
 
 def _room(polygon: Any, **more: Any) -> dict[str, Any]:
@@ -132,9 +132,8 @@ def test_json_file_equals_json_body(client: httpx.Client) -> None:
 
 def test_unknown_and_missing_parts_are_rejected(client: httpx.Client) -> None:
     file = ("flat.json", json.dumps(FLAT).encode())
-    extra = assert_problem(
-        client.post("/floorplans", files={"file": file}, data={"colour": "2"}), 422, "invalid-request"
-    )
+    response = client.post("/floorplans", files={"file": file}, data={"colour": "2"})
+    extra = assert_problem(response, 422, "invalid-request")
     (fault,) = extra["errors"]
     assert fault["field"] == "colour"
     assert fault["message"].startswith("unknown part; known: ceiling_height_m, crop, file, known_distance, layers")
@@ -223,26 +222,17 @@ def test_stalled_upload_is_ended(start_app: StartApp, tmp_path: Path) -> None:
             assert b"408" in connection.recv(4096).split(b"\r\n")[0]
 
 
-def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_path: Path) -> None:
+def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
     # With a finer grid the stored plan exceeds the limit, so its grid cannot be computed.
     with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "failed")
         assert "the limit is 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]
-        response = client.post(
-            "/localise", data={"floorplan_id": plan_id}, files={"photo": ("p.jpg", _sphere(), "image/jpeg")}
-        )
-        assert_problem(response, 409, "floorplan-failed")
+        assert_problem(localise(client, plan_id, sphere), 409, "floorplan-failed")
     with start_app(tmp_path, grid_step_m=0.25) as client:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
         assert client.get(f"/floorplans/{plan_id}").json()["reason"] is None
-
-
-def _sphere() -> bytes:
-    from tests.service.conftest import encode_picture
-
-    return encode_picture(256, 128, "JPEG")
 
 
 def test_assumed_ceiling_is_not_stored(client: httpx.Client) -> None:

@@ -18,7 +18,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, ImportOptions, import_plan
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.conftest import assert_same_plan
-from tests.service.conftest import FLAT, assert_problem, localise, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, localise, upload
+from tests.strategies import present
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
 # Required by GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11).
@@ -103,14 +104,12 @@ def test_two_control_points_make_an_anchor() -> None:
         {"x": x, "y": y, "latitude": float(lat), "longitude": float(lon)}
         for (x, y), (lon, lat) in zip(places, known.to_earth(np.array(places)), strict=True)
     ]
-    found = anchored(control_points=points, altitude_m=519.5).anchor
-    assert found is not None
+    found = present(anchored(control_points=points, altitude_m=519.5).anchor)
     assert (found.latitude, found.longitude) == pytest.approx((known.latitude, known.longitude), abs=1e-9)
     assert found.north_deg == pytest.approx(25.0, abs=1e-4)
     in_feet = FLAT | {"units": "ft", "anchor": {"control_points": [p | {"x": p["x"] / 0.3048, "y": p["y"] / 0.3048}
                                                                    for p in points]}}  # fmt: skip
-    converted = import_plan(json.dumps(in_feet).encode(), ImportOptions()).anchor
-    assert converted is not None
+    converted = present(import_plan(json.dumps(in_feet).encode(), ImportOptions()).anchor)
     assert converted.latitude == pytest.approx(known.latitude, abs=1e-9)
     stretched = [points[0], points[1] | {"x": 20.0}]
     with pytest.raises(InvalidFloorPlanError, match="check the scale"):
@@ -209,9 +208,8 @@ def test_answer_as_a_geopose(client: httpx.Client, sphere: bytes) -> None:
     assert response.headers["vary"] == "Accept"
     assert_quaternion(response.json(), geopose)
     # East is a quarter turn clockwise.
-    assert response.json()["quaternion"] == pytest.approx(
-        {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}, abs=1e-5
-    )
+    expected = {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}
+    assert response.json()["quaternion"] == pytest.approx(expected, abs=1e-5)
     keyed = client.post(
         "/localise", data=fields, files={"photo": sphere}, headers=AS_GEOPOSE | {"Idempotency-Key": "k"}
     )
@@ -268,9 +266,7 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, sphere: bytes) 
     plans = [{"floorplan_id": plan_id} for plan_id in ids]
     venue_id = client.post("/venues", json={"plans": plans, "anchor": venue_anchor}).json()["id"]
     fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"photo": sphere}
-    response = client.post("/localise", data=fields, files=file)
-    assert response.status_code == 200, response.text
-    found = response.json()["candidates"]
+    found = document_of(client.post("/localise", data=fields, files=file))["candidates"]
     assert {candidate["floorplan_id"] for candidate in found} == set(ids)
     for candidate in found:
         if candidate["floorplan_id"] == ids[2]:

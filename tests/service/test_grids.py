@@ -13,7 +13,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -47,17 +46,7 @@ from service.settings import CONSTANTS, Settings
 from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import PlanLookup, Store
 from service.telemetry import Telemetry
-from tests.service.conftest import (
-    FLAT,
-    DatabaseOf,
-    OpenStore,
-    StartApp,
-    assert_problem,
-    constants,
-    localise,
-    upload,
-    wait_for,
-)
+from tests.service.conftest import FLAT, OpenStore, StartApp, assert_problem, constants, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -82,7 +71,6 @@ class CountingEncoders(PhotographEncoder):
         self.go_on.set()
 
     def rendered(self, *arguments: Any, **named: Any) -> Any:
-        """Render as the encoders do."""
         result = self._render(*arguments, **named)
         self.embedded += len(result)
         assert self.go_on.wait(30.0)
@@ -553,13 +541,8 @@ def test_recent_plans_are_served_during_an_outage(postgres: PostgresServer, make
     try:
         assert _looked_up(known, "default", "p") == record
         assert grids.cache.find(grids.key(record.revision_id, 1.5)) is not None
-        unknown = (
-            (known, "default", "q"),
-            (known, "other", "p"),
-            (forgetful, "default", "p"),
-            (without, "default", "p"),
-        )
-        for plans, tenant, plan_id in [*unknown, (without, "default", "p")]:
+        unknown = [(known, "default", "q"), (known, "other", "p"), (forgetful, "default", "p")]
+        for plans, tenant, plan_id in [*unknown, *2 * [(without, "default", "p")]]:
             with pytest.raises(StoreUnavailableError):
                 _looked_up(plans, tenant, plan_id)
         with pytest.raises(StoreUnavailableError):
@@ -672,20 +655,14 @@ def test_new_model_recomputes_grids(start_app: StartApp, tiny_bundle: Path, tmp_
 
 
 def test_profile_model_needs_one_grid_for_all_heights(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(builder, "_MAX_GRIDS_PER_PLAN", 3)
     with start_app(tmp_path) as client:
         plan_id = upload(client)
         for height_m in (1.6, 1.7, 1.8, 1.9):
-            _localise_at(client, plan_id, sphere, height_m)
-    store = Store(database_of(tmp_path))
+            answer = localise(client, plan_id, sphere, refine="none", camera_height_m=height_m)
+            assert answer.json()["camera_height_m"] == height_m
     with start_app(tmp_path) as client:
         sha256 = client.get("/readyz").json()["model"]["sha256"]
-    assert {height for _, height in store.grids.poses(sha256, 0.5)} == {1500}
-    store.close()
-
-
-def _localise_at(client: httpx.Client, plan_id: str, sphere: bytes, height_m: float) -> None:
-    answer = localise(client, plan_id, sphere, refine="none", camera_height_m=height_m)
-    assert answer.json()["camera_height_m"] == height_m
+    assert {height for _, height in app_store.grids.poses(sha256, 0.5)} == {1500}

@@ -23,12 +23,7 @@ from tests.growth import assert_no_worse_than_linear
 # Slightly more than the maximum size of a request's head.
 _HEAD = 12_000
 _LIMITS = UploadLimits(
-    max_bytes=100_000_000,
-    name="max_photograph_bytes",
-    deadline_s=60.0,
-    idle_s=60.0,
-    bytes_per_s=1.0,
-    memory_bytes=2**20,
+    max_bytes=10**8, name="max_photograph_bytes", deadline_s=60.0, idle_s=60.0, bytes_per_s=1.0, memory_bytes=2**20
 )
 _UPLOAD_CHUNK = 65_536
 

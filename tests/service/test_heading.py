@@ -10,15 +10,15 @@ import pytest
 from PIL import Image
 
 from tests.core.test_photo_sphere import xmp
+from tests.painted import picture_file
 from tests.service.conftest import FLAT, StartApp, encode_picture, localise, upload
 
 NORTH_DEG = 30.0
 
 
 def with_packet(**properties: object) -> bytes:
-    buffer = io.BytesIO()
-    Image.open(io.BytesIO(encode_picture(512, 256, "PNG"))).save(buffer, "WEBP", lossless=True, xmp=xmp(**properties))
-    return buffer.getvalue()
+    picture = Image.open(io.BytesIO(encode_picture(512, 256, "PNG")))
+    return picture_file(picture, "WEBP", lossless=True, xmp=xmp(**properties))
 
 
 @pytest.fixture(scope="module")

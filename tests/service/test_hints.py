@@ -124,15 +124,7 @@ def test_contradicted_hints_are_warned_about() -> None:
     )
     now = datetime.now(UTC)
     record = PlanRecord(
-        id="p",
-        revision_id="r",
-        revision=1,
-        created_at=now,
-        updated_at=now,
-        report=None,
-        tenant="t",
-        plan=plan,
-        failure=None,
+        id="p", revision_id="r", revision=1, created_at=now, updated_at=now, tenant="t", plan=plan, failure=None
     )
     grid = PoseGrid(PoseSet(np.zeros((1, 2)), np.zeros(1, int)), None, np.ones((1, 8)), 1.0, 1.5)
     ground = Ground.of_plan(record, grid, hints)

@@ -38,7 +38,7 @@ from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
 from service.uploaded_file import UploadedFile
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 
 CONTENT = json.dumps(FLAT).encode()
 NOTHING = Parts({}, {})
@@ -65,11 +65,10 @@ def _same(first: httpx.Response, again: httpx.Response) -> bool:
     assert "idempotency-replayed" not in first.headers
     assert again.headers["idempotency-replayed"] == "true"
     names = ("content-type", "location", "etag")
-    return (first.status_code, first.content, [first.headers.get(name) for name in names]) == (
-        again.status_code,
-        again.content,
-        [again.headers.get(name) for name in names],
+    kept, repeated = (
+        (answer.status_code, answer.content, [answer.headers.get(name) for name in names]) for answer in (first, again)
     )
+    return kept == repeated
 
 
 @pytest.fixture
@@ -172,16 +171,12 @@ def test_one_of_many_parallel_requests_is_executed(own: httpx.Client) -> None:
     assert _count(own) == 1
 
 
-def test_plan_of_a_dead_process_is_found_by_the_next(
-    start_app: StartApp, tmp_path: Path, database_of: DatabaseOf
-) -> None:
+def test_plan_of_a_dead_process_is_found_by_the_next(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path) as client:
-        store = Store(database_of(tmp_path))
         # State after a crash: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, _files({"file": CONTENT})))
-        claim = IdempotencyKeys(store.database, store.quota, lease_s=1.0).begin(
-            "default", "POST /floorplans", "a", digest
-        )
+        keys = IdempotencyKeys(app_store.database, app_store.quota, lease_s=1.0)
+        claim = keys.begin("default", "POST /floorplans", "a", digest)
         assert isinstance(claim, Claimed)
         plan_id = claim.token
         headers = _keyed("a") | {"Content-Type": "application/json"}
@@ -190,13 +185,12 @@ def test_plan_of_a_dead_process_is_found_by_the_next(
             return client.post("/floorplans", content=CONTENT, headers=headers)
 
         assert_problem(send(), 409, "idempotency-in-progress")
-        store.plans.add("default", plan_id, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
+        app_store.plans.add("default", plan_id, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
         wait_for(lambda: send().status_code == 201, 10.0)
         again = send()
         assert again.json()["id"] == plan_id
         assert again.headers["idempotency-replayed"] == "true"
         assert _count(client) == 1
-        store.close()
 
 
 def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:
@@ -221,13 +215,8 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
     with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
         plan_id = upload(client, hall, wait=False)
         # The query waits for the plan's grid.
-        query = client.build_request(
-            "POST",
-            "/localise",
-            data={"floorplan_id": plan_id, "refine": "none"},
-            files={"photo": ("p.jpg", sphere)},
-            headers=_keyed("a"),
-        )
+        form: Any = {"data": {"floorplan_id": plan_id, "refine": "none"}, "files": {"photo": ("p.jpg", sphere)}}
+        query = client.build_request("POST", "/localise", headers=_keyed("a"), **form)
         body = query.read()
         head = b"".join(name + b": " + value + b"\r\n" for name, value in query.headers.raw)
         with socket.create_connection((client.base_url.host, client.base_url.port or 0)) as connection:

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from benchmarks.plan_drawing import draw_plan
-from tests.service.conftest import FLAT, StartApp, assert_problem, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, lines_of, wait_for
 from tests.service.test_plan_files import plan_file
 from tests.service.test_venue_levels import geojson
 
@@ -32,12 +32,8 @@ def send(
 ) -> list[dict[str, Any]]:
     """Upload a file; return the lines of the answer."""
     files = {"file": ("plan", content)}
-    response = client.post(
-        path, files=files, data=fields or {}, headers=LINES | ({} if key is None else {"Idempotency-Key": key})
-    )
-    assert response.status_code == 200, response.text
-    assert response.headers["content-type"] == "application/x-ndjson"
-    return [json.loads(line) for line in response.text.splitlines()]
+    headers = LINES | ({} if key is None else {"Idempotency-Key": key})
+    return lines_of(client.post(path, files=files, data=fields or {}, headers=headers))
 
 
 def test_steps_of_a_picture_precede_the_plan(client: httpx.Client, picture: tuple[bytes, dict[str, str]]) -> None:
@@ -102,7 +98,6 @@ def test_same_key_stores_the_plan_once_with_and_without_lines(client: httpx.Clie
 
 @pytest.fixture
 def own(start_app: StartApp, tmp_path: Path) -> Iterator[httpx.Client]:
-    """Yield an app for one test."""
     with start_app(tmp_path / "data") as started:
         yield started
 

@@ -62,10 +62,8 @@ def test_list_shows_all_key_fields(data_dir: Path, capsys: pytest.CaptureFixture
     capsys.readouterr()
     assert main(["keys", "list", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [(row["tenant"], row["name"], row["scopes"]) for row in rows] == [
-        ("acme", "camera 7", ["read", "write"]),
-        ("other", "x", ["read"]),
-    ]
+    keys = [(row["tenant"], row["name"], row["scopes"]) for row in rows]
+    assert keys == [("acme", "camera 7", ["read", "write"]), ("other", "x", ["read"])]
     assert [row["revoked_at"] is None for row in rows] == [False, True]
     assert main(["keys", "list", "--tenant", "other"]) == 0
     table = capsys.readouterr().out.splitlines()

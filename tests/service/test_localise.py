@@ -32,17 +32,8 @@ from tests.service.conftest import FLAT, StartApp, assert_problem, encode_pictur
 from tests.service.postgres import PostgresServer
 
 # Large enough that its grid takes a while, small enough for the default limits.
-HALL: dict[str, Any] = {
-    "name": "hall",
-    "ceiling_height_m": 6.0,
-    "rooms": [{"name": "hall", "polygon": [[0, 0], [98, 0], [98, 98], [0, 98]]}],
-}
-
-
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    """Upload a plan and return its id once it is ready."""
-    return upload(client)
+_ROOM = {"name": "hall", "polygon": [[0, 0], [98, 0], [98, 98], [0, 98]]}
+HALL: dict[str, Any] = {"name": "hall", "ceiling_height_m": 6.0, "rooms": [_ROOM]}
 
 
 @pytest.mark.parametrize("heading", [None, 0.0, 90.0, -360.0, 360.0, 123.456])
@@ -293,11 +284,8 @@ def test_confidence_does_not_depend_on_top_k(
     assert expected is not None
     assert 0.0 < expected.position < 1.0
     # Opposite places of a rectangular room tie up to rounding, and their order changes a few per cent.
-    for name, value in (
-        ("confidence", expected.position),
-        ("heading_confidence", expected.heading),
-        ("probability_elsewhere", 1.0 - expected.fit),
-    ):
+    values = {"confidence": expected.position, "heading_confidence": expected.heading}
+    for name, value in (values | {"probability_elsewhere": 1.0 - expected.fit}).items():
         assert len({answer[name] for answer in answers}) == 1
         assert answers[0][name] == pytest.approx(value, rel=0.05, abs=1e-4)
     shares = [candidate["probability"] for candidate in answers[-1]["candidates"]]

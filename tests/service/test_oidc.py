@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,8 @@ from service.security.oidc import TokenVerifier
 from service.security.permissions import Identity, Permission
 from service.settings import Settings
 from service.storage.store import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, wait_for
+from tests.local_servers import QuietHandler, free_port, http_server
+from tests.service.conftest import FLAT, StartApp, assert_problem, wait_for
 from tests.service.test_security import bearer, make_key
 
 ISSUER = Path(__file__).parent / "issuer"
@@ -59,13 +60,9 @@ class NodeIssuer:
     def __init__(self, port: int, *keys: RSAKey) -> None:
         self.url = f"http://127.0.0.1:{port}"
         self.fetched = 0
+        command = ["node", "issuer.mjs", str(port)]
         self._process = subprocess.Popen(
-            ["node", "issuer.mjs", str(port)],
-            cwd=ISSUER,
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            command, cwd=ISSUER, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"keys": [key.as_dict(private=True) for key in keys]}))
@@ -103,38 +100,27 @@ def node_issuer(port: int, *keys: RSAKey) -> Iterator[NodeIssuer]:
         issuer.stop()
 
 
-def _free_port() -> int:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler)
-    server.server_close()
-    return server.server_address[1]
-
-
 def _with_issuer(url: str) -> dict[str, Any]:
     return {"api_keys": True, "oidc_issuer": url, "oidc_audience": AUDIENCE}
 
 
 @needs_node
 @pytest.mark.one_replica
-def test_tokens_of_a_certified_issuer(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
-    with node_issuer(_free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
+def test_tokens_of_a_certified_issuer(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
+    with node_issuer(free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
         reader, admin = issuer.token("lalaloc:read"), issuer.token("lalaloc:admin", "lalaloc:write")
         usage = client.get("/usage", headers=bearer(reader))
         assert usage.json()["tenant"] == "acme"
-        refused = assert_problem(
-            client.post("/floorplans", json=FLAT, headers=bearer(reader)), 403, "insufficient-scope"
-        )
+        response = client.post("/floorplans", json=FLAT, headers=bearer(reader))
+        refused = assert_problem(response, 403, "insufficient-scope")
         assert "'write'; it has: read." in refused["detail"]
         assert client.post("/floorplans", json=FLAT, headers=bearer(admin)).status_code == 201
         # Keys work beside tokens.
-        store = Store(database_of(tmp_path))
-        assert client.get("/limits", headers=bearer(make_key(store))).status_code == 200
-        store.close()
+        assert client.get("/limits", headers=bearer(make_key(app_store))).status_code == 200
         entries = client.get("/admin/audit", headers=bearer(admin)).json()["entries"]
         found = {(entry["actor"], entry["tenant"], entry["action"], entry["result"]) for entry in entries}
-        assert {
-            ("oidc:robot", "acme", "POST /floorplans", "done"),
-            ("oidc:robot", "acme", "POST /floorplans", "insufficient-scope"),
-        } <= found
+        results = ("done", "insufficient-scope")
+        assert {("oidc:robot", "acme", "POST /floorplans", result) for result in results} <= found
         changed = reader[:-4] + ("AAAA" if reader[-4:] != "AAAA" else "BBBB")
         assert_problem(client.get("/usage", headers=bearer(changed)), 401, "unauthenticated")
         assert issuer.fetched == 1
@@ -144,7 +130,7 @@ def test_tokens_of_a_certified_issuer(start_app: StartApp, database_of: Database
 @pytest.mark.one_replica
 def test_issuer_rotates_its_keys(start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oidc, "_PAUSE_S", 0.2)
-    port = _free_port()
+    port = free_port()
     with start_app(tmp_path, **_with_issuer(f"http://127.0.0.1:{port}")) as client:
 
         def status(token: str) -> int:
@@ -187,7 +173,7 @@ class AnyIssuer:
 
 @pytest.fixture
 def issuer() -> Iterator[AnyIssuer]:
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_GET(self) -> None:
             if self.path == "/keys":
                 content: dict[str, Any] = {"keys": [key.as_dict(private=False) for key in found.keys]}
@@ -202,17 +188,9 @@ def issuer() -> Iterator[AnyIssuer]:
             self.end_headers()
             self.wfile.write(json.dumps(content).encode())
 
-        def log_message(self, *_arguments: Any) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    found = AnyIssuer(f"http://127.0.0.1:{server.server_address[1]}")
-    thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-    thread.start()
-    yield found
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with http_server(Handler) as url:
+        found = AnyIssuer(url)
+        yield found
 
 
 def _signed(key: Key, claims: dict[str, Any] | None = None, **header: Any) -> str:

@@ -37,7 +37,6 @@ FEW_POSES: dict[str, Any] = {"max_grid_poses": 300}
 
 @pytest.fixture(scope="module")
 def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data folder of the plans."""
     return tmp_path_factory.mktemp("data")
 
 
@@ -54,12 +53,10 @@ def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[http
 
 @pytest.fixture(scope="module")
 def plan_id(on_ray: httpx.Client) -> str:
-    """Return the id of a plan that was stored through Ray."""
     return upload(on_ray, FLAT)
 
 
 def kill_replica(deployment: str) -> None:
-    """Kill the only replica of a deployment."""
     actors = ray.util.list_named_actors(all_namespaces=True)
     [replica] = [actor for actor in actors if actor["name"].startswith(f"SERVE_REPLICA::{NAME}#{deployment}#")]
     ray.kill(ray.get_actor(**replica), no_restart=True)

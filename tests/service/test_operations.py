@@ -22,6 +22,7 @@ from service.storage import Store
 from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
+from tests.strategies import present
 
 GUIDES = Path(__file__).parents[2] / "docs" / "how-to"
 PAGE = (GUIDES / "operate.md").read_text(encoding="utf-8")
@@ -62,8 +63,7 @@ def test_sqlite_backup_restores_everything(
         assert "stop the service first" in capsys.readouterr().err
         assert client.get(f"/floorplans/{later}").status_code == 200
     assert lalaloc_service(["restore", backup, "--yes"]) == 0
-    earlier = re.search(r"is '(.*)'; delete it", capsys.readouterr().out)
-    assert earlier is not None
+    earlier = present(re.search(r"is '(.*)'; delete it", capsys.readouterr().out))
     with start_app(**on_sqlite(data)) as client:
         assert stored(client, sphere) == before
         assert client.get(f"/floorplans/{later}").status_code == 404
@@ -211,8 +211,7 @@ def test_postgresql_dump_restores_everything(
         before = stored(client, sphere)
         run(postgres, "pg_dump", "--format=custom", f"--file={dump}", *left_out, url)
         upload(client)
-    options = re.search(r"pg_restore (.*) --dbname", PAGE)
-    assert options is not None
+    options = present(re.search(r"pg_restore (.*) --dbname", PAGE))
     run(postgres, "pg_restore", *options[1].split(), f"--dbname={url}", dump)
     with start_app(tmp_path / "b", database_url=url) as client:
         wait_for(lambda: client.get("/readyz").json()["plans_preparing"] == 0)
@@ -228,8 +227,7 @@ def test_postgresql_dump_restores_albums(start_app: StartApp, postgres: Postgres
         before = pinned_album(client)
         run(postgres, "pg_dump", "--format=custom", f"--file={dump}", shipped["database_url"])
         assert client.delete(f"/albums/{before[0]}").status_code == 204
-    options = re.search(r"pg_restore (.*) --dbname", PAGE)
-    assert options is not None
+    options = present(re.search(r"pg_restore (.*) --dbname", PAGE))
     run(postgres, "pg_restore", *options[1].split(), f"--dbname={shipped['database_url']}", dump)
     with start_app(tmp_path / "b", **shipped) as client:
         assert is_same_album(client, *before)
@@ -269,6 +267,5 @@ def own_database(postgres: PostgresServer) -> str:
 
 
 def run(postgres: PostgresServer, program: str, *arguments: str) -> None:
-    """Run one of PostgreSQL's programs."""
     done = subprocess.run([postgres.programs / program, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

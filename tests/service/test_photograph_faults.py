@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -13,7 +11,7 @@ import pytest
 from lalaloc_core.photograph.file_segments import END
 from tests.core.fault_photographs import CONTRADICTED, FAULTS, LIBRARY_WORDS, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere
-from tests.service.conftest import FLAT, assert_problem, upload
+from tests.service.conftest import assert_problem
 from tests.service.test_photographs import PHONE, ask, shown
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
@@ -22,16 +20,7 @@ SOME = [
     pytest.param(fault, id=fault_id(fault), marks=[] if index % 3 == 0 else [pytest.mark.slow])
     for index, fault in enumerate(FAULTS)
 ]
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
-
-
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    return upload(client, FLAT)
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 def data_of(fault: Fault, plan_id: str) -> dict[str, str]:

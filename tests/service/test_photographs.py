@@ -22,11 +22,7 @@ MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
 PHONE: dict[Any, Any] = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 640, Tag.ExifImageHeight: 480}
 ANCHOR = {"latitude": 48.1, "longitude": 11.5, "north_deg": 0.0}
 QUICK = {"refine": "none", "top_k": 1}
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture(scope="module")

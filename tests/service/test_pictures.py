@@ -14,14 +14,9 @@ from starlette.requests import Request
 
 from lalaloc_client import Client
 from service.http.representations import preferred
-from tests.service.conftest import assert_problem, upload
+from tests.service.conftest import assert_problem
 
 JSON, PNG, SVG = "application/json", "image/png", "image/svg+xml"
-
-
-@pytest.fixture(scope="module")
-def flat(client: httpx.Client) -> str:
-    return upload(client)
 
 
 def request_picture(
@@ -65,10 +60,8 @@ def test_png_contains_the_photograph(client: httpx.Client, flat: str, sphere: by
 
 
 def test_picture_shows_both_by_default(client: httpx.Client, flat: str, sphere: bytes) -> None:
-    classes = {
-        element.get("class")
-        for element in ElementTree.fromstring(request_picture(client, flat, sphere, SVG).text).iter()
-    }
+    drawn = ElementTree.fromstring(request_picture(client, flat, sphere, SVG).text)
+    classes = {element.get("class") for element in drawn.iter()}
     assert {"layout", "camera"} <= classes
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import multiprocessing
 import os
@@ -26,7 +25,8 @@ from tests.importers.conftest import EXTERNAL_ENTITY, NESTED_ENTITIES, ZIP_BOMB,
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_ifc import DUPLEX, ifc_flat
 from tests.importers.test_pictures import open_hall, vector_pdf
-from tests.service.conftest import StartApp, assert_problem, end_time_limits, localise, wait_for
+from tests.painted import picture_file
+from tests.service.conftest import StartApp, assert_problem, document_of, end_time_limits, localise, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
@@ -38,9 +38,7 @@ def send_plan(client: httpx.Client, content: bytes, **options: Any) -> httpx.Res
 
 
 def store_plan(client: httpx.Client, content: bytes, **options: Any) -> dict[str, Any]:
-    response = send_plan(client, content, **options)
-    assert response.status_code == 201, response.text
-    return response.json()
+    return document_of(send_plan(client, content, **options), 201)
 
 
 def plan_file(format: str) -> bytes:
@@ -289,7 +287,6 @@ def test_idempotency_key_covers_the_options(client: httpx.Client) -> None:
 
 @pytest.fixture(scope="module")
 def strict(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """Start an app with low limits."""
     limits: dict[str, Any] = {
         "max_unpacked_bytes": 1_000_000,
         "max_entities": 3000,
@@ -372,10 +369,9 @@ def test_stalled_worker_is_replaced(start_app: StartApp, tmp_path: Path) -> None
 
 @pytest.mark.one_replica
 def test_file_above_the_memory_limit_is_rejected(start_app: StartApp, tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    Image.new("L", (9_000, 9_000), 255).save(stream, "PNG")
+    picture = picture_file(Image.new("L", (9_000, 9_000), 255))
     with start_app(tmp_path, import_memory_bytes=256 * 2**20, max_plan_pixels=10**9) as client:
-        response = send_plan(client, stream.getvalue(), metres_per_pixel=0.001)
+        response = send_plan(client, picture, metres_per_pixel=0.001)
         assert "memory" in assert_problem(response, 422, "invalid-floorplan")["detail"]
         assert store_plan(client, plan_file("svg"))["rooms"]
 
@@ -389,9 +385,7 @@ def test_example_is_localised_in_an_imported_drawing(start_app: StartApp, tmp_pa
         for format in ("dxf", "svg", "geojson"):
             made = store_plan(client, export_plan(plan, format), ceiling_height_m=2.6)
             assert made["status"] == "ready"
-            response = localise(client, made["id"], picture, heading_deg=truth["heading_deg"], refine="vdr")
-            assert response.status_code == 200, response.text
-            answer = response.json()
+            answer = document_of(localise(client, made["id"], picture, heading_deg=truth["heading_deg"], refine="vdr"))
             assert answer["room"] == "kitchen"
             position = shapely.Point(answer["position"]["x_m"], answer["position"]["y_m"])
             assert position.distance(shapely.Point(truth["x_m"], truth["y_m"])) < 0.3

@@ -19,10 +19,8 @@ from service.plan_files.plan_mesh import plan_glb
 from tests.service.conftest import FLAT
 
 SVG = "{http://www.w3.org/2000/svg}"
-L_ROOM = {
-    "ceiling_height_m": 3.0,
-    "rooms": [{"name": "L", "polygon": [[0, 0], [4, 0], [4, 1], [1, 1], [1, 5], [0, 5]]}],
-}
+_L_SHAPE = [[0, 0], [4, 0], [4, 1], [1, 1], [1, 5], [0, 5]]
+L_ROOM = {"ceiling_height_m": 3.0, "rooms": [{"name": "L", "polygon": _L_SHAPE}]}
 
 
 def test_drawing_has_every_room_with_y_up() -> None:

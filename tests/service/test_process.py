@@ -19,6 +19,7 @@ import httpx
 import pytest
 
 from service.settings import CONSTANTS, PREFIX
+from tests.local_servers import free_port
 from tests.service.conftest import assert_problem, localise, upload, wait_for
 from tests.service.test_localise import HALL
 
@@ -45,7 +46,7 @@ def environment_of(bundle: Path, data_dir: Path, **settings: str) -> dict[str, s
 @contextmanager
 def _uvicorn(environment: dict[str, str], log: Path) -> Iterator[tuple[subprocess.Popen[bytes], httpx.Client]]:
     """Run the service; whoever uses it ends it, and it is killed if they did not."""
-    port = _free_port()
+    port = free_port()
     command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port)]
     with log.open("ab") as output:
         process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
@@ -60,14 +61,6 @@ def _uvicorn(environment: dict[str, str], log: Path) -> Iterator[tuple[subproces
         process.wait(10.0)
 
 
-def _free_port() -> int:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def _answers(client: httpx.Client) -> bool:
     try:
         return client.get("/healthz").status_code == 200
@@ -76,7 +69,6 @@ def _answers(client: httpx.Client) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    """Worker processes of a service."""
     listing = subprocess.run(
         ["ps", "-ww", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
     ).stdout

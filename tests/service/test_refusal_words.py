@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -49,11 +48,7 @@ FILES: dict[str, bytes] = {
     "plan.webp": b"RIFF\x00\x00\x00\x00WEBPVP8 " + bytes(40),
     "plan.tiff": b"II*\0" + bytes(80),
 }
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture(scope="module")

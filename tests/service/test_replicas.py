@@ -19,6 +19,7 @@ import httpx
 import pytest
 
 from lalaloc_core.bundle import default_bundle
+from tests.local_servers import free_port
 from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
@@ -34,8 +35,7 @@ def nginx(
     program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
     if program is None:
         pytest.skip("nginx is not installed; on Debian and Ubuntu the package is nginx-light")
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port = free_port()
     text = CONFIGURATION.read_text(encoding="utf-8")
     for number, replica in enumerate(replicas, start=1):
         assert text.count(f"replica-{number}:8000") == 1
@@ -92,12 +92,8 @@ def test_two_replicas_act_as_one_service(
 
 @pytest.mark.slow
 def test_replicas_answer_the_same_album(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
-    shared: dict[str, Any] = {
-        "database_url": postgres.new_database(),
-        "bundle": default_bundle(),
-        "request_deadline_s": 90.0,
-        "sweep_s": 0.2,
-    }
+    shared: dict[str, Any] = {"bundle": default_bundle(), "request_deadline_s": 90.0, "sweep_s": 0.2}
+    shared["database_url"] = postgres.new_database()
     pictures = [(albums.EXAMPLES / name).read_bytes() for name in albums.NAMES[:3]]
     with ExitStack() as second, start_app(tmp_path / "a", **shared) as a:
         b = second.enter_context(start_app(tmp_path / "b", **shared))

@@ -48,6 +48,7 @@ from tests.service.conftest import (
     wait_for,
 )
 from tests.service.postgres import PostgresServer
+from tests.strategies import present
 
 ROOT = Path(__file__).parents[2]
 EVERYTHING = tuple(Permission)
@@ -84,19 +85,21 @@ def make_key(
 ) -> str:
     """Store a key as the command line does and return its text."""
     secret = new_secret()
-    return key_text(
-        store.keys.create(tenant, "test", hash_of(secret), scopes, rate_per_minute=rate_per_minute).id, secret
-    )
+    key = store.keys.create(tenant, "test", hash_of(secret), scopes, rate_per_minute=rate_per_minute)
+    return key_text(key.id, secret)
 
 
 def bearer(key: str) -> dict[str, str]:
-    """Return the header for a key."""
     return {"Authorization": f"Bearer {key}"}
 
 
 def id_of(key: str) -> str:
-    """Return the id in a key's text."""
     return key.split("_")[1]
+
+
+def _settings(folder: Path, database_of: DatabaseOf, bundle: Path, **more: Any) -> Settings:
+    url = database_of(folder)
+    return Settings(data_dir=folder, database_url=url, bundle=bundle, workers=0, log_level="error", **more)
 
 
 @dataclass(frozen=True)
@@ -192,9 +195,8 @@ def test_only_health_works_without_a_valid_key(guarded: Guarded, method: str, pa
 def test_key_without_the_scope_is_refused(guarded: Guarded, method: str, path: str) -> None:
     needed = NEEDED[method, path]
     scopes = tuple(permission for permission in EVERYTHING if permission != needed)
-    problem = assert_problem(
-        guarded.send(method, path, make_key(guarded.store, scopes=scopes)), 403, "insufficient-scope"
-    )
+    response = guarded.send(method, path, make_key(guarded.store, scopes=scopes))
+    problem = assert_problem(response, 403, "insufficient-scope")
     assert f"'{needed}'" in problem["detail"]
 
 
@@ -262,12 +264,8 @@ def test_unknown_paths_are_revealed_only_with_a_key(guarded: Guarded) -> None:
     refused = guarded.send("PATCH", "/localise", guarded.key)
     assert_problem(refused, 405, "method-not-allowed")
     assert refused.headers["allow"] == "POST"
-    for method, path in (
-        ("GET", "/no/such/route"),
-        ("PATCH", "/localise"),
-        ("GET", "/healthz/"),
-        ("GET", "/healthz//"),
-    ):
+    for request in ("GET /no/such/route", "PATCH /localise", "GET /healthz/", "GET /healthz//"):
+        method, path = request.split()
         assert guarded.send(method, path, None).status_code == 401
 
 
@@ -284,15 +282,7 @@ def test_redirect_names_no_host(client: httpx.Client) -> None:
 
 
 def test_route_without_a_scope_is_closed(tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path) -> None:
-    settings = Settings(
-        data_dir=tmp_path,
-        database_url=database_of(tmp_path),
-        bundle=tiny_bundle,
-        workers=0,
-        log_level="error",
-        api_keys=True,
-    )
-    app = create_app(settings)
+    app = create_app(_settings(tmp_path, database_of, tiny_bundle, api_keys=True))
     app.get("/later")(lambda: "forgotten")
     with serve(app) as base_url:
         store = Store(database_of(tmp_path))
@@ -425,11 +415,10 @@ def test_api_description_states_scopes_and_refusals() -> None:
 
 
 @pytest.mark.one_replica
-def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_rate_limit_states_when_to_retry(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=5, rate_burst=0) as client:
-        store = Store(database_of(tmp_path))
-        usual, unlimited = make_key(store), make_key(store, rate_per_minute=0)
-        more = make_key(store, rate_per_minute=9)
+        usual, unlimited = make_key(app_store), make_key(app_store, rate_per_minute=0)
+        more = make_key(app_store, rate_per_minute=9)
 
         def accepted(key: str) -> int:
             answers = [client.get("/limits", headers=bearer(key)) for _ in range(20)]
@@ -444,14 +433,12 @@ def test_rate_limit_states_when_to_retry(start_app: StartApp, database_of: Datab
         assert accepted(unlimited) == 20
         metrics = client.get("/metrics", headers=bearer(unlimited)).text
         assert re.search(r'lalaloc_rejections_total\{reason="rate-limited"\} (2[4-6])\.0', metrics)
-        store.close()
 
 
 @pytest.mark.one_replica
-def test_bytes_of_reads_count_as_requests(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_bytes_of_reads_count_as_requests(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=40, rate_burst=0) as client:
-        store = Store(database_of(tmp_path))
-        key = make_key(store)
+        key = make_key(app_store)
         client.headers.update(bearer(key))
         content = json.dumps(FLAT).encode() + b" " * 5 * access_control.BYTES_PER_REQUEST
         headers = {"Content-Type": "application/json"}
@@ -460,30 +447,26 @@ def test_bytes_of_reads_count_as_requests(start_app: StartApp, database_of: Data
         statuses = [client.get(f"{url}/original").status_code for _ in range(15)]
         assert 6 <= statuses.count(200) < 15
         assert set(statuses) == {200, 429}
-        store.close()
 
 
-def test_burst_is_limited(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+def test_burst_is_limited(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=0, rate_burst=2) as client:
-        store = Store(database_of(tmp_path))
-        key = make_key(store)
+        key = make_key(app_store)
         answers = [client.get("/limits", headers=bearer(key)) for _ in range(15)]
         refused = [answer for answer in answers if answer.status_code == 429]
         assert refused
         assert {answer.headers["retry-after"] for answer in refused} == {"1"}
         wait_for(lambda: client.get("/limits", headers=bearer(key)).status_code == 200, 5.0)
-        store.close()
 
 
 @pytest.mark.one_replica
 @pytest.mark.parametrize("kind", ["unknown", "malformed"])
 def test_many_invalid_keys_do_not_block_valid_ones(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+    start_app: StartApp, app_store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setattr(access_control, "REFUSED_KEYS_PER_MINUTE", 5)
     with start_app(tmp_path, api_keys=True, key_cache_s=0.0) as client:
-        store = Store(database_of(tmp_path))
-        key = make_key(store)
+        key = make_key(app_store)
         assert client.get("/limits", headers=bearer(key)).status_code == 200
         statuses = []
         for _ in range(12):
@@ -496,8 +479,7 @@ def test_many_invalid_keys_do_not_block_valid_ones(
         assert 1 <= int(response.headers["retry-after"]) <= 60
         assert client.get("/limits", headers=bearer(key)).status_code == 200
         # Nor one that the service has not seen before.
-        assert client.get("/limits", headers=bearer(make_key(store))).status_code == 200
-        store.close()
+        assert client.get("/limits", headers=bearer(make_key(app_store))).status_code == 200
 
 
 def test_address_counters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -563,8 +545,7 @@ def cached(tmp_path: Path) -> Iterator[CachedKey]:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
     cache = KeyCache(store.keys, fresh_s=5.0, clock=lambda: cached.clock_s)
     text = make_key(store)
-    presented = parse_authorization([f"Bearer {text}"])
-    assert presented is not None
+    presented = present(parse_authorization([f"Bearer {text}"]))
     cached = CachedKey(store, id_of(text), lambda: asyncio.run(cache.find(presented)))
     try:
         assert cached.find() is not None
@@ -579,8 +560,7 @@ def test_key_is_cached_ten_minutes_without_database(cached: CachedKey) -> None:
     # The only connection is in use.
     with cached.store.database.reading():
         for cached.clock_s in (1004.0, 1006.0, 1300.0, 1600.0):
-            key = cached.find()
-            assert key is not None
+            key = present(cached.find())
             assert key.id == cached.key_id
         cached.clock_s = 1606.0
         with pytest.raises(StoreUnavailableError):
@@ -598,8 +578,7 @@ def test_busy_database_does_not_extend_the_key_cache(cached: CachedKey) -> None:
         with pytest.raises(StoreBusyError):
             cached.find()
     # A busy database is queried again at the next request.
-    again = cached.find()
-    assert again is not None
+    again = present(cached.find())
     assert again.id == cached.key_id
 
 
@@ -640,15 +619,7 @@ def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | No
 def test_remote_requests_without_keys_are_refused(
     tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, options: dict[str, Any], status: int
 ) -> None:
-    settings = Settings(
-        data_dir=tmp_path,
-        database_url=database_of(tmp_path),
-        bundle=tiny_bundle,
-        workers=0,
-        log_level="error",
-        **options,
-    )
-    app = create_app(settings)
+    app = create_app(_settings(tmp_path, database_of, tiny_bundle, **options))
 
     async def from_network(scope: Scope, receive: Receive, send: Send) -> None:
         # Pretend that the connection came over the network.
@@ -685,9 +656,9 @@ def test_remote_requests_without_keys_are_refused(
     ],
 )
 def test_foreign_pages_without_keys_are_refused(
-    anonymous: httpx.Client, method: str, headers: dict[str, str], status: int
+    client: httpx.Client, method: str, headers: dict[str, str], status: int
 ) -> None:
-    response = anonymous.request(method, "/floorplans", headers=headers, json=FLAT if method == "POST" else None)
+    response = client.request(method, "/floorplans", headers=headers, json=FLAT if method == "POST" else None)
     assert response.status_code == status
     if status == 403:
         assert_problem(response, 403, "exposed-without-keys")
@@ -716,12 +687,6 @@ def test_impossible_allowed_host_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="neither a bare name or address nor"):
         Settings(allowed_hosts=f"localhost,{name}")
     Settings(allowed_hosts="plans.example, 192.0.2.7,2001:db8::1,*")
-
-
-@pytest.fixture(scope="module")
-def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("data")) as client:
-        yield client
 
 
 @pytest.mark.parametrize(

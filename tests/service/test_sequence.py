@@ -10,17 +10,9 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
-from tests.service.conftest import FLAT, assert_problem, encode_picture, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture
 
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
-
-
-@pytest.fixture(scope="module")
-def plan_id(client: httpx.Client) -> str:
-    return upload(client)
+APP_SETTINGS = {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
 
 
 @pytest.fixture(scope="module")
@@ -37,19 +29,17 @@ def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any
 
 
 def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> dict[str, Any]:
-    response = ask(client, plan_id, pictures, **fields)
-    assert response.status_code == 200, response.text
-    return response.json()
+    return document_of(ask(client, plan_id, pictures, **fields))
 
 
 @pytest.mark.parametrize("refine", ["none", "lpo"])
 def test_every_sphere_has_a_pose_in_the_plan(
-    client: httpx.Client, plan_id: str, pictures: list[bytes], refine: str
+    client: httpx.Client, flat: str, pictures: list[bytes], refine: str
 ) -> None:
-    answer = answer_to(client, plan_id, pictures, refine=refine, top_k=3)
+    answer = answer_to(client, flat, pictures, refine=refine, top_k=3)
     # This app has no LPO workers, so the best stage is the grid.
     assert answer["stage"] == "retrieval"
-    assert answer["floorplan_id"] == plan_id
+    assert answer["floorplan_id"] == flat
     assert len(answer["poses"]) == 3
     plan = FloorPlan.from_dict(FLAT)
     for pose in answer["poses"]:
@@ -61,9 +51,9 @@ def test_every_sphere_has_a_pose_in_the_plan(
         assert pose["heading_source"] == "searched"
 
 
-def test_given_headings_are_followed(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+def test_given_headings_are_followed(client: httpx.Client, flat: str, pictures: list[bytes]) -> None:
     fields = {"headings_deg": [10, None, 200], "heading_tolerance_deg": 5, "refine": "none"}
-    poses = answer_to(client, plan_id, pictures, **fields)["poses"]
+    poses = answer_to(client, flat, pictures, **fields)["poses"]
     assert poses[1]["heading_source"] == "searched"
     for pose, given in ((poses[0], 10.0), (poses[2], 200.0)):
         if pose["heading_source"] == "given":
@@ -72,17 +62,15 @@ def test_given_headings_are_followed(client: httpx.Client, plan_id: str, picture
             assert "which the photograph contradicts" in pose["warnings"][0]
 
 
-def test_long_turn_is_localised(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
-    assert len(answer_to(client, plan_id, 10 * pictures, refine="none")["poses"]) == 30
+def test_long_turn_is_localised(client: httpx.Client, flat: str, pictures: list[bytes]) -> None:
+    assert len(answer_to(client, flat, 10 * pictures, refine="none")["poses"]) == 30
 
 
 @pytest.mark.parametrize(
     "walk", [{"motion": "walk"}, {"motion": ""}, {"motions": [{}]}, {"camera_heights_m": [1.5, 1.6]}]
 )
-def test_walk_is_refused_by_name(
-    client: httpx.Client, plan_id: str, pictures: list[bytes], walk: dict[str, Any]
-) -> None:
-    problem = assert_problem(ask(client, plan_id, pictures[:2], **walk), 422, "invalid-request")
+def test_walk_is_refused_by_name(client: httpx.Client, flat: str, pictures: list[bytes], walk: dict[str, Any]) -> None:
+    problem = assert_problem(ask(client, flat, pictures[:2], **walk), 422, "invalid-request")
     assert [fault["field"] for fault in problem["errors"]] == [*walk]
     assert "send them to a session (POST /sessions), or to an album (POST /albums)" in problem["detail"]
 
@@ -102,19 +90,19 @@ def test_walk_is_refused_by_name(
     ],
 )
 def test_invalid_sequence_is_rejected(
-    client: httpx.Client, plan_id: str, sphere: bytes, count: int, fields: dict[str, Any], field: str, message: str
+    client: httpx.Client, flat: str, sphere: bytes, count: int, fields: dict[str, Any], field: str, message: str
 ) -> None:
-    problem = assert_problem(ask(client, plan_id, [sphere] * count, **fields), 422, "invalid-request")
+    problem = assert_problem(ask(client, flat, [sphere] * count, **fields), 422, "invalid-request")
     assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
 
 
-def test_invalid_sphere_is_rejected(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    assert_problem(ask(client, plan_id, [sphere, b"no picture"]), 422, "invalid-photograph")
+def test_invalid_sphere_is_rejected(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    assert_problem(ask(client, flat, [sphere, b"no picture"]), 422, "invalid-photograph")
     assert_problem(ask(client, "f" * 32, [sphere] * 2), 404, "unknown-floorplan")
 
 
-def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    problem = assert_problem(ask(client, plan_id, [sphere, bytes(370_000)]), 413, "upload-too-large")
+def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    problem = assert_problem(ask(client, flat, [sphere, bytes(370_000)]), 413, "upload-too-large")
     assert "LALALOC_MAX_SEQUENCE_BYTES" in problem["detail"]
     limits = client.get("/limits").json()
     assert (limits["max_sequence_photographs"], limits["max_sequence_bytes"]) == (30, 300_000)

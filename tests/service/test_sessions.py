@@ -19,37 +19,33 @@ from service.storage.kept_answers import IdempotencyKeys
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.venues import venue_plans
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, encode_picture, upload
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, encode_picture, upload
+from tests.service.test_venue_queries import venue_of
 
 
 def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
-    """Begin a session; return its id."""
     answer = client.post("/sessions", json={"floorplan_id": plan_id} | fields)
     assert answer.status_code == 201, answer.text
     assert answer.headers["location"] == f"/sessions/{answer.json()['id']}"
     return answer.json()["id"]
 
 
+def _moved(covariance: str) -> dict[str, Any]:
+    return {"forward_m": 1, "turn_deg": 0, "covariance": covariance}
+
+
 def send(client: httpx.Client, session_id: str, picture: bytes, **fields: Any) -> httpx.Response:
-    """Send a photograph."""
     data = {name: str(value) for name, value in fields.items()}
     files = {"photo": ("p.jpg", picture, "image/jpeg")}
     return client.post(f"/sessions/{session_id}/photographs", data=data, files=files)
 
 
-@pytest.fixture(scope="module")
-def plan_id(client: httpx.Client) -> str:
-    return upload(client)
-
-
-def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id, camera_height_m=1.5)
+def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat, camera_height_m=1.5)
     empty = client.get(f"/sessions/{session_id}").json()
     assert (empty["photographs"], empty["mode"], empty["pose"], empty["path"]) == (0, "searching", None, [])
     first = send(client, session_id, sphere, number=1).json()
-    second = send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
-    assert second.status_code == 200, second.text
-    answer = second.json()
+    answer = document_of(send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0))
     assert answer == client.get(f"/sessions/{session_id}").json()
     assert answer["photographs"] == answer["pose"]["number"] == 2
     assert [point["number"] for point in answer["path"]] == [1, 2]
@@ -66,8 +62,8 @@ def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, p
     assert_problem(client.delete(f"/sessions/{session_id}"), 404, "unknown-session")
 
 
-def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_photograph_out_of_order_is_refused(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
     assert send(client, session_id, sphere, number=1).status_code == 200
     problem = assert_problem(send(client, session_id, sphere, number=1), 409, "photograph-out-of-order")
     assert "number is 1; the next photograph" in problem["detail"]
@@ -85,50 +81,38 @@ def test_photograph_out_of_order_is_refused(client: httpx.Client, plan_id: str, 
         ({"forward_m": 40, "right_m": 40, "turn_deg": 0}, "invalid-motion", "the limit is 50 m"),
         ({"forward_m": 1, "turn_deg": 0, "forward_std_m": -1}, "invalid-motion", "forward_std_m is -1; it must not be"),
         ({"forward_m": 1, "turn_deg": 0, "right_std_m": 60}, "invalid-motion", "of right_m is 60 m; the limit is 50 m"),
+        (_moved(json.dumps([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])), "invalid-motion", "a variance must not be negative"),
         (
-            {"forward_m": 1, "turn_deg": 0, "covariance": json.dumps([[-1, 0, 0], [0, 1, 0], [0, 0, 1]])},
-            "invalid-motion",
-            "a variance must not be negative",
-        ),
-        (
-            {"forward_m": 1, "turn_deg": 0, "covariance": "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"},
+            _moved("[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"),
             "invalid-motion",
             "not positive semidefinite: the smallest eigenvalue of its correlations is -1",
         ),
-        (
-            {"forward_m": 1, "turn_deg": 0, "covariance": "[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]"},
-            "invalid-motion",
-            "not symmetric",
-        ),
-        (
-            {"forward_m": 1, "turn_deg": 0, "covariance": "[[NaN, 0, 0], [0, 1, 0], [0, 0, 1]]"},
-            "invalid-request",
-            "must be finite",
-        ),
-        ({"forward_m": 1, "turn_deg": 0, "covariance": "[[1]]"}, "invalid-request", "covariance"),
+        (_moved("[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]"), "invalid-motion", "not symmetric"),
+        (_moved("[[NaN, 0, 0], [0, 1, 0], [0, 0, 1]]"), "invalid-request", "must be finite"),
+        (_moved("[[1]]"), "invalid-request", "covariance"),
         ({"forward_m": 1}, "invalid-request", "forward_m and turn_deg are needed together"),
         ({"turn_std_deg": 1}, "invalid-request", "need forward_m and turn_deg"),
         ({"number": 0}, "invalid-request", "must be at least 1"),
     ],
 )
 def test_impossible_motion_is_refused(
-    client: httpx.Client, plan_id: str, sphere: bytes, fields: dict[str, Any], slug: str, message: str
+    client: httpx.Client, flat: str, sphere: bytes, fields: dict[str, Any], slug: str, message: str
 ) -> None:
-    session_id = begin(client, plan_id)
+    session_id = begin(client, flat)
     problem = assert_problem(send(client, session_id, sphere, **fields), 422, slug)
     assert message in json.dumps(problem)
     # The session is free and unchanged.
     assert send(client, session_id, sphere, number=1).status_code == 200
 
 
-def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
     assert_problem(send(client, session_id, b"no picture"), 422, "invalid-photograph")
     assert send(client, session_id, sphere, number=1).status_code == 200
 
 
-def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
     answers: list[httpx.Response] = []
     threads = [threading.Thread(target=lambda: answers.append(send(client, session_id, sphere))) for _ in range(4)]
     for thread in threads:
@@ -155,12 +139,12 @@ def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client,
         ({"colour": "red"}, "invalid-request"),
     ],
 )
-def test_impossible_session_is_refused(client: httpx.Client, plan_id: str, fields: dict[str, Any], slug: str) -> None:
-    assert_problem(client.post("/sessions", json={"floorplan_id": plan_id} | fields), 422, slug)
+def test_impossible_session_is_refused(client: httpx.Client, flat: str, fields: dict[str, Any], slug: str) -> None:
+    assert_problem(client.post("/sessions", json={"floorplan_id": flat} | fields), 422, slug)
 
 
-def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id, rooms=["kitchen"])
+def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat, rooms=["kitchen"])
     assert send(client, session_id, sphere).json()["pose"]["room"] == "kitchen"
 
 
@@ -184,9 +168,7 @@ def test_session_survives_a_restart(start_app: StartApp, tmp_path: Path, sphere:
 
 
 @pytest.mark.slow
-def test_sessions_expire_and_are_limited(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
-) -> None:
+def test_sessions_expire_and_are_limited(start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, session_ttl_s=1.0, max_sessions=2) as client:
         own = upload(client)
         first, _ = begin(client, own), begin(client, own)
@@ -195,11 +177,9 @@ def test_sessions_expire_and_are_limited(
         sleep(1.1)
         assert_problem(send(client, first, sphere), 404, "unknown-session")
         begin(client, own)
-        store = Store(database_of(tmp_path))
         sleep(1.1)
-        assert store.sessions.purge() == 1
-        assert store.quota.account("default").used.sessions == 0
-        store.close()
+        assert app_store.sessions.purge() == 1
+        assert app_store.quota.account("default").used.sessions == 0
 
 
 @pytest.mark.slow
@@ -218,18 +198,8 @@ def test_claim_of_a_dead_process_expires(start_app: StartApp, database_of: Datab
         store.close()
 
 
-def venue_of(client: httpx.Client, *plan_ids: str) -> str:
-    """Create a venue with a plan on each level; return its id."""
-    plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
-    answer = client.post("/venues", json={"name": "house", "plans": plans})
-    assert answer.status_code == 201, answer.text
-    return answer.json()["id"]
-
-
 def begin_in(client: httpx.Client, venue_id: str, **fields: Any) -> str:
-    answer = client.post("/sessions", json={"venue_id": venue_id} | fields)
-    assert answer.status_code == 201, answer.text
-    return answer.json()["id"]
+    return document_of(client.post("/sessions", json={"venue_id": venue_id} | fields), 201)["id"]
 
 
 STAIRS = {"name": "stairs", "type": "stairs", "polygon": [[20, 0], [22, 0], [22, 4], [20, 4]]}
@@ -284,9 +254,9 @@ def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, sphere: byt
     assert venue_id in problem["detail"]
 
 
-def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, plan_id: str) -> None:
-    venue_id = venue_of(client, plan_id)
-    for document in ({}, {"floorplan_id": plan_id, "venue_id": venue_id}, {"floorplan_id": plan_id, "level": 0}):
+def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, flat: str) -> None:
+    venue_id = venue_of(client, flat)
+    for document in ({}, {"floorplan_id": flat, "venue_id": venue_id}, {"floorplan_id": flat, "level": 0}):
         assert_problem(client.post("/sessions", json=document), 422, "invalid-request")
     assert_problem(client.post("/sessions", json={"venue_id": venue_id, "level": 7}), 422, "invalid-hint")
     assert_problem(client.post("/sessions", json={"venue_id": "0" * 32}), 404, "unknown-venue")
@@ -295,20 +265,18 @@ def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, plan_id:
 
 
 def test_session_of_an_earlier_version_goes_on(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
         before = send(client, session_id, sphere).json()
-        store = Store(database_of(tmp_path))
-        record = store.sessions.claim("default", session_id, None, "0" * 32)
+        record = app_store.sessions.claim("default", session_id, None, "0" * 32)
         assert record.state is not None
         assert record.pose is not None
         pose = json.loads(record.pose)
         for place in (pose["pose"], *pose["pose"]["candidates"], *pose["path"]):
             del place["floorplan_id"], place["level"]
-        store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
-        store.close()
+        app_store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
         after = send(client, session_id, sphere, forward_m=0, turn_deg=0)
         assert after.status_code == 200, after.text
         # `finish` counted a photograph.
@@ -345,8 +313,8 @@ def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_pat
         assert max(stored) < 200_000
 
 
-def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    session_id = begin(client, plan_id)
+def test_repeated_request_moves_the_camera_once(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    session_id = begin(client, flat)
 
     def keyed(key: str, picture: bytes = sphere, **fields: str) -> httpx.Response:
         url, files = f"/sessions/{session_id}/photographs", {"photo": ("p.jpg", picture, "image/jpeg")}
@@ -368,7 +336,7 @@ def test_repeated_request_moves_the_camera_once(client: httpx.Client, plan_id: s
 
 @pytest.mark.one_replica
 def test_request_whose_answer_was_not_kept_moves_the_camera_once(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_arguments: object) -> None:
         raise StoreUnavailableError()
@@ -385,10 +353,8 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
             first = photograph()
         assert first.status_code == 200
         assert_problem(photograph(), 409, "idempotency-in-progress")
-        store = Store(database_of(tmp_path))
-        with store.database.writing() as connection:
+        with app_store.database.writing() as connection:
             connection.execute(update(IDEMPOTENCY).values(lease_until_s=0.0))
-        store.close()
         assert photograph().json() == first.json()
         assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
         assert send(client, session_id, sphere).json()["photographs"] == 2

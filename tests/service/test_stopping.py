@@ -59,13 +59,8 @@ def running_service(bundle: Path, data_dir: Path, **settings: str) -> Iterator[R
 
 
 def _upload_head(body: bytes, path: str = "/floorplans") -> bytes:
-    lines = [
-        f"POST {path} HTTP/1.1",
-        "Host: localhost",
-        "Content-Type: application/json",
-        f"Content-Length: {len(body)}",
-    ]
-    return "\r\n".join([*lines, "", ""]).encode()
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    return f"{head}Content-Length: {len(body)}\r\n\r\n".encode()
 
 
 def _in_flight(client: httpx.Client) -> bool:

@@ -44,6 +44,7 @@ from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY, METADATA, ORIGINAL_CHUNKS, REVISIONS, TENANTS
 from tests.service.conftest import FLAT, OpenStore, original_of
+from tests.strategies import present
 
 PLAN = FloorPlan.from_dict(FLAT)
 
@@ -58,7 +59,6 @@ def _url(folder: Path) -> str:
 
 
 def _add(store: Store, plan_id: str = "a" * 32, *, tenant: str = "default", name: str = "Flat 3") -> str:
-    """Add a plan and return the id of its revision."""
     plan = FloorPlan.from_dict({**FLAT, "name": name})
     return store.plans.add(tenant, plan_id, NewPlan(plan, Original(b"{}")), limit=100).revision_id
 
@@ -128,8 +128,7 @@ def test_stored_plan_is_visible_to_other_processes(open_store: OpenStore, size: 
     first, second = open_store(), open_store()
     original = np.random.default_rng(1).bytes(size)
     added = first.plans.add("default", "p1", NewPlan(PLAN, Original(original)), limit=10)
-    record = second.plans.get("default", "p1")
-    assert record is not None
+    record = present(second.plans.get("default", "p1"))
     assert record.plan.to_dict() == PLAN.to_dict()
     assert (record.revision_id, record.revision) == (added.revision_id, 1)
     assert record.created_at == added.created_at
@@ -233,8 +232,7 @@ def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore) -> None:
 def test_warnings_are_stored_and_not_recomputed(open_store: OpenStore) -> None:
     plan = dataclasses.replace(PLAN, warnings=("as found at the upload",))
     open_store().plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
-    found = open_store().plans.get("default", "p")
-    assert found is not None
+    found = present(open_store().plans.get("default", "p"))
     assert found.plan.warnings == plan.warnings
 
 
@@ -245,8 +243,7 @@ def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> N
     store.plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
     with store.database.writing() as connection:
         connection.execute(update(REVISIONS).values(document_sha256=None, warnings=None))
-    found = open_store().plans.get("default", "p")
-    assert found is not None
+    found = present(open_store().plans.get("default", "p"))
     assert found.plan.warnings == plan.warnings != ()
 
 
@@ -255,14 +252,12 @@ def test_damaged_document_is_an_error(open_store: OpenStore, damage: Callable[[s
     store = open_store()
     _add(store, "p")
     with store.database.writing() as connection:
-        document = connection.scalar(select(REVISIONS.c.document))
-        assert document is not None
+        document = present(connection.scalar(select(REVISIONS.c.document)))
         connection.execute(update(REVISIONS).values(document=damage(document)))
     again = open_store()
     with pytest.raises(DamagedDataError, match="document of floor plan 'p'"):
         again.plans.get("default", "p")
-    summary = again.plans.summary("default", "p")
-    assert summary is not None
+    assert again.plans.summary("default", "p") is not None
     assert original_of(again, "p") == b"{}"
     again.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"{}")), keep=5)
     assert again.plans.get("default", "p") is not None
@@ -336,15 +331,13 @@ def test_old_revision_stays_readable(store: Store) -> None:
     old = _add(store, "p")
     smaller = FloorPlan.from_dict({**FLAT, "name": "smaller", "rooms": FLAT["rooms"][:1]})
     new = store.plans.add_revision("default", "p", NewPlan(smaller, Original(b"new")), keep=5, expected=old)
-    current = store.plans.get("default", "p")
-    assert current is not None
+    current = present(store.plans.get("default", "p"))
     assert (current.revision, current.revision_id) == (2, new.revision_id) != (1, old)
     assert (current.plan.name, len(current.plan.rooms)) == ("smaller", 1)
     assert current.updated_at > current.created_at
     assert original_of(store, "p") == b"new"
     assert store.plans.list_plans("default", limit=5)[0].name == "smaller"
-    before = store.plans.get("default", "p", old)
-    assert before is not None
+    before = present(store.plans.get("default", "p", old))
     assert (before.revision, before.plan.name) == (1, "Flat 3")
     assert store.plans.current_revisions([old, new.revision_id, "nonsense"]) == {new.revision_id}
 
@@ -457,8 +450,7 @@ def test_api_key_is_found_by_hash_until_revoked(store: Store) -> None:
     assert store.keys.find("h3") is None
     assert [key.name for key in store.keys.list_keys("t")] == ["robot"]
     store.keys.touch(made.id)
-    touched = store.keys.find("h1")
-    assert touched is not None
+    touched = present(store.keys.find("h1"))
     assert touched.last_used_at is not None
     assert store.keys.revoke(made.id)
     assert not store.keys.revoke(made.id)

@@ -20,6 +20,7 @@ from service.storage.store import Store
 from service.storage.tables import GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS
 from tests.service.conftest import OpenStore, wait_for
 from tests.service.test_store import _add, _assert_same, _grid, _key, _put, _rows
+from tests.strategies import present
 
 
 @pytest.fixture
@@ -44,8 +45,7 @@ def test_grid_without_latents_has_half_precision(store: Store) -> None:
     whole, key = _grid(count=50), _key(_add(store))
     grid = dataclasses.replace(whole, latents=None, profile_m=whole.profile_m.astype(np.float16))
     assert _put(store, key, grid)
-    found = store.grids.get(key)
-    assert found is not None
+    found = present(store.grids.get(key))
     assert found.latents is None
     assert found.profile_m.dtype == np.float16
     np.testing.assert_array_equal(found.profile_m, grid.profile_m)
@@ -114,8 +114,7 @@ def _assert_unread(store: Store, damage: Callable[[bytes], bytes], *, fits: bool
     key = _key(_add(store))
     _put(store, key)
     with store.database.writing() as connection:
-        content = connection.scalar(select(GRID_CHUNKS.c.content))
-        assert content is not None
+        content = present(connection.scalar(select(GRID_CHUNKS.c.content)))
         damaged = damage(bytes(content))
         connection.execute(update(GRID_CHUNKS).values(content=damaged))
         if fits:

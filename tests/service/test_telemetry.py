@@ -9,10 +9,8 @@ import re
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -31,11 +29,13 @@ from lalaloc_core.localise.search.pipeline import StageClock
 from service.telemetry import LOGGER_NAME, RequestLogFields
 from service.telemetry.logs import JsonFormatter, TraceContext, child_of, parse_traceparent
 from service.telemetry.tracing import Tracing, otlp_exporter
+from tests.local_servers import QuietHandler, http_server
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
 ROOT = Path(__file__).parents[2]
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 _HEX_16 = st.text("0123456789abcdef", min_size=16, max_size=16)
+APP_SETTINGS = {"log_level": "debug"}
 
 
 class Log:
@@ -65,14 +65,8 @@ class Log:
         return [line for line in lines if line["request_id"] == request_id]
 
 
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"log_level": "debug"}
-
-
 @pytest.fixture
 def log() -> Iterator[Log]:
-    """Log lines of the test."""
     attached = Log()
     logger = logging.getLogger(LOGGER_NAME)
     # Another test's app can have set another level for this process.
@@ -329,7 +323,7 @@ def collector() -> Iterator[tuple[str, list[Any]]]:
     """Run a collector that keeps the spans it receives."""
     received: list[Any] = []
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["content-length"]))
             message = ExportTraceServiceRequest.FromString(body)
@@ -340,16 +334,8 @@ def collector() -> Iterator[tuple[str, list[Any]]]:
             self.send_header("content-length", "0")
             self.end_headers()
 
-        def log_message(self, format: str, *args: object) -> None: ...
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_address[1]}/v1/traces", received
-        finally:
-            server.shutdown()
-            thread.join(10.0)
+    with http_server(Handler) as url:
+        yield f"{url}/v1/traces", received
 
 
 def test_endpoint_without_the_extra_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,11 +70,8 @@ def _recounted(store: Store, tenant: str) -> None:
 def test_limits_are_set_and_reset(configured_url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tenants", "limit", "acme", "--stored-bytes", "1000", "--cpu-share", "0.5"]) == 0
     assert main(["tenants", "limit", "acme", "--bytes-in-flight", "2000", "--cpu-share", "default"]) == 0
-    assert capsys.readouterr().out.splitlines()[-3:] == [
-        "stored_bytes: 1000",
-        "bytes_in_flight: 2000",
-        "cpu_share: default",
-    ]
+    printed = capsys.readouterr().out.splitlines()[-3:]
+    assert printed == ["stored_bytes: 1000", "bytes_in_flight: 2000", "cpu_share: default"]
     assert main(["tenants", "list", "--json"]) == 0
     [listed] = json.loads(capsys.readouterr().out)
     limits = {"stored_bytes": 1000, "bytes_in_flight": 2000, "cpu_share": None}
@@ -240,9 +237,8 @@ def test_purge_deletes_all_of_one_tenant(store: Store, capsys: pytest.CaptureFix
     assert store.quota.account("b") == kept
     assert main(["tenants", "purge", "b", "--yes"]) == 0
     with store.database.reading() as connection:
-        left = {
-            table.name: connection.scalar(select(func.count()).select_from(table)) for table in METADATA.sorted_tables
-        }
+        counts = {table.name: select(func.count()).select_from(table) for table in METADATA.sorted_tables}
+        left = {name: connection.scalar(count) for name, count in counts.items()}
     assert {name for name, count in left.items() if count} == {TENANTS.name, AUDIT_LOG.name}
 
 

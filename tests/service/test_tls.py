@@ -8,17 +8,16 @@ import shutil
 import socket
 import ssl
 import subprocess
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import httpx
 import pytest
 
+from tests.local_servers import QuietHandler, free_port, free_ports, http_server
 from tests.service.conftest import StartApp, localise, upload, wait_for
 
 CONFIGURATION = Path(__file__).parents[2] / "docker" / "Caddyfile"
@@ -38,7 +37,7 @@ def caddy(folder: Path, upstream: str) -> Iterator[Proxy]:
     program = shutil.which("caddy")
     if program is None:
         pytest.skip("Caddy is not installed; on Debian and Ubuntu the package is caddy")
-    plain, secure = _free_ports(2)
+    plain, secure = free_ports(2)
     environment = os.environ | {
         "XDG_DATA_HOME": str(folder),
         "XDG_CONFIG_HOME": str(folder),
@@ -49,12 +48,8 @@ def caddy(folder: Path, upstream: str) -> Iterator[Proxy]:
     }
     log = folder / "caddy.log"
     with log.open("wb") as output:
-        process = subprocess.Popen(
-            [program, "run", "--config", str(CONFIGURATION), "--adapter", "caddyfile"],
-            env=environment,
-            stdout=output,
-            stderr=output,
-        )
+        command = [program, "run", "--config", str(CONFIGURATION), "--adapter", "caddyfile"]
+        process = subprocess.Popen(command, env=environment, stdout=output, stderr=output)
     root = folder / "caddy" / "pki" / "authorities" / "local" / "root.crt"
     try:
         wait_for(lambda: process.poll() is not None or (root.exists() and _has_certificate(secure, root)))
@@ -65,14 +60,6 @@ def caddy(folder: Path, upstream: str) -> Iterator[Proxy]:
     finally:
         process.terminate()
         process.wait(30.0)
-
-
-def _free_ports(count: int) -> list[int]:
-    listeners = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [listener.getsockname()[1] for listener in listeners]
-    for listener in listeners:
-        listener.close()
-    return ports
 
 
 def _has_certificate(port: int, root: Path) -> bool:
@@ -107,27 +94,20 @@ def test_service_answers_over_tls(start_app: StartApp, sphere: bytes, tmp_path: 
 def test_client_cannot_state_its_address(tmp_path: Path) -> None:
     received: list[str] = []
 
-    class Upstream(BaseHTTPRequestHandler):
+    class Upstream(QuietHandler):
         def do_GET(self) -> None:
             received.extend(self.headers.get_all("X-Forwarded-For") or [])
             self.send_response(204)
             self.end_headers()
 
-        def log_message(self, *_arguments: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Upstream) as upstream:
-        threading.Thread(target=upstream.serve_forever, daemon=True).start()
-        with caddy(tmp_path, f"127.0.0.1:{upstream.server_address[1]}") as proxy:
-            assert proxy.client.get("/", headers={"X-Forwarded-For": "203.0.113.7"}).status_code == 204
-        upstream.shutdown()
+    with http_server(Upstream) as upstream, caddy(tmp_path, urlsplit(upstream).netloc) as proxy:
+        assert proxy.client.get("/", headers={"X-Forwarded-For": "203.0.113.7"}).status_code == 204
     assert len(received) == 1
     assert received[0] in ("127.0.0.1", "::1")
 
 
 def test_proxy_without_service_answers_with_a_problem(tmp_path: Path) -> None:
-    (port,) = _free_ports(1)
-    with caddy(tmp_path, f"127.0.0.1:{port}") as proxy:
+    with caddy(tmp_path, f"127.0.0.1:{free_port()}") as proxy:
         answer = proxy.client.get("/floorplans")
     assert answer.status_code == 502
     assert answer.headers["content-type"] == "application/problem+json"

@@ -22,6 +22,7 @@ from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import FLOORPLANS, METADATA, ORIGINAL_CHUNKS, REVISIONS
 from tests.service.conftest import StartApp, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
+from tests.strategies import present
 
 RELEASED = Path(__file__).parent / "released"
 
@@ -66,8 +67,7 @@ def _copy(source: sa.Engine, target: sa.Engine) -> None:
     """Migrate an empty PostgreSQL database to the revision of an SQLite file, and copy its rows."""
     scripts = ScriptDirectory(str(Path(migrations.__file__).parent))
     with source.connect() as reading, target.begin() as writing:
-        revision = MigrationContext.configure(reading).get_current_revision()
-        assert revision is not None
+        revision = present(MigrationContext.configure(reading).get_current_revision())
         context = MigrationContext.configure(writing)
         with Operations.context(context):
             for step in reversed(list(scripts.iterate_revisions(revision, "base"))):
@@ -127,8 +127,7 @@ def _assert_counted(store: Store, counts: dict[str, int]) -> None:
     )
     for tenant in accounts:
         for summary in store.plans.list_plans(tenant, limit=10):
-            record = store.plans.get(tenant, summary.id)
-            assert record is not None
+            record = present(store.plans.get(tenant, summary.id))
             place = place_columns(record.plan)
             assert {name: places[summary.id][name] for name in place} == pytest.approx(place)
             store.plans.delete(tenant, summary.id)

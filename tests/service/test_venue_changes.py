@@ -44,7 +44,6 @@ class Replica:
         self._plans = VenuePlans(self.store, cast(Any, _Grids()), cast(Any, None), **limits)
 
     def rows(self) -> list[tuple[Any, ...]]:
-        """Return the rows that queries read."""
         return [tuple(row) for row in self._plans._members(TENANT, VENUE)]
 
     def rows_read_anew(self) -> list[tuple[Any, ...]]:

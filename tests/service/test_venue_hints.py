@@ -11,7 +11,7 @@ import pytest
 
 from lalaloc_core.floorplan.earth import Anchor
 from service.venues import venue_plans
-from tests.service.conftest import FLAT, assert_problem, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, upload
 from tests.service.test_venue_queries import STUDIO, ask, venue_of
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756}
@@ -37,9 +37,7 @@ def venue_id(client: httpx.Client, storeys: list[str]) -> str:
 
 
 def answer_to(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any) -> dict[str, Any]:
-    response = ask(client, venue_id, picture, **{"refine": "none", "top_k": 10, **fields})
-    assert response.status_code == 200, response.text
-    return response.json()
+    return document_of(ask(client, venue_id, picture, **{"refine": "none", "top_k": 10, **fields}))
 
 
 @pytest.fixture(params=["all", "chosen"])
@@ -111,10 +109,8 @@ def test_plans_without_an_anchor_are_warned_about(client: httpx.Client, storeys:
     free = answer_to(client, venue_id, sphere, **fields)
     assert "1 of the venue's 2 floor plans have no anchor and are not affected by near" in free["warnings"]
     strict = answer_to(client, venue_id, sphere, strict="true", **fields)
-    assert (
-        "1 of the venue's 2 floor plans have no anchor and were not searched, because near is strict"
-        in strict["warnings"]
-    )
+    expected = "1 of the venue's 2 floor plans have no anchor and were not searched, because near is strict"
+    assert expected in strict["warnings"]
     assert {candidate["floorplan_id"] for candidate in strict["candidates"]} == {storeys[0]}
 
 
@@ -146,7 +142,5 @@ def test_hints_outside_the_venue_are_rejected(
 
 def test_near_needs_an_anchor(client: httpx.Client, sphere: bytes) -> None:
     response = ask(client, venue_of(client, upload(client)), sphere, near=json.dumps(place(0.0)), radius_m=10)
-    assert (
-        "neither the venue nor any of its floor plans has an anchor"
-        in assert_problem(response, 422, "invalid-hint")["detail"]
-    )
+    problem = assert_problem(response, 422, "invalid-hint")
+    assert "neither the venue nor any of its floor plans has an anchor" in problem["detail"]

@@ -25,7 +25,7 @@ from service.storage.store import Store
 from tests.importers.conftest import zip_file
 from tests.importers.test_ifc import DUPLEX, ifc_flat, ifc_house
 from tests.importers.test_roomplan import two_stories
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, wait_for
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, wait_for
 from tests.service.test_security import bearer, make_key
 from tests.service.test_venues import plans_of
 
@@ -98,10 +98,8 @@ def test_levels_become_a_venue(client: httpx.Client, make: Callable[[], bytes]) 
     assert (venue["name"], venue["plans"], venue["plans_ready"], venue["anchor"]) == ("Duplex", 2, 2, None)
     entries = plans_of(client, venue["id"])
     assert [entry["level"] for entry in entries] == [0.0, 1.0]
-    assert [entry["name"].casefold().replace("story", "level") for entry in entries] == [
-        "duplex – level 0",
-        "duplex – level 1",
-    ]
+    names = [entry["name"].casefold().replace("story", "level") for entry in entries]
+    assert names == ["duplex – level 0", "duplex – level 1"]
     for number, entry in enumerate(entries):
         plan = client.get(f"/floorplans/{entry['floorplan_id']}").json()
         assert (plan["name"], plan["status"]) == (entry["name"], "ready")
@@ -112,10 +110,8 @@ def test_levels_become_a_venue(client: httpx.Client, make: Callable[[], bytes]) 
 def test_levels_of_a_model_are_searched(client: httpx.Client, sphere: bytes) -> None:
     venue = send(client, ifc_house().content(), name="Haus", ceiling_height_m="2.5").json()
     entries = plans_of(client, venue["id"])
-    assert [(entry["name"], entry["level"], entry["rooms"]) for entry in entries] == [
-        ("Haus – EG", 0.0, 2),
-        ("Haus – Obergeschoss", 1.0, 1),
-    ]
+    found = [(entry["name"], entry["level"], entry["rooms"]) for entry in entries]
+    assert found == [("Haus – EG", 0.0, 2), ("Haus – Obergeschoss", 1.0, 1)]
     query = {"venue_id": venue["id"], "refine": "none"}
     answer = client.post("/localise", data=query, files={"photo": ("p.jpg", sphere, "image/jpeg")}).json()
     assert answer["floorplan_id"] in {entry["floorplan_id"] for entry in entries}
@@ -224,21 +220,18 @@ def test_limits_refuse_the_whole_file(
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["plans"] == 0
 
 
-def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+def test_levels_belong_to_the_tenant(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        store = Store(database_of(tmp_path))
-        mine, theirs = (
-            bearer(make_key(store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
-        )
+        keys = [make_key(app_store, tenant=tenant, scopes=("read", "write")) for tenant in ("mine", "theirs")]
+        mine, theirs = map(bearer, keys)
         venue = send(client, geojson(), headers=mine).json()
         assert (counts(client, mine), counts(client, theirs)) == ((2, 1), (0, 0))
         assert_problem(client.get(f"/venues/{venue['id']}", headers=theirs), 404, "unknown-venue")
-        reader = bearer(make_key(store, tenant="mine", scopes=("read", "localise")))
+        reader = bearer(make_key(app_store, tenant="mine", scopes=("read", "localise")))
         assert_problem(send(client, geojson(), headers=reader), 403, "insufficient-scope")
         used = client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"]
-        store.quota.recount()
+        app_store.quota.recount()
         assert client.get("/usage", headers=mine).json()["stored_bytes"]["by_kind"] == used
-        store.close()
 
 
 def street(first: int, count: int = 3) -> bytes:
@@ -255,9 +248,7 @@ def test_files_of_plans_make_and_extend_a_venue(client: httpx.Client) -> None:
     # Ready at once, although the file passes through a worker.
     assert (venue["name"], venue["plans"], venue["plans_ready"]) == ("Street", 3, 3)
     before, key = counts(client), {"Idempotency-Key": uuid.uuid4().hex}
-    response = extend(client, venue["id"], street(3), **key)
-    assert response.status_code == 200, response.text
-    extended = response.json()
+    extended = document_of(extend(client, venue["id"], street(3), **key))
     assert (extended["plans"], extended["plans_ready"]) == (6, 6)
     assert extended["revision"] != venue["revision"]
     again = extend(client, venue["id"], street(3), **key)
@@ -281,10 +272,8 @@ def test_file_that_cannot_be_added_changes_nothing(start_app: StartApp, tmp_path
         venue = send(client, street(0), "Street.json")
         path, before = f"/venues/{venue.json()['id']}", counts(client)
         venue_id, used = venue.json()["id"], client.get("/usage").json()["stored_bytes"]
-        assert (
-            "would have 6 plans; the limit is 5 (LALALOC_MAX_VENUE_PLANS)"
-            in (assert_problem(extend(client, venue_id, street(3)), 422, "invalid-request")["detail"])
-        )
+        problem = assert_problem(extend(client, venue_id, street(3)), 422, "invalid-request")
+        assert "would have 6 plans; the limit is 5 (LALALOC_MAX_VENUE_PLANS)" in problem["detail"]
         assert_problem(extend(client, venue_id, street(3, 4)), 507, "too-many-floorplans")
         assert_problem(extend(client, venue_id, street(3, 2), **{"If-Match": '"old"'}), 412, "revision-mismatch")
         assert_problem(extend(client, "0" * 32, street(3, 2)), 404, "unknown-venue")
@@ -299,12 +288,12 @@ def test_file_that_cannot_be_added_changes_nothing(start_app: StartApp, tmp_path
         assert extend(client, venue_id, street(3, 2), **{"If-Match": tag}).json()["plans"] == 5
 
 
-def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: DatabaseOf) -> None:
-    store, token = Store(database_of(tmp_path)), uuid.uuid4().hex
-    venue, _ = store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
+def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
+    token = uuid.uuid4().hex
+    venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
 
     def attempt(_number: int) -> tuple[str, int]:
-        extended, records = store.venue_imports.extend(
+        extended, records = app_store.venue_imports.extend(
             "t", venue.id, token, new_plans(), max_plans=9, max_venue_plans=9
         )
         return extended.revision_id, len(records)
@@ -313,15 +302,14 @@ def test_attempts_at_the_same_time_extend_once(tmp_path: Path, database_of: Data
         found = list(threads.map(attempt, range(4)))
     assert len({revision for revision, _ in found}) == 1
     assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
-    extended = store.venues.get("t", venue.id)
+    extended = app_store.venues.get("t", venue.id)
     assert extended is not None
     assert extended.plans == 4
-    used = store.quota.account("t").used
-    store.quota.recount()
-    assert store.quota.account("t").used == used
+    used = app_store.quota.account("t").used
+    app_store.quota.recount()
+    assert app_store.quota.account("t").used == used
     with pytest.raises(UnknownVenueError):
-        store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), max_plans=9, max_venue_plans=9)
-    store.close()
+        app_store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), max_plans=9, max_venue_plans=9)
 
 
 def new_plans(count: int = 3) -> list[NewPlan]:
@@ -359,16 +347,15 @@ def test_failure_between_two_plans_stores_none(tmp_path: Path, database_of: Data
     store.close()
 
 
-def test_attempts_at_the_same_time_store_one_venue(tmp_path: Path, database_of: DatabaseOf) -> None:
-    store, venue_id = Store(database_of(tmp_path)), uuid.uuid4().hex
+def test_attempts_at_the_same_time_store_one_venue(app_store: Store) -> None:
+    venue_id = uuid.uuid4().hex
 
     def attempt(_number: int) -> tuple[str, int]:
-        venue, records = store.venue_imports.add("t", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
+        venue, records = app_store.venue_imports.add("t", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
         return venue.revision_id, len(records)
 
     with ThreadPoolExecutor(4) as threads:
         found = list(threads.map(attempt, range(4)))
     assert len({revision for revision, _ in found}) == 1
     assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
-    assert len(store.plans.list_plans("t", limit=99)) == 3
-    store.close()
+    assert len(app_store.plans.list_plans("t", limit=99)) == 3

@@ -12,10 +12,11 @@ import pytest
 
 from lalaloc_core.localise.match import PoseGrid
 from service.grids import builder
+from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.venues import venue_plans
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, upload, wait_for
 from tests.service.test_localise import HALL
 
 # Pose of each example in the plan above.
@@ -26,9 +27,7 @@ STUDIO = {"ceiling_height_m": 2.6, "rooms": [{"name": "studio", "polygon": [[0, 
 def venue_of(client: httpx.Client, *plan_ids: str, **more: Any) -> str:
     """Create a venue with plans on levels 0, 1, 2 and so on."""
     plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
-    response = client.post("/venues", json={"plans": plans, **more})
-    assert response.status_code == 201, response.text
-    return response.json()["id"]
+    return document_of(client.post("/venues", json={"plans": plans, **more}), 201)["id"]
 
 
 def ask(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any) -> httpx.Response:
@@ -60,9 +59,7 @@ def test_right_plan_is_found_among_several(
     pose = POSES[name]
     fields = {"heading_deg": pose["heading_deg"]} if given else {}
     venue_id = venue_of(shipped, others[0], others[1], home)
-    response = ask(shipped, venue_id, (EXAMPLES / name).read_bytes(), **fields)
-    assert response.status_code == 200, response.text
-    answer = response.json()
+    answer = document_of(ask(shipped, venue_id, (EXAMPLES / name).read_bytes(), **fields))
     assert (answer["venue_id"], answer["floorplan_id"], answer["level"]) == (venue_id, home, 2.0)
     assert abs(answer["position"]["x_m"] - pose["x_m"]) < 0.5
     assert abs(answer["position"]["y_m"] - pose["y_m"]) < 0.5
@@ -98,9 +95,7 @@ def test_turn_is_found_in_a_venue(
     venue_id = venue_of(shipped, *others, home)
     content = (EXAMPLES / "kitchen.jpg").read_bytes()
     files = [("photo", (name, content, "image/jpeg")) for name in ("a.jpg", "b.jpg")]
-    response = shipped.post("/localise/sequence", data={"venue_id": venue_id, "motion": "turn"}, files=files)
-    assert response.status_code == 200, response.text
-    found = response.json()
+    found = document_of(shipped.post("/localise/sequence", data={"venue_id": venue_id, "motion": "turn"}, files=files))
     assert (found["venue_id"], found["floorplan_id"], found["stage"]) == (venue_id, home, "lpo")
     for pose in found["poses"]:
         assert (pose["floorplan_id"], pose["level"]) == (home, 3.0)
@@ -144,22 +139,19 @@ def test_most_probable_plans_are_searched(
 
 @pytest.mark.parametrize("stored", ["NULL", "x'4c4c5032'"], ids=["nothing", "fewer poses"])
 def test_missing_prototypes_are_made(
-    start_app: StartApp, tmp_path: Path, database_of: Any, sphere: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
+    start_app: StartApp, tmp_path: Path, app_store: Store, sphere: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
 ) -> None:
-    from service.storage import Store
 
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
     with start_app(tmp_path) as client:
         venue_id = venue_of(client, upload(client), upload(client, STUDIO))
-        store = Store(database_of(tmp_path))
-        with store.database.writing() as connection:
-            value = "'\\x4c4c5032'" if stored != "NULL" and store.database.is_postgresql else stored
+        with app_store.database.writing() as connection:
+            value = "'\\x4c4c5032'" if stored != "NULL" and app_store.database.is_postgresql else stored
             connection.exec_driver_sql(f"UPDATE latent_grids SET prototypes = {value}")
             grid_ids = connection.exec_driver_sql("SELECT id FROM latent_grids").scalars().all()
-        assert store.grids.prototypes(grid_ids) == {}
+        assert app_store.grids.prototypes(grid_ids) == {}
         assert ask(client, venue_id, sphere, refine="none").status_code == 200
-        assert store.grids.prototypes(grid_ids).keys() == set(grid_ids)
-        store.close()
+        assert app_store.grids.prototypes(grid_ids).keys() == set(grid_ids)
 
 
 @pytest.mark.slow
@@ -180,9 +172,7 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
         venue_id = venue_of(client, *plan_ids)
 
         def answer() -> dict[str, Any]:
-            response = ask(client, venue_id, sphere, refine="none")
-            assert response.status_code == 200, response.text
-            return response.json()
+            return document_of(ask(client, venue_id, sphere, refine="none"))
 
         first, again = answer(), answer()
         assert indexed[0] == indexed[1]
@@ -197,9 +187,7 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
     monkeypatch.setattr(StoredGrids, "prototypes", lambda *_: pytest.fail("read of the database"))
     # Again, from the prototype file.
     with start_app(tmp_path, request_deadline_s=60.0) as client:
-        response = ask(client, venue_id, sphere, refine="none")
-        assert response.status_code == 200, response.text
-        assert response.json()["floorplan_id"] == replaced["floorplan_id"]
+        assert document_of(ask(client, venue_id, sphere, refine="none"))["floorplan_id"] == replaced["floorplan_id"]
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from service.storage import Store
-from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload
 from tests.service.test_security import bearer, make_key
 
 JSON = {"Content-Type": "application/json"}
@@ -20,7 +20,6 @@ ANCHOR = {"latitude": 51.7546, "longitude": -1.2545, "altitude_m": 61.0, "north_
 
 @pytest.fixture(scope="module")
 def plans(client: httpx.Client) -> list[str]:
-    """Upload three plans and return their ids."""
     return [upload(client, FLAT | {"name": f"Flat {number}"}) for number in range(3)]
 
 
@@ -62,11 +61,8 @@ def test_plans_of_a_venue_are_paged_by_level(client: httpx.Client, plans: list[s
     members = [member(plans[0], 2, name="penthouse"), member(plans[1], -1), member(plans[2], 0.5)]
     venue = make(client, *members)
     found = plans_of(client, venue["id"], limit=1)
-    assert [(entry["floorplan_id"], entry["level"], entry["name"]) for entry in found] == [
-        (plans[1], -1.0, "Flat 1"),
-        (plans[2], 0.5, "Flat 2"),
-        (plans[0], 2.0, "penthouse"),
-    ]
+    placed = [(entry["floorplan_id"], entry["level"], entry["name"]) for entry in found]
+    assert placed == [(plans[1], -1.0, "Flat 1"), (plans[2], 0.5, "Flat 2"), (plans[0], 2.0, "penthouse")]
     assert {entry["status"] for entry in found} == {"ready"}
     assert [entry["floorplan_id"] for entry in plans_of(client, venue["id"], level=0.5)] == [plans[2]]
     broken = client.get(f"/venues/{venue['id']}/plans", params={"cursor": "x" * 32 + "="})
@@ -89,10 +85,8 @@ def test_put_replaces_and_patch_changes(client: httpx.Client, plans: list[str]) 
     changed = client.patch(path, json={"plans": [member(plans[0], 3), member(plans[2])], "remove": [plans[1]]})
     assert changed.status_code == 200, changed.text
     assert (changed.json()["name"], changed.json()["anchor"]) == ("old", ANCHOR)
-    assert {entry["floorplan_id"]: entry["level"] for entry in plans_of(client, venue["id"])} == {
-        plans[0]: 3,
-        plans[2]: 0,
-    }
+    levels = {entry["floorplan_id"]: entry["level"] for entry in plans_of(client, venue["id"])}
+    assert levels == {plans[0]: 3, plans[2]: 0}
     assert client.patch(path, json={"anchor": None}).json()["anchor"] is None
     assert client.patch(path, json={"name": "new"}).json()["plans"] == 2
     replaced = client.put(path, json={"plans": [member(plans[1])]}).json()
@@ -218,12 +212,10 @@ def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:
         assert "(LALALOC_MAX_VENUE_BYTES)" in assert_problem(long, 413, "upload-too-large")["detail"]
 
 
-def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, database_of: DatabaseOf) -> None:
+def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, app_store: Store) -> None:
     with start_app(tmp_path, api_keys=True) as client:
-        store = Store(database_of(tmp_path))
-        mine, theirs = (
-            bearer(make_key(store, tenant=tenant, scopes=("read", "write"))) for tenant in ("mine", "theirs")
-        )
+        keys = [make_key(app_store, tenant=tenant, scopes=("read", "write")) for tenant in ("mine", "theirs")]
+        mine, theirs = map(bearer, keys)
         plan_id = client.post("/floorplans", json=FLAT, headers=mine).json()["id"]
         stolen = client.post("/venues", json={"plans": [member(plan_id)]}, headers=theirs)
         assert "does not exist" in assert_problem(stolen, 422, "invalid-request")["detail"]
@@ -234,7 +226,6 @@ def test_venues_are_separate_per_tenant(start_app: StartApp, tmp_path: Path, dat
             assert_problem(refused, 404, "unknown-venue")
         assert_problem(client.get(f"{path}/plans", headers=theirs), 404, "unknown-venue")
         assert client.get("/venues", headers=theirs).json()["venues"] == []
-        reader = bearer(make_key(store, tenant="mine", scopes=("read",)))
+        reader = bearer(make_key(app_store, tenant="mine", scopes=("read",)))
         assert client.get(path, headers=reader).json()["plans"] == 1
         assert_problem(client.delete(path, headers=reader), 403, "insufficient-scope")
-        store.close()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.core.taken import sphere
+from tests.painted import picture_file
 
 # The robot turns on the spot.
 TURN_DEG = 45.0
@@ -21,11 +20,8 @@ def turning() -> list[bytes]:
     """Return photographs of a camera that turns clockwise on the spot."""
     files, pixels = [], sphere("kitchen")
     for number in range(6):
-        buffer = io.BytesIO()
-        Image.fromarray(np.roll(pixels, -round(number * TURN_DEG / 360.0 * pixels.shape[1]), axis=1)).save(
-            buffer, "JPEG"
-        )
-        files.append(buffer.getvalue())
+        turned = np.roll(pixels, -round(number * TURN_DEG / 360.0 * pixels.shape[1]), axis=1)
+        files.append(picture_file(turned, "JPEG"))
     return files
 
 

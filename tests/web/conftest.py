@@ -14,7 +14,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
 
-from tests.service.conftest import (
+from tests.service.conftest import (  # noqa: F401, fixtures
     _clean_environment,
     _forked_workers,
     app_settings,
@@ -24,15 +24,7 @@ from tests.service.conftest import (
 )
 from tests.service.conftest import client as service
 
-__all__ = [
-    "_clean_environment",
-    "_forked_workers",
-    "app_settings",
-    "database_of",
-    "empty_database",
-    "service",
-    "start_app",
-]
+__all__ = ["service"]
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DESKTOP = {"width": 1280, "height": 900}
@@ -53,7 +45,6 @@ class Visit:
     errors: list[str] = field(default_factory=list)
 
     def open(self, path: str = "/") -> Page:
-        """Load a page of the service."""
         self.page.goto(str(self.client.base_url).rstrip("/") + path)
         return self.page
 
@@ -94,7 +85,6 @@ def choose_plan(page: Page, name: str) -> None:
 # Not for the session: Playwright's event loop prevents other tests from running one.
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
-    """Return the installed Chromium."""
     path = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if path is None:
         pytest.skip("Chromium is not installed; on Debian and Ubuntu: apt-get install chromium")
@@ -136,11 +126,9 @@ def visit(browser: Browser, client: httpx.Client, **options: Any) -> Iterator[Vi
 
 @pytest.fixture
 def desktop(browser: Browser, service: httpx.Client) -> Iterator[Visit]:
-    """Yield a visit with a desktop."""
     yield from visit(browser, service)
 
 
 @pytest.fixture
 def phone(browser: Browser, service: httpx.Client) -> Iterator[Visit]:
-    """Yield a visit with a phone."""
     yield from visit(browser, service, viewport=PHONE, has_touch=True, is_mobile=True, device_scale_factor=2)

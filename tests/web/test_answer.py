@@ -12,6 +12,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.service.conftest import FLAT, upload
+from tests.strategies import present
 from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, visit, wait_until
 
 
@@ -111,8 +112,7 @@ def test_dragged_marker_moves_the_layout(desktop: Visit) -> None:
     desktop.find()
     expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
     begin, state = _marker(page), page.locator("#fit-state").inner_text()
-    grip = page.locator("#marker .dot").bounding_box()
-    assert grip is not None
+    grip = present(page.locator("#marker .dot").bounding_box())
     page.mouse.move(grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2)
     page.mouse.down()
     page.mouse.move(grip["x"] + 25, grip["y"] + 18, steps=4)
@@ -251,8 +251,7 @@ def test_phone_needs_no_horizontal_scrolling(phone: Visit) -> None:
     phone.find()
     assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
     for selector in ("#plan", "#stage", "#find", "#answer", "#edit-plan", "#draw-plan"):
-        box = page.locator(selector).bounding_box()
-        assert box is not None
+        box = present(page.locator(selector).bounding_box())
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= 390
     _assert_accessible(page)

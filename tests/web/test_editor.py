@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from typing import Any
 
@@ -10,13 +9,13 @@ import pytest
 from PIL import Image, ImageDraw
 from playwright.sync_api import Page, expect
 
+from tests.painted import picture_file
 from tests.service.conftest import FLAT, upload
 from tests.web.conftest import Visit, choose_plan
 from tests.web.test_answer import _assert_accessible
 
 
 def _click(page: Page, x_m: float, y_m: float) -> None:
-    """Click a place on the plan."""
     page.mouse.click(*_on_screen(page, x_m, y_m))
 
 
@@ -54,10 +53,8 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     page.get_by_role("button", name="Draw", exact=True).click()
     picture = Image.new("RGB", (600, 400), "white")
     ImageDraw.Draw(picture).rectangle((100, 100, 400, 300), outline="black", width=4)
-    content = io.BytesIO()
-    picture.save(content, "PNG")
     page.locator("#underlay-file").set_input_files(
-        {"name": "scan.png", "mimeType": "image/png", "buffer": content.getvalue()}
+        {"name": "scan.png", "mimeType": "image/png", "buffer": picture_file(picture)}
     )
     expect(page.get_by_text("Set the scale next")).to_be_attached()
     # 600 pixels are 12 m by default, so the rectangle is 6 m wide; its real width is 4.5 m.
@@ -177,9 +174,7 @@ def _skewed_scan() -> bytes:
     pen = ImageDraw.Draw(scan)
     pen.rectangle((100, 100, 800, 600), outline="black", width=14)
     pen.line((400, 100, 400, 600), fill="black", width=14)
-    content = io.BytesIO()
-    scan.rotate(1.5, fillcolor="white", resample=Image.Resampling.BICUBIC).save(content, "PNG")
-    return content.getvalue()
+    return picture_file(scan.rotate(1.5, fillcolor="white", resample=Image.Resampling.BICUBIC))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 
 from lalaloc_core.conventions import OPENING_CLASSES, row_elevations
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.profile import RenderedLayout, cast_rays, layout_depth, render_layout
+from lalaloc_core.render.profile import cast_rays, layout_depth, render_layout
 from tests.service.conftest import upload
 from tests.web.conftest import EXAMPLES, Visit
 
@@ -53,17 +53,13 @@ def _in_browser(desktop: Visit, flat: FloorPlan, poses: list[Any], function: str
     return page.evaluate(script, [rooms, poses, HEIGHT_M])
 
 
-def _rendered(flat: FloorPlan, poses: list[tuple[int, float, float, float]]) -> RenderedLayout:
-    room, x, y, heading = (np.array(values) for values in zip(*poses, strict=True))
-    return render_layout(np.stack([x, y], axis=1), np.radians(heading), room, flat.geometry, COLUMNS, HEIGHT_M)
-
-
 def test_view_agrees_with_the_renderer(
     desktop: Visit, flat: FloorPlan, poses: list[tuple[int, float, float, float]]
 ) -> None:
     call = f"{{x_m: x, y_m: y, heading_deg: heading}}, rooms[room], {COLUMNS}, height"
     seen = _in_browser(desktop, flat, poses, "layoutView", call)
-    expected = _rendered(flat, poses)
+    room, x, y, heading = (np.array(values) for values in zip(*poses, strict=True))
+    expected = render_layout(np.stack([x, y], axis=1), np.radians(heading), room, flat.geometry, COLUMNS, HEIGHT_M)
     distance = np.array([[column["distance_m"] for column in view] for view in seen])
     np.testing.assert_allclose(distance, expected.distance_m, rtol=1e-9)
     kinds = np.array([[OPENING_CLASSES.index(column["kind"]) for column in view] for view in seen])

@@ -8,7 +8,6 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -26,11 +25,7 @@ FLAT = json.loads((EXAMPLES / "flat.json").read_text())
 STEP_DEG = 3.0
 PERMISSIONS = ["camera", "accelerometer", "gyroscope", "magnetometer"]
 CAMERA = Perspective.of_hfov(360, 640, math.radians(53.0))
-
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +37,8 @@ def camera(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     # Each frame four times: the browser plays 30 frames per second, 22° of a turn.
     film.write_bytes(b"".join(frame for frame in frames for _ in range(4)))
     path = next(filter(None, map(shutil.which, _BROWSERS)))
-    arguments = [
-        *_ARGUMENTS,
-        "--use-fake-device-for-media-stream",
-        "--use-fake-ui-for-media-stream",
-        f"--use-file-for-fake-video-capture={film}",
-    ]
+    fakes = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
+    arguments = [*_ARGUMENTS, *fakes, f"--use-file-for-fake-video-capture={film}"]
     launched = browser.browser_type.launch(executable_path=path, args=arguments)
     yield launched
     launched.close()
@@ -55,15 +46,8 @@ def camera(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 @pytest.fixture
 def phone(camera: Browser, service: httpx.Client) -> Iterator[Visit]:
-    yield from visit(
-        camera,
-        service,
-        viewport=PHONE,
-        has_touch=True,
-        is_mobile=True,
-        permissions=PERMISSIONS,
-        reduced_motion="reduce",
-    )
+    options = {"has_touch": True, "is_mobile": True, "permissions": PERMISSIONS, "reduced_motion": "reduce"}
+    yield from visit(camera, service, viewport=PHONE, **options)
 
 
 def _open(visited: Visit) -> Page:

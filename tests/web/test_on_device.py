@@ -31,6 +31,7 @@ BOX = "Keep this photograph on my device"
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
 # Loading, and the first run on a busy machine.
 SLOW_MS = 180_000
+APP_SETTINGS = {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 class Wire:
@@ -78,11 +79,6 @@ def recorded(client: httpx.Client) -> Iterator[tuple[Wire, httpx.Client]]:
     finally:
         wire.server.shutdown()
         wire.server.server_close()
-
-
-@pytest.fixture(scope="module")
-def app_settings() -> dict[str, Any]:
-    return {"bundle": default_bundle(), "request_deadline_s": 90.0}
 
 
 def find(page: Visit) -> str:

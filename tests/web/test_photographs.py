@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import ExifTags, Image
@@ -16,10 +15,7 @@ from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.web.conftest import Visit
 
-
-@pytest.fixture(scope="module")
-def app_settings(tiny_view_bundle: Path) -> dict[str, Any]:
-    return {"bundle": tiny_view_bundle}
+APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
 
 def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_path: Path) -> None:

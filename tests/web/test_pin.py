@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from lalaloc_core.bundle import default_bundle
 from tests.service.conftest import StartApp, upload
+from tests.strategies import present
 from tests.web.conftest import EXAMPLES, Visit, visit
 from tests.web.test_answer import _assert_accessible
 from tests.web.test_on_device import SLOW_MS, recorded
@@ -122,8 +123,7 @@ def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -
 def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     page = pin_files(desktop, [FILES[1]])
     pin = page.locator("#pin-1")
-    circle = pin.locator("circle").bounding_box()
-    assert circle is not None
+    circle = present(pin.locator("circle").bounding_box())
     before = pin.locator(".arrow").get_attribute("transform") or ""
     heading, reach = math.radians(float(re.findall(r"[\d.]+", before)[0])), 0.8 * circle["width"]
     centre = circle["x"] + circle["width"] / 2, circle["y"] + circle["height"] / 2
@@ -144,8 +144,7 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     page.mouse.up()
     expect(pin).not_to_have_attribute("transform", place)
     expect(page.locator("#pin-state")).to_contain_text("(solved)")
-    moved = pin.locator("circle").bounding_box()
-    assert moved is not None
+    moved = present(pin.locator("circle").bounding_box())
     assert moved["x"] == pytest.approx(circle["x"] + 40, abs=6)
     expect(pin.locator(".arrow")).to_have_attribute("transform", turned)
     # Outside of all rooms the pin goes back. The service rounds places, before or after the page is asked.
