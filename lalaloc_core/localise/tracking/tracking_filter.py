@@ -137,14 +137,16 @@ def track_steps(
     starts = compared.modes()
     with clock.stage("lpo"):
         result = yield photograph.lpo_job(starts)
-        modes = photograph.refine(compared, starts, result)
+        refined, ends = photograph.refine(compared, starts, result)
+    stage: SearchStage = "retrieval" if result is None else "lpo"
     with clock.stage("rank"):
-        compared = compared.regained(starts, modes.refined)
-        answer = photograph.rank(compared, modes, grid_cost, top_k)
-    in_plan = _in_plan(state.in_plan, answer.fit)
-    probability = in_plan * answer.posterior.position
-    mode = _mode(in_plan, probability)
-    best, own_plan = answer.candidates[0], plans.merged.plan_of(answer.candidates[0].room_index)
+        compared = compared.regained(starts, refined)
+        (best, *others), posterior = compared.ranked(starts, ends, top_k)
+        (best,) = with_latents(plans.plan, encoder, query, [best], plans.grid.camera_height_m)
+        fit = photograph.fit(best, posterior, stage, grid_cost)
+    in_plan = _in_plan(state.in_plan, fit)
+    probability = in_plan * posterior.position
+    mode, own_plan = _mode(in_plan, probability), plans.merged.plan_of(best.room_index)
     sure = everything.share_alone(best) >= _SURE
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
@@ -166,8 +168,8 @@ def track_steps(
     after = plans.left(_state_after(state, compared, in_plan, pose, motion))
     assert after.pose is not None
     pose = replace(after.pose, plan=own_plan)
-    shares = tuple(in_plan * share for share in answer.posterior.candidate)
-    return Tracked(after, pose, query, answer.candidates, shares, answer.fit, motion.missed, modes.stage)
+    shares = tuple(in_plan * share for share in posterior.candidate)
+    return Tracked(after, pose, query, [best, *others], shares, fit, motion.missed, stage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,25 +208,6 @@ def _predict(
     factor = np.exp(-0.5 * np.square(beyond))
     factor = (1.0 - _HEADING_DOUBT) * factor / factor.mean() + _HEADING_DOUBT
     return _Prediction(belief * factor, prior * factor, anywhere)
-
-
-@dataclass(frozen=True, eq=False)
-class _Modes:
-    """Modes of the belief: after LPO, followed where the photograph is no outlier; and the last stage that ran."""
-
-    starts: list[Candidate]
-    refined: list[Candidate]
-    ends: list[Candidate]
-    stage: SearchStage
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """The best poses, the answer first, their posterior, and the probability that the photograph is of the plan."""
-
-    candidates: list[Candidate]
-    posterior: Posterior
-    fit: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,27 +270,27 @@ class _Photograph:
         camera_height_m, matching = self.plans.grid.camera_height_m, self.config.matching
         return refinement_job(self.plans.plan, self.query, starts, camera_height_m, self._weights, matching)
 
-    def refine(self, compared: ComparedStates, starts: list[Candidate], result: RefinementResult | None) -> _Modes:
-        """Return the modes after LPO; the same without a result."""
+    def refine(
+        self, compared: ComparedStates, starts: list[Candidate], result: RefinementResult | None
+    ) -> tuple[list[Candidate], list[Candidate]]:
+        """Return the modes after LPO, and the same left at their starts where the photograph is an outlier."""
         if result is None:
-            return _Modes(starts, starts, starts, "retrieval")
+            return starts, starts
         refined = refined_candidates(self.plans.plan, self.encoder, self.query, starts, result, self.config.matching)
         # The photograph is rather an outlier at modes that fit worse than this.
         followed = compared.relative_likelihood(refined) >= 2.0 * compared.outlier
-        ends = [end if follow else start for start, end, follow in zip(starts, refined, followed, strict=True)]
-        return _Modes(starts, refined, ends, "lpo")
+        return refined, [end if follow else start for start, end, follow in zip(starts, refined, followed, strict=True)]
 
-    def rank(self, compared: ComparedStates, modes: _Modes, grid_cost: float, top_k: int) -> _Answer:
-        """Return the modes by falling probability, and how well the photograph fits the plan at the first one."""
-        encoder, query, plan, grid = self.encoder, self.query, self.plans.plan, self.plans.grid
-        candidates, posterior = compared.ranked(modes.starts, modes.ends, top_k)
-        candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
-        matching, room = self.config.matching, candidates[0].room_index
-        by_chance = cost_by_chance(encoder.cohort, plan, query, self._reach_m, self._weights, matching, room=room)
-        signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
+    def fit(self, answer: Candidate, posterior: Posterior, stage: SearchStage, grid_cost: float) -> float | None:
+        """Return the probability that the photograph is of the plan; None without a model."""
+        encoder, query, plan, matching = self.encoder, self.query, self.plans.plan, self.config.matching
+        by_chance = cost_by_chance(
+            encoder.cohort, plan, query, self._reach_m, self._weights, matching, room=answer.room_index
+        )
+        signals = signals_of(query, answer, posterior, grid_cost, by_chance)
         model = encoder.manifest.confidence_for(view=query.is_view)
-        confidence = confidence_of(model, modes.stage, signals, posterior, heading_known=False)
-        return _Answer(candidates, posterior, None if confidence is None else confidence.fit)
+        confidence = confidence_of(model, stage, signals, posterior, heading_known=False)
+        return None if confidence is None else confidence.fit
 
 
 def _elsewhere(
