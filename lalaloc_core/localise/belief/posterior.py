@@ -62,22 +62,16 @@ class GridCosts:
     compared: int
 
     @classmethod
-    def of_all(
-        cls,
-        poses: PoseSet,
-        cost: Float[np.ndarray, "k n"],
-        offset: Float[np.ndarray, "k n"],
-        place_cost: Float[np.ndarray, "m"] | None = None,
-    ) -> GridCosts:
-        """Return the costs of all poses under all hypotheses, compared in full."""
+    def of_all(cls, poses: PoseSet, cost: Float[np.ndarray, "k n"]) -> GridCosts:
+        """Return the costs of all poses under all hypotheses, compared in full at the stated camera height."""
         hypothesis, pose = np.indices(cost.shape).reshape(2, -1)
         return cls(
             poses=poses,
             pose=pose,
             hypothesis=hypothesis,
             cost=cost.ravel(),
-            offset=offset.ravel(),
-            place_cost=place_cost,
+            offset=np.zeros_like(cost).ravel(),
+            place_cost=None,
             compared=cost.size,
         )
 
