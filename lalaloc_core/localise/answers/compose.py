@@ -38,7 +38,7 @@ from lalaloc_core.localise.belief import (
     pose_uncertainty,
     reason_for,
 )
-from lalaloc_core.localise.localisability.reports import step_after
+from lalaloc_core.localise.localisability.reports import known_of, step_after
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation
@@ -238,17 +238,10 @@ def _told(
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
     seen, step = found.query.objects, None
-    if bundle is not None:
-        step = step_after(
-            ground.plan,
-            bundle.manifest,
-            found,
-            confidence,
-            arcs=spot.arcs,
-            field=spot.photograph.hfov.value,
-            step_m=ground.grid.step_m,
-            rooms_known=ground.rooms_known,
-        )
+    if bundle is not None and confidence is not None:
+        field = spot.photograph.hfov.value
+        known = known_of(found, confidence, arcs=spot.arcs, field=field, rooms_known=ground.rooms_known)
+        step = step_after(ground.plan, bundle.manifest, known, step_m=ground.grid.step_m)
     objects = None
     if seen is not None:
         objects = [

@@ -152,25 +152,8 @@ class NextStepAnswer:
     expected_confidence: Annotated[Share, Field(description="Expected `confidence` after the step.")]
 
 
-def step_after(
-    plan: FloorPlan,
-    manifest: Manifest,
-    found: Localisation,
-    confidence: Confidence | None,
-    *,
-    arcs: Sequence[tuple[float, float]],
-    field: float,
-    step_m: float,
-    rooms_known: bool = False,
-) -> NextStepAnswer | None:
-    """Return the next step after an answer; None without a confidence, or a step.
-
-    `arcs` are azimuths (radians) that were seen, relative to the photograph's centre; `field` is its horizontal field
-    of view (radians).
-    """
-    if confidence is None:
-        return None
-    known = known_of(found, confidence, arcs=arcs, field=field, rooms_known=rooms_known)
+def step_after(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: float) -> NextStepAnswer | None:
+    """Return the next step after an answer, by the facts about it; None without a step."""
     step = next_step(plan, manifest, known, step_m=step_m)
     if step is None:
         return None
@@ -193,7 +176,11 @@ def known_of(
     field: float,
     rooms_known: bool = False,
 ) -> Known:
-    """Return the facts about an answer that steps are computed from; see `step_after`."""
+    """Return the facts about an answer that steps are computed from.
+
+    `arcs` are azimuths (radians) that were seen, relative to the photograph's centre; `field` is its horizontal field
+    of view (radians).
+    """
     is_view = found.query.is_view
     return Known(
         support=found.posterior.support,
