@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -200,20 +199,18 @@ def compose_tracked(
 
 def read_photograph(spot: Spot) -> ReadView:
     """Return what was assumed about a photograph."""
-    return ReadView(**_assumptions(spot))
-
-
-def _assumptions(spot: Spot) -> dict[str, Any]:
     photograph = spot.photograph
-    return {
-        "projection": photograph.projection,
-        "projection_source": photograph.projection_source,
-        **{name: AssumedAngle.of(getattr(photograph, name)) for name in ("hfov", "pitch", "roll")},
-        "wall_direction": None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
-        "camera": _camera(photograph),
-        "seen": [SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
-        "warnings": list(photograph.warnings),
-    }
+    return ReadView(
+        projection=photograph.projection,
+        projection_source=photograph.projection_source,
+        hfov=AssumedAngle.of(photograph.hfov),
+        pitch=AssumedAngle.of(photograph.pitch),
+        roll=AssumedAngle.of(photograph.roll),
+        wall_direction=None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
+        camera=_camera(photograph),
+        seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
+        warnings=list(photograph.warnings),
+    )
 
 
 def _camera(photograph: Photograph) -> CameraAnswer | None:
@@ -253,7 +250,7 @@ def _told(
             for shown in seen.objects
         ]
     return ViewAnswer(
-        **_assumptions(spot),
+        **vars(read_photograph(spot)),
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,
         relative_heading=relative_heading,
