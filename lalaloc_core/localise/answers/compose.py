@@ -61,15 +61,9 @@ def compose_answer(
 ) -> Answer:
     """Compose the answer of a search.
 
-    Args:
-        found: result of the search.
-        ground: the searched places.
-        spot: the photograph, with others from its spot.
-        known: the heading that was known before the search.
-        bundle: the model.
-        warnings: warnings besides those about the heading and the photograph.
-        with_step: compute the next step of an answer that is not sure.
-        relative_heading: heading minus that of the first photograph of a turn.
+    `known` is the heading that was known before the search, and `warnings` are those besides warnings about it and the
+    photograph. `with_step` computes the next step of an answer that is not sure. `relative_heading` is the heading
+    minus that of the first photograph of a turn.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view, turn=found.query.is_turn)
     confidence = found.confidence(model, ground.share(found))
@@ -156,13 +150,7 @@ def compose_tracked(
 ) -> TrackedAnswer:
     """Compose the answer of a camera that moves.
 
-    Args:
-        found: result of the filter.
-        ground: the searched places.
-        spot: the photograph.
-        bundle: the model.
-        odometry: the motion that was stated.
-        warnings: warnings besides those about the motion and the photograph.
+    `odometry` is the motion that was stated, and `warnings` are those besides warnings about it and the photograph.
     """
     pose, query, best = found.pose, found.query, found.candidates[0]
     room = ground.place(best).plan.rooms[pose.room_index]

@@ -63,12 +63,9 @@ class Passages:
     def between(
         cls, plans: Sequence[PlanOnLevel], levels: Sequence[float], room_index: Int[np.ndarray, "n"]
     ) -> Passages:
-        """Find the passages between plans.
+        """Find the passages between plans, given the room of each pose, numbered through all plans.
 
-        Args:
-            plans: the plans.
-            levels: levels of the building; those of further plans count.
-            room_index: room of each pose, numbered through all plans.
+        `levels` are those of the building; those of further plans count.
         """
         first = np.cumsum([0, *(len(entry.plan.rooms) for entry in plans)])
         found = [(number, *shaft) for number, entry in enumerate(plans) for shaft in _shafts(entry.plan)]
@@ -193,16 +190,7 @@ class TrackedPlans:
         levels: Sequence[float],
         left_out: LeftOut | None = None,
     ) -> TrackedPlans:
-        """Return several plans.
-
-        Args:
-            merged: the plans side by side.
-            plans: the same plans with their levels.
-            graphs: links of their grids.
-            keys: their keys.
-            levels: levels of the building; those of further plans count.
-            left_out: plans that are not searched.
-        """
+        """Return several plans, side by side and with their levels; `levels` are as in `Passages.between`."""
         passages = Passages.between(plans, levels, merged.grid.poses.room_index)
         return cls(merged, WalkGraph.joined(graphs), tuple(keys), passages, left_out)
 

@@ -111,17 +111,8 @@ def track_steps(
 ) -> TrackSteps:
     """Follow a camera to its next photograph; yield LPO jobs, as `pipeline.localise_steps` does.
 
-    Args:
-        plans: the plans that the camera can be in.
-        encoder: the networks.
-        state: state after the photographs before.
-        query: the photograph, encoded with an unknown heading.
-        odometry: motion since the photograph before; None if it is unknown.
-        known_heading: heading of the photograph with its largest error; None if it is unknown.
-        hints: the prior of the first photograph, in the frame of all plans.
-        top_k: number of candidates.
-        config: settings of the search.
-        clock: times the stages.
+    `state` is that after the photographs before, and `odometry` the motion since the last of them, if it is known. The
+    query has an unknown heading. `hints` are the prior of the first photograph, in the frame of all plans.
 
     Raises:
         InvalidStateError: the state is of another grid or model.

@@ -37,13 +37,7 @@ Probed = Mapping[int, Bool[np.ndarray, "l q"]]
 
 @dataclass(frozen=True, eq=False)
 class PlanSearch:
-    """Query, with the settings that all stages of its search share.
-
-    Attributes:
-        query: the query.
-        step_m: grid step (m) of the plans.
-        weights, config: weights and options of the matching cost.
-    """
+    """Query, with the settings that all stages of its search share; `step_m` is the grid step (m) of the plans."""
 
     query: Query
     step_m: float

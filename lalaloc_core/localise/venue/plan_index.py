@@ -58,7 +58,6 @@ class _Part:
     """Segment of an index.
 
     Attributes:
-        segment: the segment.
         plan: (p,) number in the index of each of the segment's plans; -1 for plans that were removed.
         dead: distinct prototypes of removed plans alone, rising.
     """
