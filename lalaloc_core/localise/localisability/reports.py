@@ -91,7 +91,9 @@ def _advice_of(plan: FloorPlan, found: Localisability) -> list[str]:
         )
     for pair in found.confused[:_PAIRS]:
         first, second = (f"'{plan.rooms[index].name}'" for index in pair.rooms)
-        lines.append(f"{first} and {second} are confused: {_percent(pair.share)} ({_words(pair.condition)})")
+        photograph, heading = parts_of(pair.condition)
+        condition = f"{_TITLES[photograph]}, heading {heading}"
+        lines.append(f"{first} and {second} are confused: {_percent(pair.share)} ({condition})")
     gains = [(gain, name) for name, gain in found.gains.items() if gain is not None and name != "doors"]
     for gain, name in sorted(gains, reverse=True):
         if gain >= _WORTH:
@@ -114,11 +116,6 @@ def _rows(values: Mapping[Condition, Any]) -> list[dict[str, float] | None]:
         else {name: round(value, 3) for name, value in zip(CONDITIONS, row, strict=True)}
         for row in columns
     ]
-
-
-def _words(condition: Condition) -> str:
-    photograph, heading = parts_of(condition)
-    return f"{_TITLES[photograph]}, heading {heading}"
 
 
 def _percent(share: float) -> str:
