@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 
 from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.tracking.track_state import StatePlan, TrackedPose, TrackState
@@ -119,12 +119,8 @@ def _passed_on(mass: Float[np.ndarray, "a"], leads_to: Bool[np.ndarray, "a a"]) 
 
 def _shafts(plan: FloorPlan) -> list[tuple[int, bool]]:
     """Return the number of each room that is stairs or a lift, and whether it is a lift."""
-    found = [(number, _is_lift(room)) for number, room in enumerate(plan.rooms)]
-    return [(number, lift) for number, lift in found if lift or "stairs" in plan.rooms[number].types]
-
-
-def _is_lift(room: Room) -> bool:
-    return not _LIFTS.isdisjoint(re.findall(r"\w+", room.name.casefold()))
+    lifts = [not _LIFTS.isdisjoint(re.findall(r"\w+", room.name.casefold())) for room in plan.rooms]
+    return [(number, lift) for number, lift in enumerate(lifts) if lift or "stairs" in plan.rooms[number].types]
 
 
 def _distances_m(
