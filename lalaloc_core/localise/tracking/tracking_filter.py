@@ -142,8 +142,10 @@ def track_steps(
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
     measured = measured_pose(plans.plan, encoder, query, best)
-    motion = _follow(before, odometry, measured, mode, sure=sure, is_refined=best.information is not None)
-    (x_m, y_m, heading), covariance = motion.pose
+    is_refined = best.information is not None
+    ((x_m, y_m, heading), covariance), missed = _follow(
+        before, odometry, measured, mode, sure=sure, is_refined=is_refined
+    )
     pose = TrackedPose(
         float(x_m),
         float(y_m),
@@ -156,11 +158,11 @@ def track_steps(
         sure,
         own_plan,
     )
-    after = plans.left(_state_after(state, compared, in_plan, pose, motion))
+    after = plans.left(_state_after(state, compared, in_plan, pose, missed))
     assert after.pose is not None
     pose = replace(after.pose, plan=own_plan)
     shares = tuple(in_plan * share for share in posterior.candidate)
-    return Tracked(after, pose, query, [best, *others], shares, fit, motion.missed, stage)
+    return Tracked(after, pose, query, [best, *others], shares, fit, missed or (), stage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,15 +315,6 @@ def _mode(in_plan: float, probability: float) -> Mode:
     return "tracking" if probability >= _TRACKING_FROM else "searching"
 
 
-@dataclass(frozen=True, eq=False)
-class _Followed:
-    """Pose after a motion, the components of it that the photograph contradicts, and whether it counts for these."""
-
-    pose: Gaussian
-    missed: tuple[Component, ...]
-    counts: bool
-
-
 def _follow(
     before: TrackedPose | None,
     odometry: Odometry | None,
@@ -330,10 +323,13 @@ def _follow(
     *,
     sure: bool,
     is_refined: bool,
-) -> _Followed:
-    """Fuse the measured pose with the one that odometry predicts, unless they contradict each other."""
+) -> tuple[Gaussian, tuple[Component, ...] | None]:
+    """Fuse the measured pose with the one that odometry predicts, unless they contradict each other.
+
+    Returns the pose, and the components of the motion that the photograph contradicts; None if it does not judge them.
+    """
     if before is None or odometry is None:
-        return _Followed(measured, (), counts=False)
+        return measured, None
     predicted = carried_on(before, odometry)
     tracking = before.mode == mode == "tracking"
     # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
@@ -341,20 +337,19 @@ def _follow(
     differing = contradicted(before, predicted, measured) if comparable else ()
     # A camera that was carried elsewhere is where the photograph says.
     pose = fused(predicted, measured) if tracking and not differing else measured
-    judged = comparable and is_refined
-    return _Followed(pose, differing if judged else (), judged)
+    return pose, differing if comparable and is_refined else None
 
 
 def _state_after(
-    state: TrackState, compared: ComparedStates, in_plan: float, pose: TrackedPose, motion: _Followed
+    state: TrackState, compared: ComparedStates, in_plan: float, pose: TrackedPose, missed: tuple[Component, ...] | None
 ) -> TrackState:
-    """Return the state for the next photograph."""
+    """Return the state for the next photograph; `missed` are the contradicted components of the motion, if judged."""
     most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
     bits = state.contradicted
-    if motion.counts:
+    if missed is not None:
         mask = (1 << RECENT) - 1
         first, second, third = (
-            ((old << 1) | (name in motion.missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
+            ((old << 1) | (name in missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
         )
         bits = first, second, third
     return replace(
