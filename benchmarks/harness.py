@@ -189,15 +189,12 @@ class Caller:
 
 
 class Rehearsal(Caller):
-    """Caller that sends nothing."""
+    """Caller that sends nothing: all connections are broken."""
 
-    def send_bytes(self, head: str, content: bytes = b"", hold_s: float = 0.0) -> Answer:
-        """Return a broken connection."""
+    def send(self, *_arguments: Any, **_options: Any) -> Answer:
         return Answer(0)
 
-    def send(self, method: str, path: str, content: bytes = b"", media: str = "", etag: str = "") -> Answer:
-        """Return a broken connection."""
-        return Answer(0)
+    send_bytes = send
 
 
 @cache
