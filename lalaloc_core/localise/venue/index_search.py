@@ -23,8 +23,6 @@ from lalaloc_core.localise.venue.index_segment import by_family
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 
-# Default numbers of pairs per query in the code scan, in the exact comparison, and in the alignment.
-_SCANNED, _COMPARED, _ALIGNED = 40_000_000, 20_000, 4_000
 # The scan returns this multiple of each hypothesis's share, as the best pairs are spread unevenly over hypotheses.
 _OVERFETCH = 6
 
@@ -140,9 +138,9 @@ class Shard(Protocol):
 class SearchLimits:
     """Approximate numbers of pairs in the stages; pairs of equal cost are kept together."""
 
-    scanned: int = _SCANNED
-    compared: int = _COMPARED
-    aligned: int = _ALIGNED
+    scanned: int = 40_000_000
+    compared: int = 20_000
+    aligned: int = 4_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
