@@ -52,7 +52,6 @@ class PinnedAlbum:
     """Album of photographs that were solved together.
 
     Attributes:
-        plans: the plans.
         plan_ids: their names in pins, which stay in the next revision.
         album: the solution: pins, cameras and their height, and scale.
         photographs: every photograph that was given, also those that cannot be read.

@@ -134,8 +134,6 @@ class PlanIndex:
 
     Attributes:
         step_m: grid step (m) of the plans.
-        cells: the coarse quantiser.
-        plan_count: number of plans, p.
         parts: the segments, the largest first.
     """
 
