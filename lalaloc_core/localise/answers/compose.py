@@ -71,7 +71,10 @@ def compose_answer(
     shares = len(placed) * [None] if confidence is None else confidence.candidates
     candidates = [_possible(place, found.query, share) for place, share in zip(placed, shares, strict=True)]
     covariance_m2, heading_std_deg = _uncertainty(placed[0], model)
-    best = candidates[0]
+    best, reason = candidates[0], None
+    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
+    if confidence is not None:
+        reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
     return Answer(
         position=best.position,
         heading_deg=best.heading_deg,
@@ -81,9 +84,7 @@ def compose_answer(
         confidence=None if confidence is None else confidence.position,
         heading_confidence=None if confidence is None else confidence.heading,
         probability_elsewhere=None if confidence is None else confidence.elsewhere,
-        warnings=_with_reason(
-            [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings], found, confidence
-        ),
+        warnings=warnings if reason is None else [*warnings, reason],
         covariance_m2=covariance_m2,
         heading_std_deg=heading_std_deg,
         stage=found.stage,
@@ -130,13 +131,6 @@ def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
     origin = "heading_deg" if known.source == "given" else "the photograph's compass heading"
     degrees = heading_to_degrees(known.heading)
     return [f"{origin} is {degrees:.4g}, which the photograph contradicts: the heading was searched for instead"]
-
-
-def _with_reason(warnings: list[str], found: Localisation, confidence: Confidence | None) -> list[str]:
-    if confidence is None:
-        return warnings
-    reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
-    return warnings if reason is None else [*warnings, reason]
 
 
 def compose_tracked(
