@@ -43,9 +43,6 @@ from lalaloc_core.localise.query.query import KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.tracking_filter import Tracked
-from lalaloc_core.photograph import Photograph
-from lalaloc_core.photograph.cameras import Around, Fisheye
-from lalaloc_core.photograph.stated_camera import intrinsics_of
 
 
 def compose_answer(
@@ -189,20 +186,10 @@ def read_photograph(spot: Spot) -> ReadView:
         pitch=AssumedAngle.of(photograph.pitch),
         roll=AssumedAngle.of(photograph.roll),
         wall_direction=None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
-        camera=_camera(photograph),
+        camera=CameraAnswer.of(photograph.camera),
         seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
         warnings=list(photograph.warnings),
     )
-
-
-def _camera(photograph: Photograph) -> CameraAnswer | None:
-    camera = photograph.camera
-    if camera is None or isinstance(camera, Around):
-        return None
-    names = ("k1", "k2", "k3", "k4") if isinstance(camera, Fisheye) else ("k1", "k2", "p1", "p2", "k3")
-    values = vars(intrinsics_of(camera))
-    matrix = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-    return CameraAnswer(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])
 
 
 def _told(
