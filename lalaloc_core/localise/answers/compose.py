@@ -21,14 +21,7 @@ from lalaloc_core.localise.answers.documents import (
     Spot,
     TrackedAnswer,
 )
-from lalaloc_core.localise.answers.views import (
-    AssumedAngle,
-    CameraAnswer,
-    ReadView,
-    SeenArc,
-    SeenObjectAnswer,
-    ViewAnswer,
-)
+from lalaloc_core.localise.answers.views import AssumedAngle, SeenObjectAnswer, ViewAnswer
 from lalaloc_core.localise.belief import (
     Confidence,
     advice_for,
@@ -171,24 +164,8 @@ def compose_tracked(
         ],
         motion_contradicted=list(found.contradicted),
         warnings=[*about_motion, *warnings, *spot.photograph.warnings],
-        view=read_photograph(spot),
+        view=spot.view,
         model=ModelAnswer.of(bundle),
-    )
-
-
-def read_photograph(spot: Spot) -> ReadView:
-    """Return what was assumed about a photograph."""
-    photograph = spot.photograph
-    return ReadView(
-        projection=photograph.projection,
-        projection_source=photograph.projection_source,
-        hfov=AssumedAngle.of(photograph.hfov),
-        pitch=AssumedAngle.of(photograph.pitch),
-        roll=AssumedAngle.of(photograph.roll),
-        wall_direction=None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
-        camera=CameraAnswer.of(photograph.camera),
-        seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
-        warnings=list(photograph.warnings),
     )
 
 
@@ -219,7 +196,7 @@ def _told(
             for shown in seen.objects
         ]
     return ViewAnswer(
-        **vars(read_photograph(spot)),
+        **vars(spot.view),
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,
         relative_heading=relative_heading,
