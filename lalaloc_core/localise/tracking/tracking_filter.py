@@ -41,15 +41,7 @@ from lalaloc_core.localise.tracking.belief_modes import (
     measured_pose,
     sector_of,
 )
-from lalaloc_core.localise.tracking.track_state import (
-    COMPONENTS,
-    MAX_STATES,
-    RECENT,
-    Component,
-    Mode,
-    TrackedPose,
-    TrackState,
-)
+from lalaloc_core.localise.tracking.track_state import MAX_STATES, Component, Mode, TrackedPose, TrackState
 from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
 from lalaloc_core.localise.tracking.walk_motion import Odometry, States
 
@@ -158,7 +150,10 @@ def track_steps(
         sure,
         own_plan,
     )
-    after = plans.left(_state_after(state, compared, in_plan, pose, missed))
+    most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
+    belief = States(compared.pose[most], compared.sector[most], compared.weight[most])
+    state = state if missed is None else state.judged(missed)
+    after = plans.left(replace(state, belief=belief, in_plan=in_plan, number=pose.number, pose=pose))
     assert after.pose is not None
     pose = replace(after.pose, plan=own_plan)
     shares = tuple(in_plan * share for share in posterior.candidate)
@@ -338,25 +333,3 @@ def _follow(
     # A camera that was carried elsewhere is where the photograph says.
     pose = fused(predicted, measured) if tracking and not differing else measured
     return pose, differing if comparable and is_refined else None
-
-
-def _state_after(
-    state: TrackState, compared: ComparedStates, in_plan: float, pose: TrackedPose, missed: tuple[Component, ...] | None
-) -> TrackState:
-    """Return the state for the next photograph; `missed` are the contradicted components of the motion, if judged."""
-    most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
-    bits = state.contradicted
-    if missed is not None:
-        mask = (1 << RECENT) - 1
-        first, second, third = (
-            ((old << 1) | (name in missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
-        )
-        bits = first, second, third
-    return replace(
-        state,
-        belief=States(compared.pose[most], compared.sector[most], compared.weight[most]),
-        in_plan=in_plan,
-        number=pose.number,
-        pose=pose,
-        contradicted=bits,
-    )
