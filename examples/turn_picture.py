@@ -28,7 +28,6 @@ _PICTURE, _QUALITY = FOLDER.parent / "docs" / "images" / "turn.jpg", 85
 
 
 def main() -> None:
-    """Draw and write the picture."""
     plan, model, frames = read_plan(PLAN_PATH), LaLaLoc(), _frames()
     files = [encode_jpeg(frame) for frame in frames]
     camera = StatedCamera(projection="perspective", hfov_deg=_FIELD_DEG)

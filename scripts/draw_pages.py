@@ -36,7 +36,6 @@ _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def main() -> int:
-    """Write the pictures."""
     parser = argument_parser(__doc__)
     parser.add_argument("out", type=Path, help="folder to write JPEGs into")
     out = parser.parse_args().out
