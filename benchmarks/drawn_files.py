@@ -160,10 +160,8 @@ def svg(drawing: HomeDrawing) -> str:
     width, height = drawing.size_m
     millimetres = f'width="{_PAPER_MM * width:.2f}mm" height="{_PAPER_MM * height:.2f}mm"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" {millimetres} viewBox="0 0 {100 * width:.3f} {100 * height:.3f}">'
-    parts, layer = (
-        [f'{head}<rect width="100%" height="100%" fill="#ffffff"/><g id="{escape(drawing.layer("wall"))}0">'],
-        "",
-    )
+    parts = [f'{head}<rect width="100%" height="100%" fill="#ffffff"/><g id="{escape(drawing.layer("wall"))}0">']
+    layer = ""
     for mark in drawing.marks:
         if mark.layer != layer:
             parts.append(f'</g><g id="{escape(drawing.layer(mark.layer))}{"" if layer == "" else len(parts)}">')

@@ -97,7 +97,6 @@ class Uploads:
         self._lock = threading.Lock()
 
     def upload(self, name: str) -> None:
-        """Upload one plan."""
         document = json.loads(PLAN_PATH.read_bytes()) | {"name": name}
         headers, deadline = {"Idempotency-Key": uuid.uuid4().hex}, time.monotonic() + _TIMEOUT_S
         while True:
@@ -117,7 +116,6 @@ class Uploads:
             time.sleep(0.2)
 
     def wait_for(self, count: int) -> None:
-        """Wait until a number of uploads are answered."""
         harness.wait_until(lambda: len(self.plan_ids) >= count, f"{count} uploads are answered", _TIMEOUT_S, 0.02)
 
 

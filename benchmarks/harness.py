@@ -50,17 +50,14 @@ def argument_parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 def print_table_head(*names: str) -> None:
-    """Print the head of a Markdown table."""
     print(table_head(*names), flush=True)
 
 
 def table_head(*names: str) -> str:
-    """Return the head of a Markdown table."""
     return f"{table_row(*names)}\n|{'---|' * len(names)}"
 
 
 def table_row(*cells: object) -> str:
-    """Return a row of a Markdown table."""
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -136,7 +133,6 @@ class Answer:
         return self.headers.get("ETag", "")
 
     def json(self) -> Any:
-        """Return the parsed content."""
         return json.loads(self.content)
 
 
@@ -189,15 +185,12 @@ class Caller:
 
 
 class Rehearsal(Caller):
-    """Caller that sends nothing."""
+    """Caller that sends nothing: all connections are broken."""
 
-    def send_bytes(self, head: str, content: bytes = b"", hold_s: float = 0.0) -> Answer:
-        """Return a broken connection."""
+    def send(self, *_arguments: Any, **_options: Any) -> Answer:
         return Answer(0)
 
-    def send(self, method: str, path: str, content: bytes = b"", media: str = "", etag: str = "") -> Answer:
-        """Return a broken connection."""
-        return Answer(0)
+    send_bytes = send
 
 
 @cache
@@ -224,7 +217,6 @@ class Requests:
 
     @property
     def count(self) -> int:
-        """Number of requests."""
         return len(self.durations_ms)
 
     def percentile_ms(self, percent: float) -> float:

@@ -24,8 +24,9 @@ from examples.truth import read_poses
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import EXPORT_FORMATS, ImportLimits, export_plan
 
-# Plans with the most vertices, and with the most rooms and openings, that are accepted by default.
+# Plans with the most vertices, and with the most rooms and openings, that are accepted by default, as for `building`.
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
+PLANS = {VERTICES_PLAN: (500, 190), ROOMS_PLAN: (10_000, 4, 2)}
 # Photographs of a sequence and of a batch.
 _PHOTOGRAPHS = 10
 _ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "north_deg": 25.0}

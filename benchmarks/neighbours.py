@@ -33,17 +33,7 @@ from typing import Any
 import psutil
 
 from benchmarks import harness
-from benchmarks.heaviest import (
-    LOADS,
-    ROOMS_PLAN,
-    VERTICES_PLAN,
-    Load,
-    Stored,
-    building,
-    created_id,
-    missing_routes,
-    store_venue,
-)
+from benchmarks.heaviest import LOADS, PLANS, Load, Stored, building, created_id, missing_routes, store_venue
 from examples.truth import PLAN_PATH
 from service.security import Permission
 from service.security.keys import hash_of, key_text, new_secret
@@ -167,7 +157,6 @@ def _holds(row: Row, refusals: frozenset[int]) -> bool:
 @contextmanager
 def _template(homes: int, plans: set[str]) -> Iterator[Template]:
     """Store the plans, the venue and the keys, and wait until all pose grids are ready."""
-    documents = {VERTICES_PLAN: lambda: building(500, 190), ROOMS_PLAN: lambda: building(10_000, 4, 2)}
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "data"
         data.mkdir()
@@ -178,7 +167,7 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
             light, heavy = harness.Caller(service.url, keys["light"]), harness.Caller(service.url, keys["heavy"])
             light_plan_id = created_id(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
             venue_id, _, member_ids = store_venue(heavy, homes)
-            bodies = {name: json.dumps(documents[name]()).encode() for name in plans}
+            bodies = {name: json.dumps(building(*PLANS[name])).encode() for name in plans}
             plan_ids = {name: created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
             preparing = lambda: heavy.send("GET", "/readyz").json()["plans_preparing"]  # noqa: E731
             harness.wait_until(lambda: not preparing(), "all plans are ready", _READY_TIMEOUT_S, 0.2)

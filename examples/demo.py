@@ -23,7 +23,7 @@ from PIL import Image
 
 from examples.launch import ROOT, ServiceFailedError, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
-from lalaloc_client import Client, ClientError, Localisation
+from lalaloc_client import Client, ClientError, Localisation, QueryOptions
 from lalaloc_core.draw.canvas import MUTED, document, image, pixels, words
 
 _PLAN_TIMEOUT_S = 120.0
@@ -95,16 +95,13 @@ def prepare_plan(client: Client) -> str:
 
 
 def _localise_photograph(client: Client, plan_id: str, truth: TruePose) -> Panel:
-    known = client.localise(
-        plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
-    )
+    stated = QueryOptions(heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m)
+    known = client.localise(plan_id, truth.picture, **stated)
     unknown = client.localise(plan_id, truth.picture, camera_height_m=truth.camera_height_m)
     for label, localisation in (("known", known), ("unknown", unknown)):
         check_localisation(localisation)
         print(_line(truth, label, localisation), flush=True)
-    picture = client.picture(
-        plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
-    )
+    picture = client.picture(plan_id, truth.picture, **stated)
     with Image.open(io.BytesIO(picture)) as opened:
         return Panel(truth, known, unknown, picture, opened.size)
 

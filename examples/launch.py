@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,19 +62,15 @@ def _wait_until_ready(url: str, process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + _READY_TIMEOUT_S
     # This loop retries, because it also checks the process.
     with Client(url, timeout_s=5.0, retry=RetryPolicy(attempts=1)) as client:
-        while not _is_ready(client):
+        while True:
+            with suppress(ConnectionFailedError):
+                if client.ready().ready:
+                    return
             if process.poll() is not None:
                 raise ServiceFailedError(f"the service ended with status {process.returncode} while starting")
             if time.monotonic() > deadline:
                 raise ServiceFailedError(f"the service is not ready after {_READY_TIMEOUT_S:g} s")
             time.sleep(_POLL_S)
-
-
-def _is_ready(client: Client) -> bool:
-    try:
-        return client.ready().ready
-    except ConnectionFailedError:
-        return False
 
 
 def _stop(process: subprocess.Popen[str]) -> None:

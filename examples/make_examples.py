@@ -193,7 +193,6 @@ def shot_of(home: Home, view: View) -> Shot:
 
 
 def true_pose(plan: FloorPlan, view: View) -> TruePose:
-    """Return the true pose of a view."""
     x_m, y_m = view.position_m
     room = plan.rooms[int(plan.room_index_at(np.array([view.position_m]))[0])]
     return TruePose(

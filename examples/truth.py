@@ -27,16 +27,13 @@ class TruePose:
 
     @property
     def picture(self) -> Path:
-        """Path of the picture."""
         return FOLDER / self.file
 
 
 def read_poses() -> list[TruePose]:
-    """Return the true poses of all example photographs."""
     return [TruePose(**record) for record in json.loads(POSES_PATH.read_bytes())]
 
 
 def write_poses(poses: Sequence[TruePose]) -> None:
-    """Write all true poses to the file."""
     records = [dataclasses.asdict(pose) for pose in poses]
     POSES_PATH.write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")

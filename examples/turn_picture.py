@@ -28,12 +28,11 @@ _PICTURE, _QUALITY = FOLDER.parent / "docs" / "images" / "turn.jpg", 85
 
 
 def main() -> None:
-    """Draw and write the picture."""
     plan, model, frames = read_plan(PLAN_PATH), LaLaLoc(), _frames()
     files = [encode_jpeg(frame) for frame in frames]
     camera = StatedCamera(projection="perspective", hfov_deg=_FIELD_DEG)
     answers = [model.localise(plan, files[0], camera=camera), model.localise_turn(plan, files, camera=camera)]
-    drawn = [_jpeg(pixels(draw_answer(drawn_answer(answer), None, "plan"))) for answer in answers]
+    drawn = [pixels(draw_answer(drawn_answer(answer), None, "plan")) for answer in answers]
     _write(frames, list(zip(drawn, (answer.confidence or 0.0 for answer in answers), strict=True)))
 
 
@@ -46,7 +45,7 @@ def _frames() -> list[UInt8[np.ndarray, "h w 3"]]:
     return [cut_view(sphere, camera, azimuth=turn, pitch=0.0, roll=0.0) for turn in turns]
 
 
-def _write(frames: Sequence[UInt8[np.ndarray, "h w 3"]], plans: Sequence[tuple[bytes, float]]) -> None:
+def _write(frames: Sequence[UInt8[np.ndarray, "h w 3"]], plans: Sequence[tuple[Image.Image, float]]) -> None:
     """Compose the photographs above the plans."""
     width = (_WIDTH - _GAP) / _COUNT - _GAP
     tall = width * _SIZE[1] / _SIZE[0]
@@ -56,15 +55,13 @@ def _write(frames: Sequence[UInt8[np.ndarray, "h w 3"]], plans: Sequence[tuple[b
     ]
     half, top = (_WIDTH - _GAP) / len(plans) - _GAP, 2 * _GAP + tall
     below = 0.0
-    for number, ((content, confidence), text) in enumerate(
+    for number, ((plan, confidence), text) in enumerate(
         zip(plans, ("The first photograph alone", f"All {_COUNT}, taken while turning"), strict=True)
     ):
         left = _GAP + number * (half + _GAP)
-        with Image.open(io.BytesIO(content)) as picture:
-            size = picture.size
-        high = half * size[1] / size[0]
+        high = half * plan.height / plan.width
         parts.append(words(left, top + 26, f"{text}: confidence {100.0 * confidence:.0f} %", 20, fill=MUTED))
-        parts.append(image(content, "jpeg", (left, top + _HEAD, half, high)))
+        parts.append(image(_jpeg(plan), "jpeg", (left, top + _HEAD, half, high)))
         below = max(below, top + _HEAD + high + _GAP)
     drawing = pixels(document(_WIDTH, round(below), "A turn on the spot and its place", parts))
     drawing.save(_PICTURE, quality=_QUALITY, optimize=True)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lalaloc_client.frames import Convention, Matrix
+from lalaloc_client.frames import Convention, Matrix, depth_sign, floor_matrix
 from lalaloc_client.planar import Placed, of_answer
 
 # A camera that looks further up or down than this has no heading (share of its axis along the floor).
@@ -65,7 +65,7 @@ def align(
             f"{_MAX_MISFIT_M:g} m: give poses and cameras of the same photographs, in the same order, or turn again"
         )
     up = sum(camera[1][3] for camera in cameras) / len(cameras) - camera_height_m
-    return Alignment(_matrix(rotation, shift, up, convention), misfit_deg, misfit_m)
+    return Alignment(floor_matrix(rotation, shift, up, convention), misfit_deg, misfit_m)
 
 
 def plan_point(x_m: float, y_m: float, z_m: float, convention: Convention) -> tuple[float, float, float]:
@@ -77,7 +77,7 @@ def _on_floor(camera: Matrix, convention: Convention) -> tuple[complex, float]:
     """Return place (x + iy) and yaw of a camera on the floor of the device's world, seen from above."""
     if len(camera) != 4 or any(len(row) != 4 for row in camera):
         raise ValueError("a camera's matrix must have 4 rows of 4 numbers")
-    side = _depth_sign(convention)
+    side = depth_sign(convention)
     # The camera looks along its own z axis, in `opengl` along -z.
     forward = [side * row[2] for row in camera[:3]]
     length = math.hypot(*forward)
@@ -87,21 +87,3 @@ def _on_floor(camera: Matrix, convention: Convention) -> tuple[complex, float]:
     if abs(ahead) < _LEAST_LEVEL:
         raise ValueError("the camera looks up or down, so that it has no heading; hold it upright")
     return complex(camera[0][3], side * camera[2][3]), cmath.phase(ahead)
-
-
-def _matrix(rotation: complex, shift: complex, up: float, convention: Convention) -> Matrix:
-    """Return the turn and shift on the floor, and the shift upwards, as a matrix in a convention."""
-    side, cosine, sine = _depth_sign(convention), rotation.real, rotation.imag
-    return (
-        (cosine, 0.0, -side * sine, shift.real),
-        (0.0, 1.0, 0.0, up),
-        (side * sine, 0.0, cosine, side * shift.imag),
-        (0.0, 0.0, 0.0, 1.0),
-    )
-
-
-def _depth_sign(convention: Convention) -> float:
-    """Return the sign of the plan's y on the device's z axis."""
-    if convention not in ("opengl", "unity"):
-        raise ValueError(f"convention is {convention!r}; it must be 'opengl' or 'unity'")
-    return 1.0 if convention == "unity" else -1.0

@@ -84,13 +84,26 @@ def ros_covariance(covariance: Covariance3) -> tuple[float, ...]:
 def camera_matrix(pose: TrackedPose, convention: Convention) -> Matrix:
     """Return the matrix that maps points of a level camera to the plan, both in a convention of AR devices."""
     heading = math.radians(pose.heading_deg)
-    sine, cosine = math.sin(heading), math.cos(heading)
-    x, y, z = pose.position.x_m, pose.position.y_m, pose.camera_height_m
-    if convention == "unity":
-        return ((cosine, 0.0, sine, x), (0.0, 1.0, 0.0, z), (-sine, 0.0, cosine, y), (0.0, 0.0, 0.0, 1.0))
-    if convention == "opengl":
-        return ((cosine, 0.0, -sine, x), (0.0, 1.0, 0.0, z), (sine, 0.0, cosine, -y), (0.0, 0.0, 0.0, 1.0))
-    raise ValueError(f"convention is {convention!r}; it must be 'opengl' or 'unity'")
+    rotation, place = complex(math.cos(heading), -math.sin(heading)), complex(pose.position.x_m, pose.position.y_m)
+    return floor_matrix(rotation, place, pose.camera_height_m, convention)
+
+
+def floor_matrix(rotation: complex, shift: complex, up: float, convention: Convention) -> Matrix:
+    """Return a turn and shift on the floor (x + iy), and a shift upwards, as a 4 x 4 matrix in a convention."""
+    side, cosine, sine = depth_sign(convention), rotation.real, rotation.imag
+    return (
+        (cosine, 0.0, -side * sine, shift.real),
+        (0.0, 1.0, 0.0, up),
+        (side * sine, 0.0, cosine, side * shift.imag),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+
+
+def depth_sign(convention: Convention) -> float:
+    """Return the sign of the plan's y on the device's z axis."""
+    if convention not in ("opengl", "unity"):
+        raise ValueError(f"convention is {convention!r}; it must be 'opengl' or 'unity'")
+    return 1.0 if convention == "unity" else -1.0
 
 
 def world_from_plan(

@@ -111,22 +111,14 @@ class OnDeviceModel:
         """Return the features of a photograph, given options about its camera; `load` comes first."""
         from lalaloc_core.errors import InvalidPhotographError
         from lalaloc_core.localise.encode.features import is_features
-        from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
         from lalaloc_core.photograph import open_photograph
 
         assert self._encoder is not None
         content = picture_file(photograph)
         if is_features(content):
             return content
-        manifest = self._bundle.manifest
         try:
-            view = open_photograph(
-                content,
-                sphere_size=sphere_size(manifest),
-                patch_size=patch_size(manifest),
-                stated=_stated_camera(options),
-            )
-            return self._encoder.features(view)
+            return self._encoder.features(open_photograph(content, stated=_stated_camera(options), **self._sizes()))
         except InvalidPhotographError as error:
             raise OnDeviceError(str(error)) from error
 
@@ -145,12 +137,11 @@ class OnDeviceModel:
             raise OnDeviceError(str(error)) from error
 
     def _film(self, content: bytes, options: Mapping[str, Any]) -> TurnFeatures:
-        from lalaloc_core.localise.encode.photograph_encoder import patch_size
         from lalaloc_core.photograph.film import read_film
         from lalaloc_core.photograph.turned import stated_headings
 
         assert self._encoder is not None
-        film = read_film(content, stated=_stated_camera(options), patch_size=patch_size(self._bundle.manifest))
+        film = read_film(content, stated=_stated_camera(options), patch_size=self._sizes()["patch_size"])
         headings_deg, std_deg = stated_headings(film.angles)
         return TurnFeatures(
             [self._encoder.features(photograph) for photograph in film.photographs],
@@ -169,24 +160,26 @@ class OnDeviceModel:
 
     def _photographs(self, photographs: Sequence[Photograph], options: Mapping[str, Any]) -> TurnFeatures:
         from lalaloc_core.localise.encode.features import is_features
-        from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
         from lalaloc_core.photograph import open_photograph
         from lalaloc_core.photograph.turned import open_turn, stated_headings
 
         assert self._encoder is not None
         contents, stated = [picture_file(photograph) for photograph in photographs], _stated_camera(options)
-        manifest = self._bundle.manifest
-        sphere, patch = sphere_size(manifest), patch_size(manifest)
+        sizes = self._sizes()
 
         def overlaps(content: bytes) -> bool:
-            if is_features(content):
-                return False
-            return not open_photograph(content, stated=stated, sphere_size=sphere, patch_size=patch).is_sphere
+            return not (is_features(content) or open_photograph(content, stated=stated, **sizes).is_sphere)
 
         if not all(map(overlaps, contents)):
             return TurnFeatures([self.features(content, options) for content in contents])
-        opened, angles = open_turn(contents, stated, sphere_size=sphere, patch_size=patch)
+        opened, angles = open_turn(contents, stated, **sizes)
         return TurnFeatures([self._encoder.features(view) for view in opened], *stated_headings(angles))
+
+    def _sizes(self) -> dict[str, Any]:
+        """Return the sizes in which the model reads photographs."""
+        from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
+
+        return {"sphere_size": sphere_size(self._bundle.manifest), "patch_size": patch_size(self._bundle.manifest)}
 
 
 def filmed(answer: SequenceLocalisation, sent: TurnFeatures) -> SequenceLocalisation:

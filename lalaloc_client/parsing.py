@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from lalaloc_client.errors import MalformedAnswerError
 
 T = TypeVar("T")
+_adapter = cache(TypeAdapter)
 
 
 def parse(kind: type[T], content: bytes | str, name: str = "answer") -> T:
@@ -27,8 +28,3 @@ def parse(kind: type[T], content: bytes | str, name: str = "answer") -> T:
 def page_of(kind: type[Any], rows: str) -> Any:
     """Return the class of a page of a listing: its rows, and `next_cursor`, which is None on the last page."""
     return make_dataclass("Page", [(rows, tuple[kind, ...]), ("next_cursor", str | None, None)], frozen=True)
-
-
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)

@@ -8,7 +8,6 @@ The photographs are cut from the example spheres. Needs Chromium and the extra `
 
 from __future__ import annotations
 
-import argparse
 import io
 import math
 import shutil
@@ -20,7 +19,7 @@ import numpy as np
 from PIL import ExifTags, Image
 from playwright.sync_api import Page, ViewportSize, expect, sync_playwright
 
-from examples.launch import ROOT, running_service
+from benchmarks.harness import argument_parser, started_service
 from examples.truth import FOLDER, PLAN_PATH
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.photograph.cameras import Perspective
@@ -37,23 +36,20 @@ _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def main() -> int:
-    """Write the pictures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argument_parser(__doc__)
     parser.add_argument("out", type=Path, help="folder to write JPEGs into")
     out = parser.parse_args().out
-    with tempfile.TemporaryDirectory() as data:
-        environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", "PYTHONPATH": str(ROOT)}
-        with running_service(0, environment, ROOT) as service, sync_playwright() as playwright:
-            path = next(filter(None, map(shutil.which, _BROWSERS)))
-            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-            for draw in (_real_phone, _pinned_folder):
-                page = browser.new_page(viewport=_SIZE)
-                page.set_default_timeout(_WAIT_MS)
-                draw(page, service.url, Path(data))
-                with Image.open(io.BytesIO(page.screenshot())) as image:
-                    image.convert("RGB").save(out / f"{draw.__name__.strip('_')}.jpg", quality=90, optimize=True)
-                page.close()
-            browser.close()
+    with tempfile.TemporaryDirectory() as data, started_service(Path(data)) as service, sync_playwright() as playwright:
+        path = next(filter(None, map(shutil.which, _BROWSERS)))
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        for draw in (_real_phone, _pinned_folder):
+            page = browser.new_page(viewport=_SIZE)
+            page.set_default_timeout(_WAIT_MS)
+            draw(page, service.url, service.data)
+            with Image.open(io.BytesIO(page.screenshot())) as image:
+                image.convert("RGB").save(out / f"{draw.__name__.strip('_')}.jpg", quality=90, optimize=True)
+            page.close()
+        browser.close()
     return 0
 
 

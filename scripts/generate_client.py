@@ -38,7 +38,6 @@ _TEXTS = {
 
 
 def main() -> None:
-    """Write the generated files."""
     for path, text in generated_files().items():
         path.write_text(text, encoding="utf-8")
 

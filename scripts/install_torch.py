@@ -78,9 +78,7 @@ def is_installed(version: str, *, wants_cpu: bool) -> bool:
 def pip_install(requirement: str, *, locked: bool = False) -> int:
     """Install one requirement into the running environment; pip's exit status.
 
-    Args:
-        requirement: name and version.
-        locked: accept only files with a digest of torch.lock, and install no dependencies, which other locks have.
+    `locked` accepts only files with a digest of torch.lock, and installs no dependencies, which other locks have.
     """
     index = os.environ.get("TORCH_INDEX")
     options = ["--extra-index-url", index] if index else []

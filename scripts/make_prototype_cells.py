@@ -19,7 +19,7 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.learn.synth.homes.plans import TRAIN, Home, home_of
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, half_norms, nearest
-from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, prototypes_of, unpacked_openings
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
 
@@ -39,14 +39,14 @@ def grid_without_latents(home: Home) -> PoseGrid:
 
 def sample(homes: int, seed: int) -> np.ndarray:
     """Return the prototypes of a number of homes."""
-    parts, rng = list[Prototypes](), np.random.default_rng(seed)
+    parts, rng = list[np.ndarray](), np.random.default_rng(seed)
     for index in range(homes):
         home, _ = home_of(TRAIN, seed, index)
         part = prototypes_of(grid_without_latents(home), home.plan)
         if rng.random() < _SCALED:
-            part.rows["log_profile"] += np.float16(rng.uniform(*_LOG_FACTOR))
+            part["log_profile"] += np.float16(rng.uniform(*_LOG_FACTOR))
         parts.append(part)
-    return joined(parts).rows
+    return np.concatenate(parts)
 
 
 def centres(feature: Float[np.ndarray, "n f"], count: int, rounds: int, rng: np.random.Generator) -> np.ndarray:

@@ -1,22 +1,29 @@
 """Write the generated parts of docs/: `python -m scripts.write_docs`.
 
 A table stands between `<!-- begin: NAME -->` and `<!-- end: NAME -->`, where NAME is a key of `TABLES`. The tests fail
-when a table is out of date.
+when a table is out of date. `measured_tables.md.j2` has the tables of docs/bench.json.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import yaml
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from benchmarks.harness import table_head, table_row
+from benchmarks.neighbours import markdown as markdown_of_neighbours
 from lalaloc_core.cli import entry_point
-from scripts.figures import measured_table, neighbours_table, paper_tables, table
+from lalaloc_core.conditions import CONDITIONS, parts_of
+from lalaloc_core.evaluate.reproduce.paper_tables import TABLES as PAPER_TABLES
+from lalaloc_core.evaluate.reproduce.paper_tables import TableResult, markdown
 from service.cli import entry_point as service_cli
 from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.openapi import openapi_text
@@ -56,6 +63,48 @@ def documents() -> dict[Path, str]:
 
 def _fill(part: re.Match[str]) -> str:
     return f"<!-- begin: {part[1]} -->\n{TABLES[part[1]]()}\n<!-- end: {part[1]} -->"
+
+
+def table(head: str, rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; the names of its columns are separated by " | "."""
+    return "\n".join([table_head(*head.split(" | ")), *(table_row(*cells) for cells in rows)])
+
+
+def _read(path: str) -> Any:
+    return json.loads((ROOT / path).read_text(encoding="utf-8"))
+
+
+def measured_table(name: str) -> str:
+    """Return a table of docs/bench.json as Markdown: a block of the template."""
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.get_template("measured_tables.md.j2")
+    files = _read("models/default/manifest.json")["files"]
+    context = template.new_context(
+        {
+            "bench": _read("docs/bench.json"),
+            "conditions": {name: parts_of(name) for name in CONDITIONS},
+            "bundle_mb": sum(entry["bytes"] for entry in files.values()) / 1e6,
+        }
+    )
+    # Blocks see the macros of the template once it has been rendered.
+    "".join(template.root_render_func(context))
+    lines = "".join(template.blocks[name](context)).splitlines()
+    return "\n".join(line for line in lines if line)
+
+
+def neighbours_table() -> str:
+    """Return the latency of one tenant beside another as a Markdown table, with the command that measured it."""
+    if not (ROOT / "docs/neighbours.json").exists():
+        return "Not measured with this version."
+    report = _read("docs/neighbours.json")
+    return f"`{report['command']}` on {report['cores']} cores:\n\n{markdown_of_neighbours(report)}"
+
+
+def paper_tables() -> str:
+    """Return the measured tables of the paper with our figures beside the paper's, as Markdown."""
+    paths = [ROOT / "docs" / "tables" / f"{paper_table.name}.json" for paper_table in PAPER_TABLES]
+    return "\n".join(markdown(TableResult.read(path)) for path in paths if path.exists()).rstrip()
 
 
 def folder_map() -> str:

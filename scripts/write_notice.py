@@ -81,7 +81,6 @@ def npm_packages() -> list[tuple[str, str, str]]:
 
 
 def main() -> int:
-    """Write NOTICE."""
     atomic_write(NOTICE, notice_text())
     return 0
 

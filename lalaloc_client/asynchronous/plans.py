@@ -347,9 +347,6 @@ class AsyncPlans(AsyncAlbums):
 
 
 def _venue_document(plans: Iterable[VenuePlan], name: str | None, anchor: VenueAnchor | None) -> dict[str, Any]:
-    document: dict[str, Any] = {"plans": [plan.to_dict() for plan in plans]}
-    if name is not None:
-        document["name"] = name
-    if anchor is not None:
-        document["anchor"] = anchor.to_dict()
-    return document
+    given = {"name": name, "anchor": None if anchor is None else anchor.to_dict()}
+    stated = {key: value for key, value in given.items() if value is not None}
+    return {"plans": [plan.to_dict() for plan in plans], **stated}

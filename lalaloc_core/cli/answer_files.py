@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.cli.plan_files import check_picture_name, write_picture, write_text
+from lalaloc_core.cli.plan_files import check_picture_name, write_file, write_picture
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.shown_text import no_formula
 
@@ -49,11 +49,11 @@ def write_files(
     from lalaloc_core.draw.plan_overlays import draw_places
 
     if arguments.csv is not None:
-        write_text(arguments.csv, csv_text(_COLUMNS, map(_row, answers)))
+        write_file(arguments.csv, csv_text(_COLUMNS, map(_row, answers)))
     if arguments.geojson is not None:
-        write_text(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
+        write_file(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
     if arguments.map is not None:
-        write_picture(draw_places(plan, places), arguments.map, "--map")
+        write_picture(draw_places(plan, places), arguments.map)
 
 
 def csv_text(columns: Iterable[str], rows: Iterable[Sequence[object]]) -> str:

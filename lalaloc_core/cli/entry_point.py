@@ -6,12 +6,18 @@ import argparse
 import logging
 import os
 import re
+import runpy
 import sys
 
 from lalaloc_core import __version__
-from lalaloc_core.cli import assistants, encoding, localising, pinning, plans, tracking
+from lalaloc_core.cli import encoding, localising, pinning, plans, tracking
+from lalaloc_core.cli.options import add_options
 from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError
 
+_MCP_OPTIONS = """
+--url URL: address of the service (default: %(default)s)
+--http HOST:PORT: serve streamable HTTP at /mcp instead of stdio; callers send their own keys (stdio: LALALOC_API_KEY)
+"""
 # The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130
 
@@ -66,8 +72,11 @@ def build_parser(*, with_lab: bool = True) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise photographs in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (localising, pinning, encoding, tracking, plans, assistants):
+    for group in (localising, pinning, encoding, tracking, plans):
         group.add_commands(commands)
+    mcp = commands.add_parser("mcp", help="serve tools of a LaLaLoc service to assistants (Model Context Protocol)")
+    add_options(mcp, _MCP_OPTIONS, url={"default": "http://127.0.0.1:8000"})
+    mcp.set_defaults(run=_serve_assistants)
     bench = commands.add_parser("bench", help="measure the figures of the results page and print them as JSON")
     laboratory = commands.add_parser(
         "lab", help="train, measure and export models, by configuration files and options (docs/how-to/train.md)"
@@ -89,6 +98,12 @@ def _add_lab(bench: argparse.ArgumentParser, laboratory: argparse.ArgumentParser
     actions = laboratory.add_subparsers(required=True, metavar="COMMAND")
     for name, command in (training.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS).items():
         lab.add_options(actions.add_parser(name, help=lab.summary(command)), command)
+
+
+def _serve_assistants(arguments: argparse.Namespace) -> None:
+    given = [] if arguments.http is None else [f"--http={arguments.http}"]
+    sys.argv = ["lalaloc mcp", f"--url={arguments.url}", *given]
+    runpy.run_module("lalaloc_client.mcp_server", run_name="__main__")
 
 
 def _complete(parser: argparse.ArgumentParser, shell: str) -> None:

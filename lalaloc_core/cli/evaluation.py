@@ -10,23 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from lalaloc_core.cli.lab import (
-    AsJson,
-    BundleFolder,
-    Command,
-    Homes,
-    Runs,
-    Seed,
-    SkipBad,
-    Textures,
-    Workers,
-    check_range,
-)
+from lalaloc_core.cli.lab import BundleFolder, Command, Seed, SkipBad, Textures, Workers, check_range
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.files import default_bundle
 from lalaloc_core.learn.dataset_names import HELDOUT_HOMES, Split
 
+Homes = Annotated[int, "number of generated homes, 4 queries each"]
+AsJson = Annotated[bool, "print all figures as JSON"]
+Runs = Annotated[tuple[Path, ...], "folders of runs"]
 # Decimals of printed scores; a run's folder has all.
 _DECIMALS = 4
 # Columns of the printed table.

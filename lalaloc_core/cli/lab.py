@@ -34,10 +34,7 @@ Textures = Annotated[Path | None, "folder of material pictures for generated hom
 BundleFolder = Annotated[Path, "model bundle (default: the shipped one)"]
 Workers = Annotated[int | None, "worker processes (default: one per core)"]
 SkipBad = Annotated[bool, "skip unusable files and samples, and list them"]
-Homes = Annotated[int, "number of generated homes, 4 queries each"]
 Seed = Annotated[int, "random seed of generated homes"]
-AsJson = Annotated[bool, "print all figures as JSON"]
-Runs = Annotated[tuple[Path, ...], "folders of runs"]
 
 
 def summary(command: Command) -> str:

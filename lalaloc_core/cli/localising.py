@@ -6,7 +6,6 @@ import argparse
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,15 +40,6 @@ photographs PHOTO: full spheres, ordinary, fisheye or panorama-mode photographs 
 --json: print JSON: a list with one answer per photograph
 {BUNDLE}
 """
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """The answer for one photograph, or the error if it has none."""
-
-    photograph: Path
-    answer: Answer | None
-    document: dict[str, Any]
 
 
 def add_commands(commands: Any) -> None:
@@ -89,21 +79,19 @@ def _localise(arguments: argparse.Namespace) -> None:
     documents, rows, places = [], [], []
     model = LaLaLoc(arguments.bundle)
     find = _answers if arguments.turn is None else _turn_answers
-    for number, found in enumerate(find(arguments, model, plan, stated)):
-        documents.append(found.document)
-        answer = found.answer
+    for number, (path, answer, document) in enumerate(find(arguments, model, plan, stated)):
+        documents.append(document)
         if answer is None:
-            print(f"error: {found.document['error']}", file=sys.stderr)
+            print(f"error: {document['error']}", file=sys.stderr)
             continue
         for warning in _remarks(answer):
-            print(f"warning: {found.photograph}: {warning}", file=sys.stderr)
+            print(f"warning: {path}: {warning}", file=sys.stderr)
         drawn = drawn_answer(answer)
-        rows.append(_row(found.document, drawn))
-        places.append((found.photograph.stem, drawn.camera))
+        rows.append(_row(document, drawn))
+        places.append((path.stem, drawn.camera))
         if arguments.out is not None:
             out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
-            title = found.photograph.name if several else None
-            _draw(drawn, found.photograph, out, arguments, stated, title)
+            _draw(drawn, path, out, arguments, stated, path.name if several else None)
     write_files(arguments, plan, documents, places)
     if arguments.json:
         print_json(documents, JSON_DECIMALS)
@@ -116,8 +104,10 @@ def _localise(arguments: argparse.Namespace) -> None:
         )
 
 
-def _answers(arguments: argparse.Namespace, model: LaLaLoc, plan: FloorPlan, stated: StatedCamera) -> Iterator[_Found]:
-    """Yield the answers in the order of the photographs, with a progress bar on a terminal."""
+def _answers(
+    arguments: argparse.Namespace, model: LaLaLoc, plan: FloorPlan, stated: StatedCamera
+) -> Iterator[tuple[Path, Answer | None, dict[str, Any]]]:
+    """Yield photographs in order with their answers, None where it failed, and documents, with a progress bar."""
     from tqdm import tqdm
 
     paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
@@ -134,14 +124,14 @@ def _answers(arguments: argparse.Namespace, model: LaLaLoc, plan: FloorPlan, sta
         except InvalidPhotographError as error:
             if len(arguments.photographs) == 1:
                 raise
-            yield _Found(path, None, {"photograph": str(path), "error": str(error)})
+            yield path, None, {"photograph": str(path), "error": str(error)}
         else:
-            yield _Found(path, answer, {"photograph": str(path), **answer.document(), "warnings": _remarks(answer)})
+            yield path, answer, {"photograph": str(path), **answer.document(), "warnings": _remarks(answer)}
 
 
 def _turn_answers(
     arguments: argparse.Namespace, model: LaLaLoc, plan: FloorPlan, stated: StatedCamera
-) -> Iterator[_Found]:
+) -> Iterator[tuple[Path, Answer | None, dict[str, Any]]]:
     """Yield the answer for a turn, with the angles of its photographs."""
     from lalaloc_core.photograph.picture_folders import turn_files
 
@@ -153,7 +143,7 @@ def _turn_answers(
     if answer.film is None:
         poses = zip(files, document["poses"], strict=True)
         document["poses"] = [{"photograph": file.name, **pose} for file, pose in poses]
-    yield _Found(path, answer, document)
+    yield path, answer, document
 
 
 def _remarks(answer: Answer) -> list[str]:

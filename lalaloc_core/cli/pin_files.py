@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lalaloc_core.cli.answer_files import EarthPlace, csv_text, place_feature, place_on_earth
-from lalaloc_core.cli.plan_files import write_text
+from lalaloc_core.cli.plan_files import write_file
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.shown_text import no_formula
 
@@ -56,15 +56,15 @@ def write_pin_files(
     if all(plan.anchor is None for plan in pinned.plans):
         notes.append("the plan has no anchor (docs/reference/plan-format.md), so pins.geojson is left out")
     else:
-        write_text(out / "pins.geojson", json.dumps(_collection(plans, entries)) + "\n")
+        write_file(out / "pins.geojson", json.dumps(_collection(plans, entries)) + "\n")
     copied = _write_copies(out / COPIES, plans, paths, entries) if copies else []
     notes += copied
-    write_text(out / "pins.json", json.dumps(document, indent=2) + "\n")
-    write_text(out / "pins.csv", csv_text(_COLUMNS, [[cell(entry) for cell in _COLUMNS.values()] for entry in entries]))
+    write_file(out / "pins.json", json.dumps(document, indent=2) + "\n")
+    write_file(out / "pins.csv", csv_text(_COLUMNS, [[cell(entry) for cell in _COLUMNS.values()] for entry in entries]))
     rows = [_report_row(list(plans), path, entry) for path, entry in zip(paths, entries, strict=True)]
     for number, plan in enumerate(pinned.plans):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
-        write_text(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
+        write_file(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
     title = " / ".join(dict.fromkeys(plan.name for plan in pinned.plans))
     write_pdf(report_pages(title, pinned.plans, rows, _summary(document, copied)), out / "report.pdf", DPI)
     return document

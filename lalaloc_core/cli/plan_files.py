@@ -78,21 +78,17 @@ def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
     return plan
 
 
-def write_picture(svg: str, out: Path, option: str = "--out") -> None:
+def write_picture(svg: str, out: Path) -> None:
     """Write a drawing as SVG or PNG, by the file's suffix."""
     from lalaloc_core.draw import rasterise
 
-    check_picture_name(out, option)
-    try:
-        out.write_bytes(rasterise(svg) if out.suffix.lower() == ".png" else svg.encode())
-    except OSError as error:
-        raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
+    write_file(out, rasterise(svg) if out.suffix.lower() == ".png" else svg.encode())
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, its line ends as they are."""
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file; the line ends of text stay as they are."""
     try:
-        path.write_text(text, encoding="utf-8", newline="")
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
     except OSError as error:
         raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error
 

@@ -84,7 +84,7 @@ def _read_traced(arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
     try:
         return read_plans(arguments.file, arguments, trace)
     finally:
-        write_picture(trace_svg(trace, arguments.file.name), arguments.debug, "--debug")
+        write_picture(trace_svg(trace, arguments.file.name), arguments.debug)
         print(f"drawn: {arguments.debug}", file=sys.stderr)
 
 
@@ -155,7 +155,7 @@ def _localisability(plan: FloorPlan, arguments: argparse.Namespace) -> tuple[dic
     found = localisability(plan, Bundle.open(arguments.bundle).manifest)
     report = report_of(plan, found)
     if arguments.picture is not None:
-        write_picture(localisability_svg(plan, report), arguments.picture, "--picture")
+        write_picture(localisability_svg(plan, report), arguments.picture)
     return report, summary_of(plan, found)
 
 

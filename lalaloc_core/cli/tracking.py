@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, add_options, heading
-from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture, write_text
+from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_file, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 
@@ -75,7 +75,7 @@ def _track(arguments: argparse.Namespace) -> None:
             )
             for time_s, answer in found
         ]
-        write_text(arguments.trajectory, "\n".join(lines) + "\n")
+        write_file(arguments.trajectory, "\n".join(lines) + "\n")
     if arguments.out is not None:
         write_picture(_picture(plan, [answer for _, answer in found]), arguments.out)
     if arguments.json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
@@ -34,7 +35,6 @@ class LocalModel:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.encoder = PhotographEncoder(bundle, threads=1)
-        self.refiner = _LocalRefiner(bundle).refine
         manifest = bundle.manifest
         self._sizes: dict[str, Any] = {"sphere_size": sphere_size(manifest), "patch_size": patch_size(manifest)}
 
@@ -86,24 +86,17 @@ class LocalModel:
         queries = [turn.query(self.encoder, *spot) for spot in turn.spots]
         return run_steps(turn.steps(ground, self.encoder, queries), self.refiner)
 
-
-class _LocalRefiner:
-    """Refiner in this process; torch is loaded when the first job compares latents."""
-
-    def __init__(self, bundle: Bundle) -> None:
-        self._bundle = bundle
-        self._by_latents: Refiner | None = None
-
-    def refine(self, job: RefinementJob) -> RefinementResult | None:
+    def refiner(self, job: RefinementJob) -> RefinementResult | None:
         """Refine the poses of a job within their rooms."""
-        if refined_by_walls(job):
-            return refine_walls(job)
-        if self._by_latents is None:
-            import torch
+        return refine_walls(job) if refined_by_walls(job) else self._by_latents(job)
 
-            from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+    @cached_property
+    def _by_latents(self) -> Refiner:
+        """Refiner by latents; torch is loaded when the first job compares them."""
+        import torch
 
-            # Its tensors are too small to share between threads.
-            torch.set_num_threads(1)
-            self._by_latents = PoseRefiner.from_bundle(self._bundle).refine
-        return self._by_latents(job)
+        from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
+
+        # Its tensors are too small to share between threads.
+        torch.set_num_threads(1)
+        return PoseRefiner.from_bundle(self.bundle).refine

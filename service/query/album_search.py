@@ -14,7 +14,6 @@ from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry,
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.solve import solve_album
-from lalaloc_core.localise.answers.compose import read_photograph
 from lalaloc_core.localise.answers.documents import Spot
 from lalaloc_core.localise.encode.features import encodes_spheres
 from lalaloc_core.localise.query import Query
@@ -72,7 +71,7 @@ class AlbumSearch:
                 model=taken.model or None,
                 width=taken.width or None,
                 height=taken.height or None,
-                **read_photograph(Spot(made.photograph)).document(),
+                **Spot(made.photograph).view.document(),
             )
             return AlbumEntry(made.to_bytes(self._parts.bundle), facts.model_dump_json())
 

@@ -20,7 +20,7 @@ import numpy as np
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
-from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, joined, prototypes_of
+from lalaloc_core.localise.venue.prototypes import ROW, prototypes_of
 from lalaloc_core.render.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
@@ -38,9 +38,9 @@ class SortedPrototypes:
     version: int
 
     @classmethod
-    def of(cls, prototypes: Prototypes, cells: Cells) -> SortedPrototypes:
+    def of(cls, rows: np.ndarray, cells: Cells) -> SortedPrototypes:
         """Sort prototypes into cells."""
-        rows = prototypes.rows.copy()
+        rows = rows.copy()
         rows["cell"] = cells.assign(rows)
         return cls(rows, cells.version)
 
@@ -53,14 +53,14 @@ class SortedPrototypes:
     def of_grids(cls, grids: Sequence[PoseGrid], plans: Sequence[FloorPlan]) -> list[SortedPrototypes]:
         """Make the prototypes of several plans as `of_grid` does, sorted at once."""
         made = [prototypes_of(grid, plan) for grid, plan in zip(grids, plans, strict=True)]
-        whole = cls.of(joined(made), shipped_cells())
+        whole = cls.of(np.concatenate(made), shipped_cells())
         parts = np.split(whole.rows, np.cumsum([len(part) for part in made])[:-1])
         return [cls(rows, whole.version) for rows in parts]
 
     def in_shipped_cells(self) -> np.ndarray:
         """Return the rows, sorted into the shipped cells again if their version differs."""
         cells = shipped_cells()
-        return self.rows if self.version == cells.version else self.of(Prototypes(self.rows, 0.0), cells).rows
+        return self.rows if self.version == cells.version else self.of(self.rows, cells).rows
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def candidate(x_m: float, cost: float, hypothesis: int = 0) -> Candidate:
 def costs_at(places: list[float], cost: np.ndarray) -> GridCosts:
     position = np.stack([places, np.zeros(len(places))], axis=1)
     poses = PoseSet(position, np.zeros(len(places), int))
-    return GridCosts.of_all(poses, np.atleast_2d(cost), np.zeros_like(np.atleast_2d(cost)))
+    return GridCosts.of_all(poses, np.atleast_2d(cost))
 
 
 def posterior_at(

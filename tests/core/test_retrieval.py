@@ -464,7 +464,7 @@ def test_likeliest_pairs_equal_a_complete_coarse_pass(
         rooms = len(building.plan.rooms)
         directions = rng.random((rooms if told == "directions" else 1, HYPOTHESES)).astype(np.float32) * 0.2
         room = grid.poses.room_index if told == "directions" else np.zeros(poses, np.intp)
-        penalty = None if told is None else PlaceCost(hint, row, fixtures, room, directions)
+        penalty = None if told is None else PlaceCost(hint, ((fixtures, row), (directions, room)))
         matching_cost = matching_cost_of(building, query if azimuths == SPHERE_AZIMUTHS else view_of(query))
         binned, room_index = grid.binned(building.plan, azimuths), grid.poses.room_index
         every = coarse_costs(binned, matching_cost, room_index)

@@ -35,9 +35,7 @@ from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_
 from lalaloc_core.localise.venue.prototype_costs import PrototypeAlignment, PrototypeCosts
 from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
-    Prototypes,
     claims_of_trust,
-    joined,
     most_probable,
     packed_openings,
     prototypes_of,
@@ -105,9 +103,9 @@ def query_of(log_m: np.ndarray, scale: float, kind: np.ndarray, hypotheses: int,
     )
 
 
-def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
+def query_at(prototypes: np.ndarray, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
     """Return a noisy prediction at a prototype; the first heading hypothesis is right."""
-    row = prototypes.rows[number]
+    row = prototypes[number]
     log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
     kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
     types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
@@ -116,16 +114,16 @@ def query_at(prototypes: Prototypes, number: int, rng: np.random.Generator, *, h
     return query_of(log_m, 0.05, kind, hypotheses, ceiling=ceiling, room_type=room_type)
 
 
-def index_of(parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
+def index_of(parts: Sequence[np.ndarray], cells: Cells) -> PlanIndex:
     """Assign the prototypes of each plan to cells and return their index."""
-    rows = joined(parts).rows.copy()
+    rows = np.concatenate(parts)
     rows["cell"] = cells.assign(rows)
     count = np.array([len(part) for part in parts])
-    return PlanIndex.build(rows, np.cumsum(count) - count, count, step_m=parts[0].step_m, cells=cells)
+    return PlanIndex.build(rows, np.cumsum(count) - count, count, step_m=STEP_M, cells=cells)
 
 
 @pytest.fixture(scope="module")
-def prototype_sets() -> list[Prototypes]:
+def prototype_sets() -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     plans = [random_plan(rng) for _ in range(20)]
     return [prototypes_of(grid_of(plan), plan) for plan in plans]
@@ -136,12 +134,12 @@ def test_prototypes_cover_the_floor() -> None:
     grid = grid_of(plan)
     prototypes = prototypes_of(grid, plan)
     assert len(prototypes) == pytest.approx(len(grid.poses) / 2, rel=0.1)
-    assert np.exp(prototypes.rows["log_area"]).sum() == pytest.approx(len(grid.poses) * STEP_M**2, rel=1e-5)
-    assert set(prototypes.rows["claims"].tolist()) == {1 << OPENING_CLASSES.index("door")}
-    kinds = unpacked_openings(prototypes.rows["openings"])
+    assert np.exp(prototypes["log_area"]).sum() == pytest.approx(len(grid.poses) * STEP_M**2, rel=1e-5)
+    assert set(prototypes["claims"].tolist()) == {1 << OPENING_CLASSES.index("door")}
+    kinds = unpacked_openings(prototypes["openings"])
     assert set(kinds.ravel().tolist()) == {0, OPENING_CLASSES.index("door")}
-    assert set(prototypes.rows["room_type"].tolist()) == {ROOM_TYPES.index("kitchen"), ROOM_TYPES.index("unknown")}
-    np.testing.assert_allclose(prototypes.rows["ceiling_m"], plan.ceiling_heights_m[0], rtol=1e-3)
+    assert set(prototypes["room_type"].tolist()) == {ROOM_TYPES.index("kitchen"), ROOM_TYPES.index("unknown")}
+    np.testing.assert_allclose(prototypes["ceiling_m"], plan.ceiling_heights_m[0], rtol=1e-3)
 
 
 def test_openings_are_packed_losslessly() -> None:
@@ -199,9 +197,9 @@ def test_prototype_cost_is_the_documented_formula(kinds: tuple[str, ...] | None)
     n, (k, j) = len(prototypes), costs.shape
     assert (k, j) == (8, len(costs.offsets))
     number, hypothesis, offset = rng.integers(n, size=60), rng.integers(k, size=60), rng.integers(j, size=60)
-    found = costs.pairs(prototypes.rows[number], hypothesis, offset)
+    found = costs.pairs(prototypes[number], hypothesis, offset)
     expected = [
-        reference_cost(prototypes.rows[a], query, int(b), float(costs.offsets[c]))
+        reference_cost(prototypes[a], query, int(b), float(costs.offsets[c]))
         for a, b, c in zip(number, hypothesis, offset, strict=True)
     ]
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3)
@@ -221,13 +219,13 @@ def test_code_cost_approximates_the_prototype_cost(kinds: tuple[str, ...] | None
     # A small ceiling weight keeps the bounded ceiling term from mattering.
     costs = PrototypeCosts(query, STEP_M, replace(WEIGHTS, ceiling=0.02), CONFIG)
     (k, j), n = costs.shape, len(prototypes)
-    value = unpacked_codes(product_codes(prototypes.rows))
-    (family,) = np.unique(family_of(prototypes.rows["claims"])).tolist()
+    value = unpacked_codes(product_codes(prototypes))
+    (family,) = np.unique(family_of(prototypes["claims"])).tolist()
     tables = lookup_tables(costs, claims_of(family))
     for hypothesis in range(k):
         for offset in range(j):
             coded = tables[hypothesis, offset][np.arange(value.shape[1]), value].sum(axis=1)
-            exact = costs.pairs(prototypes.rows, np.full(n, hypothesis), np.full(n, offset))
+            exact = costs.pairs(prototypes, np.full(n, hypothesis), np.full(n, offset))
             np.testing.assert_allclose(coded, exact, atol=0.15)
             assert np.corrcoef(coded, exact)[0, 1] > 0.98
 
@@ -270,7 +268,7 @@ def test_alignment_finds_the_camera_beside_a_prototype(moved_m: tuple[float, flo
     # The camera stood higher than stated, so predicted distances are too small.
     query = query.scaled(-height_offset)
     # At a high temperature, the prior of the unknowns hardly counts.
-    weights, pair = replace(WEIGHTS, temperature=1000.0), (prototypes.rows[[number]], np.array([0]), np.array([0]))
+    weights, pair = replace(WEIGHTS, temperature=1000.0), (prototypes[[number]], np.array([0]), np.array([0]))
     cost, step = PrototypeAlignment(PrototypeCosts(query, STEP_M, weights, CONFIG)).pairs(*pair)
     np.testing.assert_allclose(step[0, :2], moved_m, atol=0.08)
     assert step[0, 2] == pytest.approx(np.radians(turn_deg), abs=np.radians(1.5))
@@ -280,8 +278,8 @@ def test_alignment_finds_the_camera_beside_a_prototype(moved_m: tuple[float, flo
     assert cost[0] < 0.6 * unmoved[0]
 
 
-def test_known_values_are_not_aligned(prototype_sets: list[Prototypes]) -> None:
-    rows, rng = prototype_sets[0].rows[:5], np.random.default_rng(13)
+def test_known_values_are_not_aligned(prototype_sets: list[np.ndarray]) -> None:
+    rows, rng = prototype_sets[0][:5], np.random.default_rng(13)
     query = replace(query_at(prototype_sets[0], 3, rng), camera_height=CameraHeight(1.5, 0.0))
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
     step = PrototypeAlignment(costs).pairs(rows, np.zeros(5, int), np.zeros(5, int)).step
@@ -304,7 +302,7 @@ def furnished_plan(number: int) -> FloorPlan:
 def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> None:
     plans, rng, cells = [furnished_plan(number) for number in range(9)], np.random.default_rng(14), shipped_cells()
     parts = [prototypes_of(grid_of(plan), plan) for plan in plans]
-    rows, count = joined(parts).rows.copy(), np.array([len(part) for part in parts])
+    rows, count = np.concatenate(parts), np.array([len(part) for part in parts])
     rows["cell"] = cells.assign(rows)
     begin, limits = np.cumsum(count) - count, SearchLimits(compared=4000, aligned=1000)
     index = PlanIndex.build(rows, begin, count, step_m=STEP_M, cells=cells)
@@ -335,7 +333,7 @@ def test_plans_that_differ_in_openings_alone_are_told_apart(hypotheses: int) -> 
     np.testing.assert_allclose(walls, walls[0], atol=1e-3)
 
 
-def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototypes]) -> None:
+def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[np.ndarray]) -> None:
     few, rng = prototype_sets[:4], np.random.default_rng(4)
     query = query_at(few[1], 3, rng, hypotheses=4)
     alignment = PrototypeAlignment(PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG))
@@ -343,8 +341,8 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototype
     expected = []
     for part in few:
         offset = np.zeros(len(part), int)
-        cost = np.stack([alignment.pairs(part.rows, np.full(len(part), k), offset).cost for k in range(4)])
-        weighed = part.rows["log_area"] - WEIGHTS.temperature * cost.astype(float)
+        cost = np.stack([alignment.pairs(part, np.full(len(part), k), offset).cost for k in range(4)])
+        weighed = part["log_area"] - WEIGHTS.temperature * cost.astype(float)
         expected.append(np.logaddexp.reduce(weighed, axis=None))
     found = index.whole.log_masses(query, WEIGHTS, CONFIG)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
@@ -352,7 +350,7 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[Prototype
 
 
 @pytest.mark.slow
-def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) -> None:
+def test_few_comparisons_find_the_best_plan(prototype_sets: list[np.ndarray]) -> None:
     index, rng = index_of(prototype_sets, shipped_cells()), np.random.default_rng(5)
     pairs = sum(map(len, prototype_sets)) * 16
     for number in range(len(prototype_sets)):
@@ -370,7 +368,7 @@ def test_few_comparisons_find_the_best_plan(prototype_sets: list[Prototypes]) ->
         assert few.max() == pytest.approx(whole.max(), abs=0.7)
 
 
-def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> None:
+def test_unknown_camera_height_is_searched(prototype_sets: list[np.ndarray]) -> None:
     rng = np.random.default_rng(6)
     query = query_at(prototype_sets[7], 4, rng)
     # The camera stood at 1.95 m, not at 1.5 m, so predicted distances are too small.
@@ -381,7 +379,7 @@ def test_unknown_camera_height_is_searched(prototype_sets: list[Prototypes]) -> 
     assert index.whole.log_masses(unknown, WEIGHTS, CONFIG, SearchLimits(compared=2000)).argmax() == 7
 
 
-def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]) -> None:
+def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[np.ndarray]) -> None:
     several = [*prototype_sets, prototype_sets[3], prototype_sets[3]]
     index, rng = index_of(several, shipped_cells()), np.random.default_rng(7)
     for compared, scanned in ((50, 2000), (50, 10**9), (50, 1000), (10**9, 1)):
@@ -391,10 +389,10 @@ def test_copies_have_equal_masses_for_any_limit(prototype_sets: list[Prototypes]
         np.testing.assert_allclose(masses[[20, 21]], masses[3], rtol=0, atol=1e-9)
 
 
-def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> None:
+def test_updated_index_equals_a_new_one(prototype_sets: list[np.ndarray]) -> None:
     """Plans come and go one by one and many at once, in any order, with copies of each other in several segments."""
     rng, cells = np.random.default_rng(12), shipped_cells()
-    rows = joined(prototype_sets).rows.copy()
+    rows = np.concatenate(prototype_sets)
     rows["cell"] = cells.assign(rows)
     count = np.array([len(part) for part in prototype_sets])
     begin = np.cumsum(count) - count
@@ -440,7 +438,7 @@ def test_updated_index_equals_a_new_one(prototype_sets: list[Prototypes]) -> Non
         plans = wanted
 
 
-def test_divided_index_equals_an_undivided_one(prototype_sets: list[Prototypes]) -> None:
+def test_divided_index_equals_an_undivided_one(prototype_sets: list[np.ndarray]) -> None:
     rng, cells = np.random.default_rng(15), shipped_cells()
     index, order = index_of(prototype_sets, cells), rng.permutation(len(prototype_sets))
     shards = [
@@ -457,7 +455,7 @@ def test_divided_index_equals_an_undivided_one(prototype_sets: list[Prototypes])
             np.testing.assert_allclose(masses, expected, rtol=0, atol=1e-9)
 
 
-def test_search_sent_to_another_machine_has_the_same_costs(prototype_sets: list[Prototypes]) -> None:
+def test_search_sent_to_another_machine_has_the_same_costs(prototype_sets: list[np.ndarray]) -> None:
     search = PlanSearch(query_at(prototype_sets[0], 2, np.random.default_rng(16)), STEP_M, WEIGHTS, CONFIG)
     alone = len(pickle.dumps(search))
     search.costs.opening_loss(claims_of(FAMILIES - 1))
@@ -486,12 +484,12 @@ def test_claims_of_complete_kinds_are_those_of_earlier_databases() -> None:
 
 def test_plans_with_and_without_openings_are_found() -> None:
     rng, cells = np.random.default_rng(8), shipped_cells()
-    whole, prototype_sets = list[Prototypes](), list[Prototypes]()
+    whole, prototype_sets = list[np.ndarray](), list[np.ndarray]()
     for number in range(12):
         complete, bare = (random_plan(np.random.default_rng(number), kinds=kinds) for kinds in (None, ()))
         whole.append(prototypes_of(grid_of(complete), complete))
         prototype_sets.append(prototypes_of(grid_of(bare), bare) if number % 2 else whole[-1])
-    rows = joined(prototype_sets).rows.copy()
+    rows = np.concatenate(prototype_sets)
     rows["cell"] = cells.assign(rows)
     # Family 0 has no openings, family 3 has doors and windows.
     assert np.unique(rows["cell"] // (len(cells) // FAMILIES)).tolist() == [0, 3]
@@ -503,9 +501,9 @@ def test_plans_with_and_without_openings_are_found() -> None:
         assert (masses > masses[number]).sum() <= (2 if number % 2 else 0)
 
 
-def test_cell_cost_approximates_the_prototype_cost(prototype_sets: list[Prototypes]) -> None:
+def test_cell_cost_approximates_the_prototype_cost(prototype_sets: list[np.ndarray]) -> None:
     # Each cell has a single prototype.
-    rows = joined(prototype_sets).rows[:50].copy()
+    rows = np.concatenate(prototype_sets)[:50]
     share = (unpacked_openings(rows["openings"])[:, :, None] == np.arange(CLASSES)).astype(np.float32)
     cells = Cells(rows["log_profile"].astype(np.float32), share, version=1)
     rows["claims"] = sum(1 << code for code in range(1, CLASSES))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -22,14 +21,7 @@ from lalaloc_core.localise.answers.documents import (
     Spot,
     TrackedAnswer,
 )
-from lalaloc_core.localise.answers.views import (
-    AssumedAngle,
-    CameraAnswer,
-    ReadView,
-    SeenArc,
-    SeenObjectAnswer,
-    ViewAnswer,
-)
+from lalaloc_core.localise.answers.views import AssumedAngle, SeenObjectAnswer, ViewAnswer
 from lalaloc_core.localise.belief import (
     Confidence,
     advice_for,
@@ -38,15 +30,12 @@ from lalaloc_core.localise.belief import (
     pose_uncertainty,
     reason_for,
 )
-from lalaloc_core.localise.localisability.reports import step_after
+from lalaloc_core.localise.localisability.reports import known_of, step_after
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import KnownHeading
 from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.tracking_filter import Tracked
-from lalaloc_core.photograph import Photograph
-from lalaloc_core.photograph.cameras import Around, Fisheye
-from lalaloc_core.photograph.stated_camera import intrinsics_of
 
 
 def compose_answer(
@@ -62,15 +51,9 @@ def compose_answer(
 ) -> Answer:
     """Compose the answer of a search.
 
-    Args:
-        found: result of the search.
-        ground: the searched places.
-        spot: the photograph, with others from its spot.
-        known: the heading that was known before the search.
-        bundle: the model.
-        warnings: warnings besides those about the heading and the photograph.
-        with_step: compute the next step of an answer that is not sure.
-        relative_heading: heading minus that of the first photograph of a turn.
+    `known` is the heading that was known before the search, and `warnings` are those besides warnings about it and the
+    photograph. `with_step` computes the next step of an answer that is not sure. `relative_heading` is the heading
+    minus that of the first photograph of a turn.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view, turn=found.query.is_turn)
     confidence = found.confidence(model, ground.share(found))
@@ -78,7 +61,10 @@ def compose_answer(
     shares = len(placed) * [None] if confidence is None else confidence.candidates
     candidates = [_possible(place, found.query, share) for place, share in zip(placed, shares, strict=True)]
     covariance_m2, heading_std_deg = _uncertainty(placed[0], model)
-    best = candidates[0]
+    best, reason = candidates[0], None
+    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
+    if confidence is not None:
+        reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
     return Answer(
         position=best.position,
         heading_deg=best.heading_deg,
@@ -88,9 +74,7 @@ def compose_answer(
         confidence=None if confidence is None else confidence.position,
         heading_confidence=None if confidence is None else confidence.heading,
         probability_elsewhere=None if confidence is None else confidence.elsewhere,
-        warnings=_with_reason(
-            [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings], found, confidence
-        ),
+        warnings=warnings if reason is None else [*warnings, reason],
         covariance_m2=covariance_m2,
         heading_std_deg=heading_std_deg,
         stage=found.stage,
@@ -139,13 +123,6 @@ def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
     return [f"{origin} is {degrees:.4g}, which the photograph contradicts: the heading was searched for instead"]
 
 
-def _with_reason(warnings: list[str], found: Localisation, confidence: Confidence | None) -> list[str]:
-    if confidence is None:
-        return warnings
-    reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
-    return warnings if reason is None else [*warnings, reason]
-
-
 def compose_tracked(
     found: Tracked,
     ground: Ground,
@@ -157,13 +134,7 @@ def compose_tracked(
 ) -> TrackedAnswer:
     """Compose the answer of a camera that moves.
 
-    Args:
-        found: result of the filter.
-        ground: the searched places.
-        spot: the photograph.
-        bundle: the model.
-        odometry: the motion that was stated.
-        warnings: warnings besides those about the motion and the photograph.
+    `odometry` is the motion that was stated, and `warnings` are those besides warnings about it and the photograph.
     """
     pose, query, best = found.pose, found.query, found.candidates[0]
     room = ground.place(best).plan.rooms[pose.room_index]
@@ -193,37 +164,9 @@ def compose_tracked(
         ],
         motion_contradicted=list(found.contradicted),
         warnings=[*about_motion, *warnings, *spot.photograph.warnings],
-        view=read_photograph(spot),
+        view=spot.view,
         model=ModelAnswer.of(bundle),
     )
-
-
-def read_photograph(spot: Spot) -> ReadView:
-    """Return what was assumed about a photograph."""
-    return ReadView(**_assumptions(spot))
-
-
-def _assumptions(spot: Spot) -> dict[str, Any]:
-    photograph = spot.photograph
-    return {
-        "projection": photograph.projection,
-        "projection_source": photograph.projection_source,
-        **{name: AssumedAngle.of(getattr(photograph, name)) for name in ("hfov", "pitch", "roll")},
-        "wall_direction": None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
-        "camera": _camera(photograph),
-        "seen": [SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in spot.arcs],
-        "warnings": list(photograph.warnings),
-    }
-
-
-def _camera(photograph: Photograph) -> CameraAnswer | None:
-    camera = photograph.camera
-    if camera is None or isinstance(camera, Around):
-        return None
-    names = ("k1", "k2", "k3", "k4") if isinstance(camera, Fisheye) else ("k1", "k2", "p1", "p2", "k3")
-    values = vars(intrinsics_of(camera))
-    matrix = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
-    return CameraAnswer(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])
 
 
 def _told(
@@ -238,17 +181,10 @@ def _told(
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
     seen, step = found.query.objects, None
-    if bundle is not None:
-        step = step_after(
-            ground.plan,
-            bundle.manifest,
-            found,
-            confidence,
-            arcs=spot.arcs,
-            field=spot.photograph.hfov.value,
-            step_m=ground.grid.step_m,
-            rooms_known=ground.rooms_known,
-        )
+    if bundle is not None and confidence is not None:
+        field = spot.photograph.hfov.value
+        known = known_of(found, confidence, arcs=spot.arcs, field=field, rooms_known=ground.rooms_known)
+        step = step_after(ground.plan, bundle.manifest, known, step_m=ground.grid.step_m)
     objects = None
     if seen is not None:
         objects = [
@@ -260,7 +196,7 @@ def _told(
             for shown in seen.objects
         ]
     return ViewAnswer(
-        **_assumptions(spot),
+        **vars(spot.view),
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,
         relative_heading=relative_heading,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -11,7 +12,7 @@ from pydantic import Field
 from lalaloc_core.answer_numbers import Cost, Degrees, Heading, LatentDistance, Metres, Share, Variance
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.answers.views import Document, ReadView, ViewAnswer
+from lalaloc_core.localise.answers.views import AssumedAngle, CameraAnswer, Document, ReadView, SeenArc, ViewAnswer
 from lalaloc_core.localise.belief import union_of_arcs
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate
@@ -41,6 +42,22 @@ class Spot:
         """Azimuths (radians, first and last) that are seen, relative to the centre of `photograph`."""
         turned = [(self.photograph, 0.0), *self.others]
         return union_of_arcs([(seen.azimuths[0] + turn, seen.azimuths[1] + turn) for seen, turn in turned])
+
+    @property
+    def view(self) -> ReadView:
+        """Assumptions about the photograph, and the azimuths that are seen."""
+        photograph = self.photograph
+        return ReadView(
+            projection=photograph.projection,
+            projection_source=photograph.projection_source,
+            hfov=AssumedAngle.of(photograph.hfov),
+            pitch=AssumedAngle.of(photograph.pitch),
+            roll=AssumedAngle.of(photograph.roll),
+            wall_direction=None if photograph.wall_direction is None else AssumedAngle.of(photograph.wall_direction),
+            camera=CameraAnswer.of(photograph.camera),
+            seen=[SeenArc(from_deg=math.degrees(begin), to_deg=math.degrees(end)) for begin, end in self.arcs],
+            warnings=list(photograph.warnings),
+        )
 
 
 @dataclass(frozen=True)

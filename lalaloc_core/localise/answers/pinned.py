@@ -52,8 +52,7 @@ class PinnedAlbum:
     """Album of photographs that were solved together.
 
     Attributes:
-        plans: the plans.
-        plan_ids: their names in pins, which stay in the next revision.
+        plan_ids: names of the plans in pins, which stay in the next revision.
         album: the solution: pins, cameras and their height, and scale.
         photographs: every photograph that was given, also those that cannot be read.
         notes: what was left out, and warnings about all photographs.

@@ -36,13 +36,10 @@ class Turn:
 
     Attributes:
         photographs: the photographs, or the frames of `film`.
-        known: known heading of each.
-        height: camera height.
         turns: headings (radians) minus that of the first photograph, if they are known well enough for one query.
         relative: relative headings of the photographs, in groups.
         overlap: angles by overlap; None if they are stated, or for features and spheres.
         relative_headings: relative heading of each photograph as answers tell it; None where it was searched.
-        film: the film; None for photographs.
     """
 
     photographs: Sequence[Photograph]

@@ -11,8 +11,9 @@ from pydantic import ConfigDict, Field
 from lalaloc_core.answer_numbers import Degrees, Score, Share, SignedDegrees
 from lalaloc_core.localise.localisability.reports import NextStepAnswer
 from lalaloc_core.photograph import Assumed
+from lalaloc_core.photograph.cameras import Around, Camera, Fisheye
 from lalaloc_core.photograph.projection import Source
-from lalaloc_core.photograph.stated_camera import Projection
+from lalaloc_core.photograph.stated_camera import Projection, intrinsics_of
 
 
 class Document:
@@ -68,6 +69,16 @@ class CameraAnswer(Document):
             description="k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye camera: OpenCV's order."
         ),
     ]
+
+    @classmethod
+    def of(cls, camera: Camera | None) -> CameraAnswer | None:
+        """Return the camera of a photograph; None for full spheres and strips."""
+        if camera is None or isinstance(camera, Around):
+            return None
+        names = ("k1", "k2", "k3", "k4") if isinstance(camera, Fisheye) else ("k1", "k2", "p1", "p2", "k3")
+        values = vars(intrinsics_of(camera))
+        matrix = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
+        return cls(width=camera.width, height=camera.height, **matrix, distortion=[values[name] for name in names])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,22 +62,16 @@ class GridCosts:
     compared: int
 
     @classmethod
-    def of_all(
-        cls,
-        poses: PoseSet,
-        cost: Float[np.ndarray, "k n"],
-        offset: Float[np.ndarray, "k n"],
-        place_cost: Float[np.ndarray, "m"] | None = None,
-    ) -> GridCosts:
-        """Return the costs of all poses under all hypotheses, compared in full."""
+    def of_all(cls, poses: PoseSet, cost: Float[np.ndarray, "k n"]) -> GridCosts:
+        """Return the costs of all poses under all hypotheses, compared in full at the stated camera height."""
         hypothesis, pose = np.indices(cost.shape).reshape(2, -1)
         return cls(
             poses=poses,
             pose=pose,
             hypothesis=hypothesis,
             cost=cost.ravel(),
-            offset=offset.ravel(),
-            place_cost=place_cost,
+            offset=np.zeros_like(cost).ravel(),
+            place_cost=None,
             compared=cost.size,
         )
 
@@ -157,38 +151,33 @@ class WeightedPlaces:
     """Probable places of a query.
 
     Attributes:
-        pose: (m,) number of the grid pose that each place comes from.
-        heading: (m,) headings of the photograph (radians).
-        weight: (m,) probability; the sum is one.
         poses: number of grid poses.
         counted: the same places as candidates count them; None for the same.
     """
 
     query: Query
-    pose: Int[np.ndarray, "m"]
-    position: Float[np.ndarray, "m 2"]
-    heading: Float[np.ndarray, "m"]
-    weight: Float[np.ndarray, "m"]
+    support: Support
     poses: int
     counted: _SortedPlaces | None = None
 
     def posterior(self, candidates: Sequence[Candidate]) -> Posterior:
         """Return the posterior with the probabilities of candidates, the answer first."""
-        answer, weight, left, shares = candidates[0], self.weight, self.weight.copy(), []
-        places = self.counted or _SortedPlaces(self.position, self.heading, self.query)
+        support, answer, shares = self.support, candidates[0], []
+        weight, left = support.weight, support.weight.copy()
+        places = self.counted or _SortedPlaces(support.position_m, support.heading, self.query)
         for candidate in candidates:
             near = places.near(candidate, RIGHT_WITHIN_M)
             shares.append(float(left[near].sum()))
             left[near] = 0.0
-        turned = wrap_angle(self.heading - (self.query.roll[answer.hypothesis] + answer.frame_heading))
+        turned = wrap_angle(support.heading - (self.query.roll[answer.hypothesis] + answer.frame_heading))
         # A hypothesis stands for the headings up to half a sector from it.
         is_right = np.abs(turned) <= HEADING_WITHIN + 0.5 * self.query.sector
         return Posterior(
-            pose=np.bincount(self.pose, weight, minlength=self.poses),
+            pose=np.bincount(support.pose, weight, minlength=self.poses),
             position=min(float(weight[places.within(answer.position_m, RIGHT_WITHIN_M)].sum()), 1.0),
             candidate=tuple(shares),
             heading=float(weight[is_right].sum()),
-            support=Support(self.pose, self.position, self.heading, weight),
+            support=support,
         )
 
 
@@ -232,7 +221,8 @@ def weighted_places(
         counted = _ties_at_their_ends(position, heading, mode, ends, query)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return WeightedPlaces(query, pose, position, heading, weight, len(grid.poses), _SortedPlaces(*counted, query))
+    support = Support(pose, position, heading, weight)
+    return WeightedPlaces(query, support, len(grid.poses), _SortedPlaces(*counted, query))
 
 
 def _modes(

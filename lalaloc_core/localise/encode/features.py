@@ -187,11 +187,7 @@ def encodes_spheres(manifest: Manifest) -> bool:
 
 
 def read_features(content: bytes, bundle: Bundle) -> Photograph:
-    """Read features.
-
-    Returns:
-        The photograph, with `features` instead of pixels.
-    """
+    """Read the features of a photograph; return it with `features` instead of pixels."""
     version, header, body = _split(content)
     manifest = bundle.manifest
     if header.model != bundle.sha256:

@@ -23,7 +23,6 @@ class LayoutEncoder:
     """Layout encoder of one bundle, and what else searches need of it; safe to share between threads.
 
     Attributes:
-        manifest: the bundle's manifest.
         cohort: poses of other homes; None if the bundle has none.
         helper: returns threads that take over a part of a query, or None if no core is idle.
     """

@@ -28,13 +28,7 @@ from lalaloc_core.photograph.patches import joined_patches
 
 
 class PhotographEncoder:
-    """Networks of one bundle for photographs and for the layouts that they are compared with; safe to share.
-
-    Attributes:
-        manifest: the bundle's manifest.
-        layouts: encoder of layouts, and what searches need beside it.
-        spheres: encoder of full spheres.
-    """
+    """Networks of one bundle for photographs and for the layouts that they are compared with; safe to share."""
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
         """Load the networks.

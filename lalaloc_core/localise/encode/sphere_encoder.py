@@ -83,7 +83,9 @@ class SphereEncoder:
         if self._head is not None:
             # Rolling the ring rotates the camera, so the image is encoded once for all hypotheses.
             outputs = self.outputs(frame, camera_height.height_m)
-            return self._query(outputs, heading, camera_height, heading_tolerance, roll, rest)
+            return self.query_of_outputs(
+                outputs, heading, camera_height, heading_tolerance=heading_tolerance, roll=roll, rest=rest
+            )
         count, width = _HEADINGS_WITHOUT_RING, image.shape[1]
 
         def hypotheses(shifts: Int[np.ndarray, "k"]) -> Query:
@@ -100,13 +102,28 @@ class SphereEncoder:
         camera_height: CameraHeight,
         *,
         heading_tolerance: float = 0.0,
+        roll: float = 0.0,
+        rest: float | None = None,
     ) -> Query:
-        """Return the query of a sphere that was encoded without a heading, by the outputs of the network.
+        """Return the query of a sphere by the outputs of the network, which are for the given camera height.
 
-        `outputs` are for the given camera height. The other arguments are as for `query`. A heading is undone by whole
-        sectors instead of pixels.
+        The ring and the predictions are rolled to the right for each hypothesis. `roll` is the angle (radians) that the
+        picture was rolled by, which left a `rest` of its heading; without, a heading is undone by whole sectors instead
+        of pixels. The other arguments are as for `query`.
         """
-        return self._query(outputs, heading, camera_height, heading_tolerance)
+        head, sectors = self._head, self._manifest.ring_sectors
+        assert head is not None
+
+        def hypotheses(shifts: Int[np.ndarray, "k"]) -> Query:
+            ring = np.ascontiguousarray(rolled(outputs["ring"].T, shifts).transpose(0, 2, 1))
+            latents = as_array(head.run(["latent"], {"ring": ring})[0])
+            predictions = {}
+            if self.predicts_profile:
+                columns = shifts * (len(outputs["log_profile"]) // sectors)
+                predictions = turned_predictions(outputs, columns, self._manifest)
+            return Query(latents, roll + shifts * (TWO_PI / sectors), 0.0, False, camera_height, **predictions)
+
+        return query_of_hypotheses(hypotheses, sectors, heading, heading_tolerance, rest)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
@@ -163,33 +180,6 @@ class SphereEncoder:
         mirrored = helper.submit(self.run, both[1:], camera_height_m, outputs)
         own = self.run(both[:1], camera_height_m, outputs)
         return [np.concatenate(pair) for pair in zip(own, mirrored.result(), strict=True)]
-
-    def _query(
-        self,
-        outputs: Mapping[str, np.ndarray],
-        heading: float | None,
-        camera_height: CameraHeight,
-        tolerance: float,
-        roll: float = 0.0,
-        rest: float | None = None,
-    ) -> Query:
-        """Return the query by the outputs for a picture that was rolled by an angle, which left a rest of its heading.
-
-        The ring and the predictions are rolled to the right for each hypothesis.
-        """
-        head, sectors = self._head, self._manifest.ring_sectors
-        assert head is not None
-
-        def hypotheses(shifts: Int[np.ndarray, "k"]) -> Query:
-            ring = np.ascontiguousarray(rolled(outputs["ring"].T, shifts).transpose(0, 2, 1))
-            latents = as_array(head.run(["latent"], {"ring": ring})[0])
-            predictions = {}
-            if self.predicts_profile:
-                columns = shifts * (len(outputs["log_profile"]) // sectors)
-                predictions = turned_predictions(outputs, columns, self._manifest)
-            return Query(latents, roll + shifts * (TWO_PI / sectors), 0.0, False, camera_height, **predictions)
-
-        return query_of_hypotheses(hypotheses, sectors, heading, tolerance, rest)
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:

@@ -257,13 +257,8 @@ class _Photographs:
         for door in self._doors():
             told = self._through(door)
             if told is not None:
-                yield NextStep(
-                    kind="door",
-                    bits=told.bits,
-                    confidence=self._known.fit * told.share,
-                    turn=door.turn,
-                    distance_m=door.distance_m,
-                )
+                confidence = self._known.fit * told.share
+                yield NextStep(kind="door", bits=told.bits, confidence=confidence, **door._asdict())
 
     def _through(self, door: _Door) -> _Told | None:
         """Return the expectation of a photograph from behind a door; None if few places have that door."""

@@ -91,7 +91,9 @@ def _advice_of(plan: FloorPlan, found: Localisability) -> list[str]:
         )
     for pair in found.confused[:_PAIRS]:
         first, second = (f"'{plan.rooms[index].name}'" for index in pair.rooms)
-        lines.append(f"{first} and {second} are confused: {_percent(pair.share)} ({_words(pair.condition)})")
+        photograph, heading = parts_of(pair.condition)
+        condition = f"{_TITLES[photograph]}, heading {heading}"
+        lines.append(f"{first} and {second} are confused: {_percent(pair.share)} ({condition})")
     gains = [(gain, name) for name, gain in found.gains.items() if gain is not None and name != "doors"]
     for gain, name in sorted(gains, reverse=True):
         if gain >= _WORTH:
@@ -114,11 +116,6 @@ def _rows(values: Mapping[Condition, Any]) -> list[dict[str, float] | None]:
         else {name: round(value, 3) for name, value in zip(CONDITIONS, row, strict=True)}
         for row in columns
     ]
-
-
-def _words(condition: Condition) -> str:
-    photograph, heading = parts_of(condition)
-    return f"{_TITLES[photograph]}, heading {heading}"
 
 
 def _percent(share: float) -> str:
@@ -152,25 +149,8 @@ class NextStepAnswer:
     expected_confidence: Annotated[Share, Field(description="Expected `confidence` after the step.")]
 
 
-def step_after(
-    plan: FloorPlan,
-    manifest: Manifest,
-    found: Localisation,
-    confidence: Confidence | None,
-    *,
-    arcs: Sequence[tuple[float, float]],
-    field: float,
-    step_m: float,
-    rooms_known: bool = False,
-) -> NextStepAnswer | None:
-    """Return the next step after an answer; None without a confidence, or a step.
-
-    `arcs` are azimuths (radians) that were seen, relative to the photograph's centre; `field` is its horizontal field
-    of view (radians).
-    """
-    if confidence is None:
-        return None
-    known = known_of(found, confidence, arcs=arcs, field=field, rooms_known=rooms_known)
+def step_after(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: float) -> NextStepAnswer | None:
+    """Return the next step after an answer, by the facts about it; None without a step."""
     step = next_step(plan, manifest, known, step_m=step_m)
     if step is None:
         return None
@@ -193,7 +173,11 @@ def known_of(
     field: float,
     rooms_known: bool = False,
 ) -> Known:
-    """Return the facts about an answer that steps are computed from; see `step_after`."""
+    """Return the facts about an answer that steps are computed from.
+
+    `arcs` are azimuths (radians) that were seen, relative to the photograph's centre; `field` is its horizontal field
+    of view (radians).
+    """
     is_view = found.query.is_view
     return Known(
         support=found.posterior.support,

@@ -154,10 +154,10 @@ class MatchingCost:
         self._plan, self._query, self._reach_m = plan, query, reach_m
         self._weights, self._config, self._stride = weights, config, stride
         first, rival = query.profile, query.profile.rival
-        self._first = WallMode.of(first.log_m, first.log_scale, np.ones((1, 1)), reach_m, weights.tail, stride)
-        self._rival = None
-        if rival is not None:
-            self._rival = WallMode.of(rival.log_m, rival.log_scale, rival.odds, reach_m, weights.tail, stride)
+        modes = [(first.log_m, first.log_scale, np.ones((1, 1)))]
+        modes += [] if rival is None else [(rival.log_m, rival.log_scale, rival.odds)]
+        self._modes = [WallMode.of(*mode, reach_m, weights.tail, stride) for mode in modes]
+        self._first = self._modes[0]
 
     def costs(
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
@@ -215,14 +215,12 @@ class MatchingCost:
     ) -> tuple[Float[np.ndarray, "n w"], Float[np.ndarray, "n w"]]:
         """Return centre and precision, by azimuth, of the predicted mode that each pose's own wall fits better."""
         centre, precision = self._first.centre[hypothesis], self._first.precision[hypothesis]
-        if self._rival is None:
-            return centre, precision
         log_m = layouts.log_profile - offset[:, None].astype(np.float32)
-        is_rival = self._rival.likelihood(log_m, hypothesis) > self._first.likelihood(log_m, hypothesis)
-        return (
-            np.where(is_rival, self._rival.centre[hypothesis], centre),
-            np.where(is_rival, self._rival.precision[hypothesis], precision),
-        )
+        for rival in self._modes[1:]:
+            is_rival = rival.likelihood(log_m, hypothesis) > self._first.likelihood(log_m, hypothesis)
+            centre = np.where(is_rival, rival.centre[hypothesis], centre)
+            precision = np.where(is_rival, rival.precision[hypothesis], precision)
+        return centre, precision
 
     @property
     def hypotheses(self) -> int:
@@ -249,9 +247,8 @@ class MatchingCost:
 
     def predicted_modes(self, columns: Int[np.ndarray, "a"]) -> Float[np.ndarray, "k a v"]:
         """Return the predictions of walls at some azimuths: centre, precision and odds of each mode."""
-        modes = [self._first] if self._rival is None else [self._first, self._rival]
         shape = self._first.centre[:, columns].shape
-        values = [np.broadcast_to(part, self._first.centre.shape)[:, columns] for mode in modes for part in mode]
+        values = [np.broadcast_to(part, self._first.centre.shape)[:, columns] for mode in self._modes for part in mode]
         return np.stack(values, axis=2).reshape(*shape, -1)
 
     @property
@@ -266,8 +263,7 @@ class MatchingCost:
 
     def _likelihood(self, log_m: Float[np.ndarray, "n"], place: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Return the likelihood of walls at places (hypothesis, column), over that of the first mode's centre."""
-        likelihood = self._first.likelihood(log_m, place)
-        return likelihood if self._rival is None else likelihood + self._rival.likelihood(log_m, place)
+        return np.add.reduce([mode.likelihood(log_m, place) for mode in self._modes])
 
     def _gathered(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Gathered:
         """Gather the layouts of some poses."""
@@ -351,7 +347,7 @@ class MatchingCost:
     @cached_property
     def _seen_walls(self) -> SeenWalls:
         """Predicted walls at the columns that count."""
-        return SeenWalls.of([self._first] if self._rival is None else [self._first, self._rival])
+        return SeenWalls.of(self._modes)
 
     @cached_property
     def _opening_losses(self) -> Float[np.ndarray, "t k w c"] | None:

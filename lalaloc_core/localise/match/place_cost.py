@@ -24,6 +24,7 @@ between two hypotheses. Photographs of one spot see the same walls, so the mean 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,17 +61,12 @@ class PlaceCost:
 
     Attributes:
         hint: (n,) cost of the hints; infinite where strict ones exclude a pose.
-        row: (n,) numbers of the poses' rows in `fixtures`.
-        fixtures: (f, k) cost of the fixtures, or (f, 1) where it does not depend on the heading.
-        room: (n,) numbers of the poses' rows in `directions`.
-        directions: (r, k) cost of the directions of the walls, or (r, 1) as well.
+        parts: costs of the fixtures and of the directions of the walls that tell anything, (r, k) or, where they do not
+            depend on the heading, (r, 1), each with the (n,) numbers of the poses' rows in it.
     """
 
     hint: Float[np.ndarray, "n"]
-    row: Int[np.ndarray, "n"]
-    fixtures: Float[np.ndarray, "f #k"]
-    room: Int[np.ndarray, "n"]
-    directions: Float[np.ndarray, "r #k"]
+    parts: Sequence[tuple[Float[np.ndarray, "_ #k"], Int[np.ndarray, "n"]]]
 
     @classmethod
     def of(
@@ -87,34 +83,33 @@ class PlaceCost:
         told = [each for each in query.wall_directions if math.degrees(each.sd) < _MAX_DIRECTION_SD]
         if hints.are_none and not seen and not told:
             return None
-        hint = np.zeros(len(position_m))
+        hint, parts = np.zeros(len(position_m)), []
         if not hints.are_none:
             hint = hints.penalty(plan, position_m, room_index) / temperature
-        row, fixtures = _fixture_costs(plan, query, seen, position_m, room_index)
-        room, directions = np.zeros(len(position_m), np.intp), np.zeros((1, 1), np.float32)
+        if seen:
+            parts.append(_fixture_costs(plan, query, seen, position_m, room_index))
         if told:
             # Candidates are in few rooms of a plan that can have thousands.
             rooms, room = np.unique(room_index, return_inverse=True)
-            directions = _direction_costs(plan.wall_directions[rooms], query, told)
-        return cls(hint, row, fixtures / temperature, room, directions / temperature)
+            parts.append((_direction_costs(plan.wall_directions[rooms], query, told), room))
+        return cls(hint, [(cost / temperature, row) for cost, row in parts])
 
     def lowest(self, pose: Int[np.ndarray, "m"], neighbours: int) -> Float[np.ndarray, "m #l"]:
         """Return lower bounds of the cost of some poses under each so many neighbouring hypotheses."""
-        fixtures, directions = (
-            np.minimum.reduceat(cost, np.arange(0, cost.shape[1], neighbours), axis=1)
-            for cost in (self.fixtures, self.directions)
-        )
-        return self.hint[pose, None] + fixtures[self.row[pose]] + directions[self.room[pose]]
+        lowest = self.hint[pose, None]
+        for cost, row in self.parts:
+            part = np.minimum.reduceat(cost, np.arange(0, cost.shape[1], neighbours), axis=1)
+            lowest = lowest + part[row[pose]]
+        return lowest
 
     def of_poses(self, pose: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m #k"]:
         """Return the cost of some poses under every hypothesis, (m, 1) where it does not depend on that."""
-        return self.hint[pose, None] + self.fixtures[self.row[pose]] + self.directions[self.room[pose]]
+        return sum((cost[row[pose]] for cost, row in self.parts), self.hint[pose, None])
 
     def of_pairs(self, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
         """Return the cost of some pairs of a pose and a hypothesis."""
-        parts = ((self.fixtures, self.row[pose]), (self.directions, self.room[pose]))
         return self.hint[pose] + sum(
-            cost[row, hypothesis if cost.shape[1] > 1 else np.zeros_like(hypothesis)] for cost, row in parts
+            cost[row[pose], hypothesis if cost.shape[1] > 1 else np.zeros_like(hypothesis)] for cost, row in self.parts
         )
 
 
@@ -139,14 +134,12 @@ def _fixture_costs(
     seen: list[SeenObject],
     position_m: Float[np.ndarray, "n 2"],
     room_index: Int[np.ndarray, "n"],
-) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "f #k"]]:
+) -> tuple[Float[np.ndarray, "f k"], Int[np.ndarray, "n"]]:
     """Return the negative log likelihood (nats, at least 0) of rows, and the number of each pose's row.
 
     Poses in rooms without any of the fixtures share row 0.
     """
-    row, nothing = np.zeros(len(position_m), np.intp), np.zeros((1, 1), np.float32)
-    if not seen:
-        return row, nothing
+    row = np.zeros(len(position_m), np.intp)
     rooms = np.concatenate([plan.fixtures_by_kind[each.name].room_index for each in seen])
     beside = np.flatnonzero(np.isin(room_index, rooms))
     row[beside] = 1 + np.arange(len(beside))
@@ -157,7 +150,7 @@ def _fixture_costs(
         agreement[1:] = _agreement(places, query, each, position_m[beside], room_index[beside])
         # At least 0, by the highest density there is, so that costs of poses that are compared later are comparable.
         cost += _log_factor(share, _FIELD / (math.sqrt(2.0 * math.pi) * _AZIMUTH_SD)) - _log_factor(share, agreement)
-    return row, cost
+    return cost, row
 
 
 def _log_factor(share: float, agreement: float | Float[np.ndarray, "f k"]) -> float | Float[np.ndarray, "f k"]:

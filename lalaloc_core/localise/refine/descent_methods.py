@@ -50,15 +50,9 @@ def refined_by_walls(job: RefinementJob) -> bool:
 def refine_walls(
     job: RefinementJob, config: LpoConfig | None = None, *, wanted: Callable[[], bool] = lambda: True
 ) -> RefinementResult | None:
-    """Refine every starting pose of a job within its own room by its predicted wall profile.
+    """Refine every starting pose of a job within its own room by its predicted wall profile; latents are not used.
 
-    Args:
-        job: the job, with `log_profile` and `precision`; its latents are not used.
-        config: settings of the optimiser.
-        wanted: asked before each iteration whether the result is still wanted.
-
-    Returns:
-        The result without latent distances; None if it was not wanted any more.
+    The result is without latent distances; None if it is not `wanted` any more, asked before each iteration.
     """
     assert job.log_profile is not None
     by_profile = replace(job, targets=job.log_profile)

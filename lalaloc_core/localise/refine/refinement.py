@@ -11,7 +11,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.floorplan import FloorPlan
@@ -139,23 +139,6 @@ def _put_back(starts: list[Candidate], result: RefinementResult, excluded: Bool[
     return replace(result, **back)
 
 
-def latent_distances_at(
-    plan: FloorPlan,
-    encoder: LayoutEncoder,
-    query: Query,
-    poses: PoseSet,
-    heading: Float[np.ndarray, "k"],
-    hypotheses: list[int],
-    camera_height_m: float,
-) -> Float[np.ndarray, "k"]:
-    """Return the distances of the latents at poses to those of the query's hypotheses."""
-    if not query.latents.any():
-        # Views have no latents, and those of layouts are of unit length.
-        return np.ones(len(poses))
-    latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
-    return np.linalg.norm(latents - query.latents[hypotheses], axis=1)
-
-
 def with_latents(
     plan: FloorPlan, encoder: LayoutEncoder, query: Query, candidates: list[Candidate], camera_height_m: float
 ) -> list[Candidate]:
@@ -170,14 +153,14 @@ def with_latents(
     ]
     if not moved:
         return candidates
-    poses = PoseSet(
-        np.stack([candidates[k].position_m for k in moved]), np.array([candidates[k].room_index for k in moved])
-    )
-    heading, hypotheses = (
-        np.array([candidates[k].frame_heading for k in moved]),
-        [candidates[k].hypothesis for k in moved],
-    )
-    distance = latent_distances_at(plan, encoder, query, poses, heading, hypotheses, camera_height_m)
+    # Views have no latents, and those of layouts are of unit length.
+    distance, chosen = np.ones(len(moved)), [candidates[k] for k in moved]
+    if query.latents.any():
+        rooms = np.array([candidate.room_index for candidate in chosen])
+        poses = PoseSet(np.stack([candidate.position_m for candidate in chosen]), rooms)
+        heading = np.array([candidate.frame_heading for candidate in chosen])
+        latents, _ = encoder.poses(plan, poses, heading, camera_height_m)
+        distance = np.linalg.norm(latents - query.latents[[candidate.hypothesis for candidate in chosen]], axis=1)
     completed = list(candidates)
     for row, k in enumerate(moved):
         completed[k] = replace(candidates[k], latent_distance=float(distance[row]))

@@ -127,14 +127,8 @@ class Localisation:
 
         `share` is the probability that the place is among those that were searched.
         """
-        return confidence_of(
-            model,
-            self.stage,
-            self.signals[self.stage],
-            self.posterior,
-            heading_known=self.query.heading_known,
-            share=share,
-        )
+        signals, known = self.signals[self.stage], self.query.heading_known
+        return confidence_of(model, self.stage, signals, self.posterior, heading_known=known, share=share)
 
 
 Steps = Generator[RefinementJob, RefinementResult | None, Localisation]

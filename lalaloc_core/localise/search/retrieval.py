@@ -64,10 +64,9 @@ def grid_costs(
     """
     place_cost = _place_cost(plan, grid, query, weights, hints)
     if not config.compares_profiles(query):
-        distance = latent_distances(grid.known_latents, query.latents)
-        hypothesis, pose = np.indices(distance.shape).reshape(2, -1)
-        places = None if place_cost is None else place_cost.of_pairs(pose, hypothesis)
-        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), places)
+        costs = GridCosts.of_all(grid.poses, latent_distances(grid.known_latents, query.latents))
+        places = None if place_cost is None else place_cost.of_pairs(costs.pose, costs.hypothesis)
+        return replace(costs, place_cost=places)
     matching_cost = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
     relaxed = _place_cost(plan, grid, query, weights, hints.relaxed) if hints.strict else None
     temperature = weights.temperature

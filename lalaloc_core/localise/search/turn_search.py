@@ -100,51 +100,33 @@ def searched_turn(
     matching: MatchingConfig,
 ) -> Generator[None, Any, SearchedTurn]:
     """Search the relative headings of photographs of one spot; yields None where the search can pause."""
-    costs = [_GridCost(plan, grid, encoder, query, matching) for query in queries]
-    pairs = _MAX_PAIRS // sum(len(query.roll) for query in queries)
-    index, most = np.arange(len(grid.poses)), max(min(_MAX_PLACES, pairs), 1)
-    if len(index) > most:
-        total = np.zeros(len(index))
-        for cost in costs:
-            total += cost.log_likelihood(index, stride=_STRIDE).max(axis=1)
-            yield None
-        index = np.sort(np.argpartition(-total, most)[:most])
-    seen = []
-    for cost in costs:
-        seen.append(cost.log_likelihood(index))
-        yield None
-    return _most_probable(
-        seen, [cost.heading for cost in costs], relative, area_shares(grid.poses, plan.areas_m2)[index]
-    )
 
-
-@dataclass(frozen=True, eq=False)
-class _GridCost:
-    """Cost of a plan's grid for one photograph."""
-
-    plan: FloorPlan
-    grid: PoseGrid
-    encoder: LayoutEncoder
-    query: Query
-    matching: MatchingConfig
-
-    @property
-    def heading(self) -> Float[np.ndarray, "k"]:
-        """Heading (radians) of the photograph under each hypothesis."""
-        return self.query.roll + self.query.frame_heading
-
-    def log_likelihood(self, index: np.ndarray, stride: int = 1) -> Float[np.ndarray, "p k"]:
+    def log_likelihood(query: Query, index: np.ndarray, stride: int = 1) -> Float[np.ndarray, "p k"]:
         """Return the log likelihood of some poses under each hypothesis, by every so many azimuths."""
-        plan, grid, query = self.plan, self.grid, self.query
-        weights = self.encoder.manifest.evidence_for(view=query.is_view)
-        if self.matching.compares_profiles(query):
-            layouts, reach_m = grid.layouts(plan).rows(index), self.matching.grid_reach * grid.step_m
-            cost, _ = MatchingCost(plan, query, reach_m, weights, self.matching, stride=stride).costs(layouts)
+        weights = encoder.manifest.evidence_for(view=query.is_view)
+        if matching.compares_profiles(query):
+            layouts, reach_m = grid.layouts(plan).rows(index), matching.grid_reach * grid.step_m
+            cost, _ = MatchingCost(plan, query, reach_m, weights, matching, stride=stride).costs(layouts)
         else:
             cost = latent_distances(grid.known_latents[index], query.latents)
         found = -weights.temperature * cost.T.astype(np.float64)
         places = PlaceCost.of(plan, query, NO_HINTS, 1.0, grid.poses.position_m[index], grid.poses.room_index[index])
         return found if places is None else found - places.of_poses(np.arange(len(index)))
+
+    pairs = _MAX_PAIRS // sum(len(query.roll) for query in queries)
+    index, most = np.arange(len(grid.poses)), max(min(_MAX_PLACES, pairs), 1)
+    if len(index) > most:
+        total = np.zeros(len(index))
+        for query in queries:
+            total += log_likelihood(query, index, stride=_STRIDE).max(axis=1)
+            yield None
+        index = np.sort(np.argpartition(-total, most)[:most])
+    seen = []
+    for query in queries:
+        seen.append(log_likelihood(query, index))
+        yield None
+    heading = [query.roll + query.frame_heading for query in queries]
+    return _most_probable(seen, heading, relative, area_shares(grid.poses, plan.areas_m2)[index])
 
 
 def _most_probable(

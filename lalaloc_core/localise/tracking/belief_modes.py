@@ -17,6 +17,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import (
     HEADING_SEPARATION,
     Posterior,
+    Support,
     WeightedPlaces,
     distinct,
     photograph_heading,
@@ -156,8 +157,8 @@ class ComparedStates:
             heading[own] = photograph_heading(self.query, end)
         order = np.argsort(-mass, kind="stable")
         candidates = distinct([ends[index] for index in order], self.query, self.separation_m, top_k)
-        places = WeightedPlaces(self.query, self.pose, position, heading, self.weight, len(self.grid.poses))
-        return candidates, places.posterior(candidates)
+        support = Support(self.pose, position, heading, self.weight)
+        return candidates, WeightedPlaces(self.query, support, len(self.grid.poses)).posterior(candidates)
 
     def _of_mode(self, mode: Candidate) -> Bool[np.ndarray, "m"]:
         """Return which states belong to a mode."""

@@ -22,7 +22,7 @@ MAX_STATES = 4096
 # Probability, before the first photograph, that the camera is in the plan.
 _IN_PLAN = 0.9
 # Recent photographs of which contradicted motions are remembered.
-RECENT = 8
+_RECENT = 8
 # Version 1 was of one plan, and ended with a path.
 _MAGIC, _VERSIONS, _HEADER = b"LTRK", (1, 2), struct.Struct("<4sHI")
 _MAX_BYTES = 2**20
@@ -127,6 +127,14 @@ class TrackState:
     def suspected(self) -> tuple[Component, ...]:
         """Components of the motions that at least three of the recent photographs contradict."""
         return tuple(name for name, bits in zip(COMPONENTS, self.contradicted, strict=True) if bits.bit_count() >= 3)
+
+    def judged(self, missed: tuple[Component, ...]) -> TrackState:
+        """Return the state after a photograph that contradicts some components of its motion."""
+        mask = (1 << _RECENT) - 1
+        first, second, third = (
+            ((bits << 1) | (name in missed)) & mask for name, bits in zip(COMPONENTS, self.contradicted, strict=True)
+        )
+        return replace(self, contradicted=(first, second, third))
 
     def to_bytes(self) -> bytes:
         """Return the state as bytes, at most about 100 kB."""

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csr_array
 
 from lalaloc_core.errors import InvalidStateError
-from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.tracking.track_state import StatePlan, TrackedPose, TrackState
@@ -63,12 +63,9 @@ class Passages:
     def between(
         cls, plans: Sequence[PlanOnLevel], levels: Sequence[float], room_index: Int[np.ndarray, "n"]
     ) -> Passages:
-        """Find the passages between plans.
+        """Find the passages between plans, given the room of each pose, numbered through all plans.
 
-        Args:
-            plans: the plans.
-            levels: levels of the building; those of further plans count.
-            room_index: room of each pose, numbered through all plans.
+        `levels` are those of the building; those of further plans count.
         """
         first = np.cumsum([0, *(len(entry.plan.rooms) for entry in plans)])
         found = [(number, *shaft) for number, entry in enumerate(plans) for shaft in _shafts(entry.plan)]
@@ -122,12 +119,8 @@ def _passed_on(mass: Float[np.ndarray, "a"], leads_to: Bool[np.ndarray, "a a"]) 
 
 def _shafts(plan: FloorPlan) -> list[tuple[int, bool]]:
     """Return the number of each room that is stairs or a lift, and whether it is a lift."""
-    found = [(number, _is_lift(room)) for number, room in enumerate(plan.rooms)]
-    return [(number, lift) for number, lift in found if lift or "stairs" in plan.rooms[number].types]
-
-
-def _is_lift(room: Room) -> bool:
-    return not _LIFTS.isdisjoint(re.findall(r"\w+", room.name.casefold()))
+    lifts = [not _LIFTS.isdisjoint(re.findall(r"\w+", room.name.casefold())) for room in plan.rooms]
+    return [(number, lift) for number, lift in enumerate(lifts) if lift or "stairs" in plan.rooms[number].types]
 
 
 def _distances_m(
@@ -193,16 +186,7 @@ class TrackedPlans:
         levels: Sequence[float],
         left_out: LeftOut | None = None,
     ) -> TrackedPlans:
-        """Return several plans.
-
-        Args:
-            merged: the plans side by side.
-            plans: the same plans with their levels.
-            graphs: links of their grids.
-            keys: their keys.
-            levels: levels of the building; those of further plans count.
-            left_out: plans that are not searched.
-        """
+        """Return several plans, side by side and with their levels; `levels` are as in `Passages.between`."""
         passages = Passages.between(plans, levels, merged.grid.poses.room_index)
         return cls(merged, WalkGraph.joined(graphs), tuple(keys), passages, left_out)
 

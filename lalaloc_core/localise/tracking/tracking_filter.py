@@ -41,15 +41,7 @@ from lalaloc_core.localise.tracking.belief_modes import (
     measured_pose,
     sector_of,
 )
-from lalaloc_core.localise.tracking.track_state import (
-    COMPONENTS,
-    MAX_STATES,
-    RECENT,
-    Component,
-    Mode,
-    TrackedPose,
-    TrackState,
-)
+from lalaloc_core.localise.tracking.track_state import MAX_STATES, Component, Mode, TrackedPose, TrackState
 from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans
 from lalaloc_core.localise.tracking.walk_motion import Odometry, States
 
@@ -111,17 +103,8 @@ def track_steps(
 ) -> TrackSteps:
     """Follow a camera to its next photograph; yield LPO jobs, as `pipeline.localise_steps` does.
 
-    Args:
-        plans: the plans that the camera can be in.
-        encoder: the networks.
-        state: state after the photographs before.
-        query: the photograph, encoded with an unknown heading.
-        odometry: motion since the photograph before; None if it is unknown.
-        known_heading: heading of the photograph with its largest error; None if it is unknown.
-        hints: the prior of the first photograph, in the frame of all plans.
-        top_k: number of candidates.
-        config: settings of the search.
-        clock: times the stages.
+    `state` is that after the photographs before, and `odometry` the motion since the last of them, if it is known. The
+    query has an unknown heading. `hints` are the prior of the first photograph, in the frame of all plans.
 
     Raises:
         InvalidStateError: the state is of another grid or model.
@@ -137,20 +120,24 @@ def track_steps(
     starts = compared.modes()
     with clock.stage("lpo"):
         result = yield photograph.lpo_job(starts)
-        modes = photograph.refine(compared, starts, result)
+        refined, ends = photograph.refine(compared, starts, result)
+    stage: SearchStage = "retrieval" if result is None else "lpo"
     with clock.stage("rank"):
-        compared = compared.regained(starts, modes.refined)
-        answer = photograph.rank(compared, modes, grid_cost, top_k)
-    in_plan = _in_plan(state.in_plan, answer.fit)
-    probability = in_plan * answer.posterior.position
-    mode = _mode(in_plan, probability)
-    best, own_plan = answer.candidates[0], plans.merged.plan_of(answer.candidates[0].room_index)
+        compared = compared.regained(starts, refined)
+        (best, *others), posterior = compared.ranked(starts, ends, top_k)
+        (best,) = with_latents(plans.plan, encoder, query, [best], plans.grid.camera_height_m)
+        fit = photograph.fit(best, posterior, stage, grid_cost)
+    in_plan = _in_plan(state.in_plan, fit)
+    probability = in_plan * posterior.position
+    mode, own_plan = _mode(in_plan, probability), plans.merged.plan_of(best.room_index)
     sure = everything.share_alone(best) >= _SURE
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
     measured = measured_pose(plans.plan, encoder, query, best)
-    motion = _follow(before, odometry, measured, mode, sure=sure, is_refined=best.information is not None)
-    (x_m, y_m, heading), covariance = motion.pose
+    is_refined = best.information is not None
+    ((x_m, y_m, heading), covariance), missed = _follow(
+        before, odometry, measured, mode, sure=sure, is_refined=is_refined
+    )
     pose = TrackedPose(
         float(x_m),
         float(y_m),
@@ -163,11 +150,14 @@ def track_steps(
         sure,
         own_plan,
     )
-    after = plans.left(_state_after(state, compared, in_plan, pose, motion))
+    most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
+    belief = States(compared.pose[most], compared.sector[most], compared.weight[most])
+    state = state if missed is None else state.judged(missed)
+    after = plans.left(replace(state, belief=belief, in_plan=in_plan, number=pose.number, pose=pose))
     assert after.pose is not None
     pose = replace(after.pose, plan=own_plan)
-    shares = tuple(in_plan * share for share in answer.posterior.candidate)
-    return Tracked(after, pose, query, answer.candidates, shares, answer.fit, motion.missed, modes.stage)
+    shares = tuple(in_plan * share for share in posterior.candidate)
+    return Tracked(after, pose, query, [best, *others], shares, fit, missed or (), stage)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,25 +196,6 @@ def _predict(
     factor = np.exp(-0.5 * np.square(beyond))
     factor = (1.0 - _HEADING_DOUBT) * factor / factor.mean() + _HEADING_DOUBT
     return _Prediction(belief * factor, prior * factor, anywhere)
-
-
-@dataclass(frozen=True, eq=False)
-class _Modes:
-    """Modes of the belief: after LPO, followed where the photograph is no outlier; and the last stage that ran."""
-
-    starts: list[Candidate]
-    refined: list[Candidate]
-    ends: list[Candidate]
-    stage: SearchStage
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """The best poses, the answer first, their posterior, and the probability that the photograph is of the plan."""
-
-    candidates: list[Candidate]
-    posterior: Posterior
-    fit: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,27 +258,27 @@ class _Photograph:
         camera_height_m, matching = self.plans.grid.camera_height_m, self.config.matching
         return refinement_job(self.plans.plan, self.query, starts, camera_height_m, self._weights, matching)
 
-    def refine(self, compared: ComparedStates, starts: list[Candidate], result: RefinementResult | None) -> _Modes:
-        """Return the modes after LPO; the same without a result."""
+    def refine(
+        self, compared: ComparedStates, starts: list[Candidate], result: RefinementResult | None
+    ) -> tuple[list[Candidate], list[Candidate]]:
+        """Return the modes after LPO, and the same left at their starts where the photograph is an outlier."""
         if result is None:
-            return _Modes(starts, starts, starts, "retrieval")
+            return starts, starts
         refined = refined_candidates(self.plans.plan, self.encoder, self.query, starts, result, self.config.matching)
         # The photograph is rather an outlier at modes that fit worse than this.
         followed = compared.relative_likelihood(refined) >= 2.0 * compared.outlier
-        ends = [end if follow else start for start, end, follow in zip(starts, refined, followed, strict=True)]
-        return _Modes(starts, refined, ends, "lpo")
+        return refined, [end if follow else start for start, end, follow in zip(starts, refined, followed, strict=True)]
 
-    def rank(self, compared: ComparedStates, modes: _Modes, grid_cost: float, top_k: int) -> _Answer:
-        """Return the modes by falling probability, and how well the photograph fits the plan at the first one."""
-        encoder, query, plan, grid = self.encoder, self.query, self.plans.plan, self.plans.grid
-        candidates, posterior = compared.ranked(modes.starts, modes.ends, top_k)
-        candidates = with_latents(plan, encoder, query, candidates[:1], grid.camera_height_m) + candidates[1:]
-        matching, room = self.config.matching, candidates[0].room_index
-        by_chance = cost_by_chance(encoder.cohort, plan, query, self._reach_m, self._weights, matching, room=room)
-        signals = signals_of(query, candidates[0], posterior, grid_cost, by_chance)
+    def fit(self, answer: Candidate, posterior: Posterior, stage: SearchStage, grid_cost: float) -> float | None:
+        """Return the probability that the photograph is of the plan; None without a model."""
+        encoder, query, plan, matching = self.encoder, self.query, self.plans.plan, self.config.matching
+        by_chance = cost_by_chance(
+            encoder.cohort, plan, query, self._reach_m, self._weights, matching, room=answer.room_index
+        )
+        signals = signals_of(query, answer, posterior, grid_cost, by_chance)
         model = encoder.manifest.confidence_for(view=query.is_view)
-        confidence = confidence_of(model, modes.stage, signals, posterior, heading_known=False)
-        return _Answer(candidates, posterior, None if confidence is None else confidence.fit)
+        confidence = confidence_of(model, stage, signals, posterior, heading_known=False)
+        return None if confidence is None else confidence.fit
 
 
 def _elsewhere(
@@ -339,15 +310,6 @@ def _mode(in_plan: float, probability: float) -> Mode:
     return "tracking" if probability >= _TRACKING_FROM else "searching"
 
 
-@dataclass(frozen=True, eq=False)
-class _Followed:
-    """Pose after a motion, the components of it that the photograph contradicts, and whether it counts for these."""
-
-    pose: Gaussian
-    missed: tuple[Component, ...]
-    counts: bool
-
-
 def _follow(
     before: TrackedPose | None,
     odometry: Odometry | None,
@@ -356,10 +318,13 @@ def _follow(
     *,
     sure: bool,
     is_refined: bool,
-) -> _Followed:
-    """Fuse the measured pose with the one that odometry predicts, unless they contradict each other."""
+) -> tuple[Gaussian, tuple[Component, ...] | None]:
+    """Fuse the measured pose with the one that odometry predicts, unless they contradict each other.
+
+    Returns the pose, and the components of the motion that the photograph contradicts; None if it does not judge them.
+    """
     if before is None or odometry is None:
-        return _Followed(measured, (), counts=False)
+        return measured, None
     predicted = carried_on(before, odometry)
     tracking = before.mode == mode == "tracking"
     # Wrong odometry keeps the belief from settling, so photographs that are sure by themselves judge it as well.
@@ -367,27 +332,4 @@ def _follow(
     differing = contradicted(before, predicted, measured) if comparable else ()
     # A camera that was carried elsewhere is where the photograph says.
     pose = fused(predicted, measured) if tracking and not differing else measured
-    judged = comparable and is_refined
-    return _Followed(pose, differing if judged else (), judged)
-
-
-def _state_after(
-    state: TrackState, compared: ComparedStates, in_plan: float, pose: TrackedPose, motion: _Followed
-) -> TrackState:
-    """Return the state for the next photograph."""
-    most = np.argsort(-compared.weight, kind="stable")[:MAX_STATES]
-    bits = state.contradicted
-    if motion.counts:
-        mask = (1 << RECENT) - 1
-        first, second, third = (
-            ((old << 1) | (name in motion.missed)) & mask for name, old in zip(COMPONENTS, bits, strict=True)
-        )
-        bits = first, second, third
-    return replace(
-        state,
-        belief=States(compared.pose[most], compared.sector[most], compared.weight[most]),
-        in_plan=in_plan,
-        number=pose.number,
-        pose=pose,
-        contradicted=bits,
-    )
+    return pose, differing if comparable and is_refined else None

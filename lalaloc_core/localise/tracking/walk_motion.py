@@ -168,7 +168,6 @@ class WalkGraph:
     Attributes:
         position_m: (n, 2) positions in the frames of their own plans.
         links: (n, n) ones between linked poses, and on the diagonal.
-        step_m: step of the grid.
         first: (p + 1,) number of the first pose of each plan, and that of poses.
     """
 

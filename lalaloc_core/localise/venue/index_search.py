@@ -23,8 +23,6 @@ from lalaloc_core.localise.venue.index_segment import by_family
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells
 from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
 
-# Default numbers of pairs per query in the code scan, in the exact comparison, and in the alignment.
-_SCANNED, _COMPARED, _ALIGNED = 40_000_000, 20_000, 4_000
 # The scan returns this multiple of each hypothesis's share, as the best pairs are spread unevenly over hypotheses.
 _OVERFETCH = 6
 
@@ -37,13 +35,7 @@ Probed = Mapping[int, Bool[np.ndarray, "l q"]]
 
 @dataclass(frozen=True, eq=False)
 class PlanSearch:
-    """Query, with the settings that all stages of its search share.
-
-    Attributes:
-        query: the query.
-        step_m: grid step (m) of the plans.
-        weights, config: weights and options of the matching cost.
-    """
+    """Query, with the settings that all stages of its search share; `step_m` is the grid step (m) of the plans."""
 
     query: Query
     step_m: float
@@ -146,9 +138,9 @@ class Shard(Protocol):
 class SearchLimits:
     """Approximate numbers of pairs in the stages; pairs of equal cost are kept together."""
 
-    scanned: int = _SCANNED
-    compared: int = _COMPARED
-    aligned: int = _ALIGNED
+    scanned: int = 40_000_000
+    compared: int = 20_000
+    aligned: int = 4_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -61,20 +61,19 @@ class MergedPlans:
         and are for the same model; the camera height (m) is the query's.
         """
         shift_m = _shifts(plans, gap_m)
+        placed = list(zip(plans, shift_m, strict=True))
         plan = FloorPlan(
             name="",
-            rooms=tuple(_moved(room, shift) for plan, shift in zip(plans, shift_m, strict=True) for room in plan.rooms),
+            rooms=tuple(_moved(room, shift) for plan, shift in placed for room in plan.rooms),
             camera_height_m=camera_height_m,
             openings=tuple(
-                replace(opening, line_m=opening.line_m + shift)
-                for plan, shift in zip(plans, shift_m, strict=True)
-                for opening in plan.openings
+                replace(opening, line_m=opening.line_m + shift) for plan, shift in placed for opening in plan.openings
             ),
             room_trust=_room_trust(plans),
             opening_faces=_faces(plans),
             fixtures=tuple(
                 replace(fixture, outline_m=fixture.outline_m + shift)
-                for plan, shift in zip(plans, shift_m, strict=True)
+                for plan, shift in placed
                 for fixture in plan.fixtures
             ),
         )

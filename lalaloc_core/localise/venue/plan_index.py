@@ -58,7 +58,6 @@ class _Part:
     """Segment of an index.
 
     Attributes:
-        segment: the segment.
         plan: (p,) number in the index of each of the segment's plans; -1 for plans that were removed.
         dead: distinct prototypes of removed plans alone, rising.
     """
@@ -135,8 +134,6 @@ class PlanIndex:
 
     Attributes:
         step_m: grid step (m) of the plans.
-        cells: the coarse quantiser.
-        plan_count: number of plans, p.
         parts: the segments, the largest first.
     """
 

@@ -90,7 +90,13 @@ class Cells:
 
     @cached_property
     def _bins(self) -> Float[np.ndarray, "v b"]:
-        return _soft_bins(self.log_profile)
+        """Linear interpolation weights of log distances: two adjacent bins each, the others 0."""
+        position = (np.clip(self.log_profile, _LOWEST, _HIGHEST - 1e-6) - _LOWEST) / _BIN
+        lower = position.astype(np.intp)
+        weight = np.zeros((*position.shape, _BINS), np.float32)
+        np.put_along_axis(weight, lower[..., None], (1.0 - (position - lower))[..., None], axis=2)
+        np.put_along_axis(weight, lower[..., None] + 1, (position - lower)[..., None], axis=2)
+        return weight.reshape(len(position), -1)
 
 
 @lru_cache(maxsize=1)
@@ -144,13 +150,3 @@ def nearest(
         part = slice(begin, begin + _CHUNK)
         number[part] = (half_norm - feature[part] @ centroid.T).argmin(axis=1)
     return number
-
-
-def _soft_bins(log_profile: Float[np.ndarray, "v a"]) -> Float[np.ndarray, "v b"]:
-    """Return linear interpolation weights of log distances: two adjacent bins each, the others 0."""
-    position = (np.clip(log_profile, _LOWEST, _HIGHEST - 1e-6) - _LOWEST) / _BIN
-    lower = position.astype(np.intp)
-    weight = np.zeros((*log_profile.shape, _BINS), np.float32)
-    np.put_along_axis(weight, lower[..., None], (1.0 - (position - lower))[..., None], axis=2)
-    np.put_along_axis(weight, lower[..., None] + 1, (position - lower)[..., None], axis=2)
-    return weight.reshape(len(log_profile), -1)

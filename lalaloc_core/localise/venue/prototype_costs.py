@@ -14,7 +14,6 @@ Differences to the matching cost of grid poses:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -85,8 +84,8 @@ class PrototypeCosts:
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
         self.precision = self.precisions(self.reach_m)
         self.offsets = _offsets(query)
-        # Losses of openings by claims, of which a venue has few.
-        self._opening_loss: dict[int, np.ndarray] = {}
+        # Losses of openings by the arguments of `opening_loss`; a venue has few claims.
+        self._opening_loss: dict[tuple[int, float, float], np.ndarray] = {}
         self._byte_losses: dict[int, np.ndarray] = {}
         self.penalty = query.camera_height.penalty(self.offsets) / weights.temperature
 
@@ -193,31 +192,30 @@ class PrototypeCosts:
         """True if the query has openings that are compared."""
         return self._query.openings is not None and self._config.use_openings
 
-    def opening_loss(self, claims: int) -> Float[np.ndarray, "k a c"]:
-        """Return the `opening_losses` of prototypes with some claims."""
-        if claims not in self._opening_loss:
-            (self._opening_loss[claims],) = self.opening_losses([claims], self.reach_m, _OPENINGS_SHARE)
-        return self._opening_loss[claims]
+    def opening_loss(
+        self, claims: int, reach: float = 1.0, share: float = _OPENINGS_SHARE
+    ) -> Float[np.ndarray, "k a c"]:
+        """Return the weighted cost of each opening class by hypothesis and azimuth, for claims of `prototypes.ROW`.
 
-    def opening_losses(self, claims: Sequence[int], reach_m: float, share: float) -> Float[np.ndarray, "m k a c"]:
-        """Return the weighted cost of each opening class by claims, hypothesis and azimuth.
-
-        The openings' term is the sum over the azimuths. There are m claims, see `prototypes.ROW`. Openings appear
-        displaced by up to `reach_m`; their weight is a share of the matching cost's.
+        The openings' term is the sum over the azimuths. Openings appear displaced by up to `reach` times the reach of
+        prototypes; their weight is a share of the matching cost's.
         """
-        predicted = self._query.openings
-        assert predicted is not None
-        probability = np.exp(predicted.log_probability[:: self._every])
-        spread = reach_m / median_distance_m(self.centre[0], self.precision[0])
-        probability = smoothed(probability, spread)[:, self._columns]
-        trusts = [*map(trust_of_claims, claims), [1.0] * _CLASSES]
-        floor, appearance = self._config.floor, self._weights.appearance
-        loss = np.stack(
-            [class_losses(probability, predicted.prior, trust, floor, appearance) for trust in trusts]
-        ).astype(np.float32)
-        # Costs are relative to the best class for a plan that shows all openings.
-        loss = loss[:-1] - loss[-1].min(axis=-1, keepdims=True)
-        return loss * np.float32(share * self._weights.openings / AZIMUTHS)
+        key = claims, reach, share
+        if key not in self._opening_loss:
+            predicted = self._query.openings
+            assert predicted is not None
+            probability = np.exp(predicted.log_probability[:: self._every])
+            spread = reach * self.reach_m / median_distance_m(self.centre[0], self.precision[0])
+            probability = smoothed(probability, spread)[:, self._columns]
+            floor, appearance = self._config.floor, self._weights.appearance
+            loss, shown = (
+                class_losses(probability, predicted.prior, trust, floor, appearance).astype(np.float32)
+                for trust in (trust_of_claims(claims), [1.0] * _CLASSES)
+            )
+            # Costs are relative to the best class for a plan that shows all openings.
+            loss = loss - shown.min(axis=-1, keepdims=True)
+            self._opening_loss[key] = loss * np.float32(share * self._weights.openings / AZIMUTHS)
+        return self._opening_loss[key]
 
     def _byte_loss(self, claims: int) -> Float[np.ndarray, "t"]:
         """Return sums of `opening_loss` over the four azimuths of a byte, by hypothesis, byte and its value."""
@@ -279,7 +277,6 @@ class PrototypeAlignment:
         self._costs = costs
         reach_m = costs.reach_m
         self._precisions = [costs.precisions(share * reach_m) for share in (*_STEPS, _COMPARISON)]
-        self._opening_loss: dict[int, np.ndarray] = {}
         self._max_m = _MAX_REACHES * reach_m
         azimuth = costs.azimuths
         self._along = np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32)
@@ -358,16 +355,9 @@ class PrototypeAlignment:
         kind = np.take_along_axis(unpacked_openings(rows["openings"]), place, axis=1)
         cost = np.empty(len(rows), np.float32)
         for claims in np.unique(rows["claims"]).tolist():
-            row = np.flatnonzero(rows["claims"] == claims)
-            cost[row] = self._loss(claims)[hypothesis[row, None], np.arange(AZIMUTHS), kind[row]].sum(axis=1)
+            row, loss = np.flatnonzero(rows["claims"] == claims), self._costs.opening_loss(claims, _COMPARISON, 1.0)
+            cost[row] = loss[hypothesis[row, None], np.arange(AZIMUTHS), kind[row]].sum(axis=1)
         return cost
-
-    def _loss(self, claims: int) -> Float[np.ndarray, "k a c"]:
-        """Return the losses of opening classes after alignment."""
-        if claims not in self._opening_loss:
-            reach_m = _COMPARISON * self._costs.reach_m
-            (self._opening_loss[claims],) = self._costs.opening_losses([claims], reach_m, 1.0)
-        return self._opening_loss[claims]
 
 
 def _slopes(log_m: Float[np.ndarray, "n a"]) -> Float[np.ndarray, "n a"]:

@@ -14,8 +14,7 @@ gives every plan a mass, its unnormalised probability:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -52,19 +51,8 @@ _NEGLIGIBLE = -12.0
 _COPY_TOLERANCE = 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class Prototypes:
-    """Prototypes of one plan, or of several plans, concatenated: records of type `ROW`, from grids with one step."""
-
-    rows: np.ndarray
-    step_m: float
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-
-def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
-    """Return the prototypes of a plan, not yet assigned to cells (all in cell 0)."""
+def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> np.ndarray:
+    """Return the prototypes of a plan: records of type `ROW`, not yet assigned to cells (all in cell 0)."""
     square = np.rint(grid.poses.position_m / grid.step_m).astype(np.int64)
     is_chosen, pose_room = square.sum(axis=1) % 2 == 0, grid.poses.room_index
     # Narrow rooms can have no pose on a black square; they keep all of their poses.
@@ -88,7 +76,7 @@ def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
     kinds = [each.type if len(each.types) == 1 else ROOM_TYPES[0] for each in plan.rooms]
     rows["room_type"] = np.array([ROOM_TYPES.index(kind) for kind in kinds], np.uint8)[room]
     rows["claims"] = claims_of_trust(plan.opening_trust)
-    return Prototypes(rows, grid.step_m)
+    return rows
 
 
 def claims_of_trust(opening_trust: Mapping[str, float]) -> int:
@@ -104,11 +92,6 @@ def trust_of_claims(claims: int) -> list[float]:
     """Return the trust in each opening class, see `claims_of_trust`."""
     classes = len(OPENING_CLASSES)
     return [_TRUST_LEVELS[claims >> code & 1][claims >> classes + code & 1] for code in range(classes)]
-
-
-def joined(parts: Sequence[Prototypes]) -> Prototypes:
-    """Concatenate the prototypes of several plans."""
-    return Prototypes(np.concatenate([part.rows for part in parts]), parts[0].step_m)
 
 
 def packed_openings(kind: UInt8[np.ndarray, "n a"]) -> UInt8[np.ndarray, "n b"]:
