@@ -43,7 +43,7 @@ class WorstQuery:
 
     Attributes:
         first_error_m: position error after the first stage.
-        symmetric: whether the pose fits the mirrored room; see `failures.is_symmetric`.
+        symmetric: whether the pose fits the mirrored room; see `score.is_symmetric`.
         symmetric_by_chance: probability of that for a random wrong position in the room.
         true_cost, found_cost: matching cost of the true and of the found pose; None if the model predicts no wall
             profile. The search missed a true pose with a lower cost; no search finds one with a higher cost.

@@ -4,7 +4,7 @@ The confidence is the posterior within 1 m of the answer, times the probability 
 The fit is judged by signals that do not compare places: the cost of the best place, also relative to that of a fit by
 chance (`match.fit_by_chance`), the uncertainty that the image encoder predicts, and the latent distance. A logistic
 model of the signals (`bundle.ConfidenceModel`) is fitted on validation queries and on photographs of unknown places
-(`lalaloc_core.evaluate.calibrate`). `sequence.sequence_search` combines the confidence of several photographs.
+(`lalaloc_core.evaluate.calibrate`).
 
 Near its minimum the cost is a parabola, and the inverse of its curvature (`Candidate.information`) is the covariance
 up to a factor, which is fitted on validation queries as well. If the heading was searched, position and heading are

@@ -96,7 +96,7 @@ class Draw(NamedTuple):
     mistaken: dict[int, float]
 
 
-# _Outcomes of photographs at each place.
+# Outcomes of photographs at each place.
 _Outcomes = dict[Condition, list[list[Draw]]]
 
 

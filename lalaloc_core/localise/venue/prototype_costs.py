@@ -244,7 +244,7 @@ def _walls(factor: Float[np.ndarray, "n a"], precision: Float[np.ndarray, "n a"]
 
 
 class _Aligned(NamedTuple):
-    """_Aligned pairs of a prototype and a hypothesis.
+    """Pairs of a prototype and a hypothesis.
 
     Attributes:
         cost: (n,) cost at the aligned pose, with the prior of the unknowns.

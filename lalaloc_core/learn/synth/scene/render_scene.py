@@ -132,7 +132,7 @@ class RenderScene(SceneRecords):
         walls_m: segments (x0, y0, x1, y1), room interior to their left.
         wall_owner: slot of the wall's room; -1 - d for the jambs of the hole that is decal d.
         wall_surface: row of `surfaces`.
-        facts: facts known from drawing; `facts` adds others.
+        facts: facts known from drawing.
     """
 
     camera_height_m: float
