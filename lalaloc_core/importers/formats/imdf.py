@@ -19,7 +19,7 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.common.tagged_features import import_features, in_english
-from lalaloc_core.importers.formats.geojson import Projector, parse_features, plan_features
+from lalaloc_core.importers.formats.geojson import file_rings, parse_features, plan_features
 
 _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
 _NAMESPACE = uuid.UUID("2f6c1d58-2d0e-5c7e-9a41-6b0f6f1e7c11")
@@ -56,11 +56,10 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """
     if anchor is None:
         raise InvalidFloorPlanError("IMDF requires the place of the plan on Earth; set its anchor")
-    projector = Projector(anchor)
     name = str(document.get("name", "floor plan"))
     ids = {kind: str(uuid.uuid5(_NAMESPACE, f"{kind}/{name}")) for kind in ("venue", "building", "level", "footprint")}
     by_type: dict[str, list[dict[str, Any]]] = {"unit": [], "opening": []}
-    for number, feature in enumerate(plan_features(document, projector)):
+    for number, feature in enumerate(plan_features(document, anchor)):
         kind = feature["properties"].pop("feature_type")
         properties = feature["properties"] | {"level_id": ids["level"]}
         if kind == "unit":
@@ -81,7 +80,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
                 "properties": properties,
             }
         )
-    outline = projector.polygon([_bounding_box(document)])
+    outline = file_rings([_bounding_box(document)], anchor)
     context = {"venue": {"category": "unspecified", "name": {"en": name}, "address_id": None},
                "building": {"category": "unspecified", "name": {"en": name}, "address_id": None},
                "footprint": {"category": "ground", "name": None, "building_ids": [ids["building"]]},
