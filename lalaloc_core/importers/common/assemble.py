@@ -102,14 +102,12 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     rooms = _without_areas(_without_low_rooms(rooms, builder), builder)
     rooms, shift = _near_origin(rooms, builder)
     openings = [_shift_opening(opening, shift) for opening in sketch.openings]
-    placed = place_openings(openings, [room.shape for room in rooms])
-    if placed.off_wall:
-        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in placed.off_wall[:_MAX_NAMED])
-        builder.warnings.append(
-            f"{len(placed.off_wall)} openings lie on no wall and were left out, for example at {places}"
-        )
-    if placed.overlapping:
-        builder.notes.append(f"{placed.overlapping} openings that overlap other openings were left out")
+    openings, off_wall, overlapping = place_openings(openings, [room.shape for room in rooms])
+    if off_wall:
+        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in off_wall[:_MAX_NAMED])
+        builder.warnings.append(f"{len(off_wall)} openings lie on no wall and were left out, for example at {places}")
+    if overlapping:
+        builder.notes.append(f"{overlapping} openings that overlap other openings were left out")
     name = options.name or clean_name(sketch.name)
     document: dict[str, Any] = {} if name is None else {"name": name}
     if sketch.north_deg is not None:
@@ -124,8 +122,8 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if ceiling_m is not None:
         document["ceiling_height_m"] = ceiling_m
     document["rooms"] = [_room(room, ceiling_m, sketch, shift) for room in rooms]
-    if placed.openings:
-        document["openings"] = [_opening(opening) for opening in placed.openings]
+    if openings:
+        document["openings"] = [_opening(opening) for opening in openings]
     if fixtures:
         document["fixtures"] = [
             {"kind": fixture.kind, "outline": _ring(fixture.shape.exterior)} for _, fixture in fixtures

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -26,19 +26,13 @@ _ON_WALL_M = 0.05
 _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
-@dataclass(frozen=True)
-class _PlacedOpenings:
-    """Openings on walls, openings on no wall, and the number left out because another takes their place."""
-
-    openings: list[SketchedOpening]
-    off_wall: list[SketchedOpening]
-    overlapping: int
-
-
-def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> _PlacedOpenings:
+def place_openings(
+    openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]
+) -> tuple[list[SketchedOpening], list[SketchedOpening], int]:
     """Move every opening onto the walls beside it.
 
-    If two openings overlap in a wall, a door is kept before a window and a window before a passage.
+    Returns the openings on walls, those on no wall, and the number of those left out: if two overlap in a wall, a door
+    is kept before a window and a window before a passage.
     """
     edges = _edges(rooms)
     tree = shapely.STRtree([_segment(edge) for edge in edges])
@@ -55,7 +49,7 @@ def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.
             _stack_window(placed, kept)
         else:
             kept.append(free)
-    return _PlacedOpenings(kept, off_wall, overlapping)
+    return kept, off_wall, overlapping
 
 
 class WallLines:
