@@ -146,11 +146,10 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     bounds = budget.limits.rooms
     marked = marked_rooms(drawing, builder, bounds)
     lines = [stroke for stroke in drawing.strokes if stroke.role in (None, "wall")]
-    walls = take_leaves(lines, drawing.swings, drawing.areas)
+    walls, leaves = take_leaves(lines, drawing.swings, drawing.areas)
     others = [stroke for stroke in drawing.strokes if stroke.role not in (None, "wall")]
-    leaves = walls.swings
     areas = without_leaves(drawing.areas, [*drawing.swings, *leaves])
-    without = replace(drawing, strokes=[*walls.strokes, *others], areas=areas)
+    without = replace(drawing, strokes=[*walls, *others], areas=areas)
     reading = choose_reading(without, marked, [*drawing.swings, *leaves], builder, budget)
     gaps, shapes = reading.gaps, reading.rooms
     if reading.walls is None:
