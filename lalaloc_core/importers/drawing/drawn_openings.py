@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -127,23 +126,15 @@ def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:
     return sum(share(*corner) > 0.5 for corner in corners) <= _CORNERS
 
 
-@dataclass(frozen=True, eq=False)
-class _PaintedWalls:
-    """Visible parts of walls, and the gaps that are painted into them."""
-
-    bodies: list[shapely.Polygon]
-    gaps: list[Gap]
-
-
 def cut_painted(
     bodies: Sequence[tuple[shapely.Polygon, int]],
     patches: Sequence[Patch],
     thickest_m: float,
     check_time: Callable[[], None],
-) -> _PaintedWalls:
+) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Take what is hidden from walls, which come with their places in the order of painting, in metres.
 
-    Gaps are in walls of at most `thickest_m`.
+    Returns the visible parts of walls, and the gaps that are painted into walls of at most `thickest_m`.
     """
     tree = shapely.STRtree([patch.shape for patch in patches])
     visible: list[shapely.Polygon] = []
@@ -172,7 +163,7 @@ def cut_painted(
             gap = _gap(piece, walls, patches[k], thickest_m)
             if gap is not None:
                 gaps.append(gap)
-    return _PaintedWalls(visible, gaps)
+    return visible, gaps
 
 
 def _gap(piece: shapely.Polygon, walls: shapely.STRtree, patch: Patch, thickest_m: float) -> Gap | None:

@@ -238,11 +238,11 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     drawn = [(area.shape, area.order) for area in drawing.areas if area.is_dark and area.role is None]
     drawn = [(shape, order) for shape, order in drawn if not _is_stroke_of_letter(shape, bounds)]
     drawn += _drawn_thick(drawing, None, bounds)
-    painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
-    bodies = [shape for shape in painted.bodies if not _is_outline(Area(shape, "", is_dark=True), bounds)]
+    visible, painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
+    bodies = [shape for shape in visible if not _is_outline(Area(shape, "", is_dark=True), bounds)]
     if not bodies:
         return None
-    gaps = [*painted.gaps, *_panes(drawing, shapely.unary_union(bodies), 2, budget)]
+    gaps = [*painted, *_panes(drawing, shapely.unary_union(bodies), 2, budget)]
     painted_over = [gap.shape.buffer(bounds.seam_m, join_style="mitre") for gap in gaps]
     found = _enclose(bodies, [], [*_closers(drawing, bounds), *painted_over], budget)
     return replace(found, gaps=[*gaps, *found.gaps])
