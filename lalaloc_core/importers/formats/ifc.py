@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -326,12 +326,8 @@ class _Meshes:
 
     def __init__(self, budget: Budget) -> None:
         self._budget = budget
+        self.check_time = budget.check_time
         self._sizes: dict[int, float] = {}
-
-    @property
-    def check_time(self) -> Callable[[], None]:
-        """Function that raises an exception if the time is over."""
-        return self._budget.check_time
 
     @property
     def has_time_for_fixtures(self) -> bool:
