@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -30,7 +30,6 @@ from lalaloc_core.importers.common.sketch import (
     ROOM_HEIGHT_M,
     Level,
     OpeningKind,
-    Point,
     Sketch,
     SketchedFixture,
     SketchedOpening,
@@ -76,19 +75,6 @@ class Feature:
     shape: BaseGeometry
     properties: Mapping[str, Any]
     id: str | None
-
-
-@dataclass(frozen=True)
-class _PointOpening:
-    """Opening drawn as a point on a wall, as in OpenStreetMap; `has_level` is False if it may belong to any level."""
-
-    kind: OpeningKind
-    position: Point
-    width_m: float
-    name: str | None
-    head_m: float | None
-    layer: str
-    has_level: bool
 
 
 def import_features(
@@ -251,7 +237,9 @@ class _Drawer:
 
     def __init__(self, sketch: Sketch, options: ImportOptions, builder: ReportBuilder) -> None:
         self._sketch, self._options, self._builder = sketch, options, builder
-        self._points: list[_PointOpening] = []
+        # Openings that begin and end at a point on a wall, as in OpenStreetMap; their widths (m), layers, and whether
+        # they can only belong to this level.
+        self._points: list[tuple[SketchedOpening, float, str, bool]] = []
 
     def add(self, feature: Feature, role: Role, shape: BaseGeometry) -> None:
         """Add a feature by its role; openings without a direction wait for `add_points`."""
@@ -305,8 +293,9 @@ class _Drawer:
             if width_m is None or width_m <= 0.0:
                 width_m = _USUAL_WIDTH_M[kind]
                 self._builder.unsure.append(f"{kind}s drawn as points without a width; {width_m:g} m is assumed")
-            position, has_level = (shape.x, shape.y), bool(_levels_of(feature))
-            self._points.append(_PointOpening(kind, position, width_m, name, head_m, layer, has_level))
+            point = (shape.x, shape.y)
+            opening = SketchedOpening(kind, point, point, name, None, head_m)
+            self._points.append((opening, width_m, layer, bool(_levels_of(feature))))
             return
         ends = opening_line(shape)
         self._builder.use(layer, kind if ends is not None else "ignored (no length)")
@@ -319,12 +308,12 @@ class _Drawer:
             return
         walls = WallLines([room.shape for room in self._sketch.rooms])
         lost = 0
-        for point in self._points:
-            ends = walls.line_at(point.position, point.width_m)
-            self._builder.use(point.layer, point.kind if ends is not None else "ignored (on no wall of the level)")
+        for opening, width_m, layer, has_level in self._points:
+            ends = walls.line_at(opening.start, width_m)
+            self._builder.use(layer, opening.kind if ends is not None else "ignored (on no wall of the level)")
             if ends is not None:
-                self._sketch.openings.append(SketchedOpening(point.kind, *ends, point.name, None, point.head_m))
-            lost += ends is None and point.has_level
+                self._sketch.openings.append(replace(opening, start=ends[0], end=ends[1]))
+            lost += ends is None and has_level
         if lost:
             self._builder.warnings.append(f"{lost} openings drawn as points lie on no wall and were left out")
 
