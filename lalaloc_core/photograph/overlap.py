@@ -304,10 +304,8 @@ def headings_in_order(
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return headings of all photographs minus that of the first, and the deviations of the places of their groups.
 
-    Args:
-        group: numbers of the groups of photographs that overlap, from 0.
-        heading: headings (radians) within the groups.
-        steps: from each photograph to the next one, and for turns that close from the last to the first.
+    Headings (radians) are given within the groups of photographs that overlap, whose numbers count from 0. Steps are
+    from each photograph to the next one, and for turns that close from the last to the first.
     """
     first = np.arange(len(steps))
     second = (first + 1) % len(group)

@@ -161,11 +161,8 @@ def assemble_levels(
 ) -> tuple[ImportedPlan, ...]:
     """Return the plans of the chosen levels, lowest first; of several levels, those without a room are left out.
 
-    Args:
-        levels: levels of a file, with their contents.
-        options: options of the import.
-        budget: limits of the import, which is told every level as it begins.
-        make: makes the plan of a level.
+    `levels` are the levels of a file with their contents, and `make` makes the plan of one of them; the budget is told
+    every level as it begins.
     """
     chosen = choose_levels(levels, options)
     if len(chosen) > (most := budget.limits.max_levels):

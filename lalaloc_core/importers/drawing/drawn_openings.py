@@ -45,11 +45,9 @@ def drawn_panes(
 ) -> list[tuple[shapely.Polygon, shapely.LineString]]:
     """Return the windows among the thin lines of a drawing (m), as areas and as lines along their middle.
 
-    Args:
-        lines: straight lines.
-        walls: the walls; with the areas between the lines of windows, if walls are drawn with two lines.
-        least: lines that make a window. Two do in a gap; a wall with two faces is such a pair itself.
-        check_time: called between steps; raises an exception to stop.
+    The walls include the areas between the lines of windows, if walls are drawn with two lines. At least `least` lines
+    make a window: two do in a gap; a wall with two faces is such a pair itself. `check_time` is called between steps
+    and raises an exception to stop.
     """
     candidates = [line for line in lines if _LENGTH_M[0] <= line.length <= _LENGTH_M[1]]
     if not candidates or walls.is_empty:

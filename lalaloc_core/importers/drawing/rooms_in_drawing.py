@@ -79,12 +79,8 @@ def choose_reading(
 ) -> Reading:
     """Return the reading that explains most of a drawing in metres, and report the others.
 
-    Args:
-        drawing: the drawing, without leaves of doors among its lines.
-        marked: rooms that the file marks, see `marked_rooms`.
-        leaves: leaves and swings of doors.
-        builder: the report.
-        budget: the budget.
+    The drawing has no leaves of doors among its lines; `leaves` are these and the swings of doors. `marked` are the
+    rooms that the file marks, see `marked_rooms`.
     """
     readings: list[Reading] = []
     bounds = budget.limits.rooms

@@ -75,15 +75,8 @@ def split_named_rooms(
 ) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Divide rooms with several names of rooms at gaps between ends of walls that leave a name on both sides.
 
-    Args:
-        rooms: the rooms.
-        walls: the walls around them.
-        closed: gaps that are closed already.
-        letterings: texts of the drawing.
-        check_time: called between steps; raises an exception to stop.
-
-    Returns:
-        The rooms in the order given, parts beside each other, and the gaps that divide them.
+    Returns the rooms in the order given, parts beside each other, and the gaps that divide them. `closed` are gaps that
+    are closed already; `check_time` is called between steps and raises an exception to stop.
     """
     places = [shapely.Point(text.position) for text in letterings if text.room_types]
     names = shapely.STRtree(places)
