@@ -343,14 +343,7 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
     """Return groups of pieces that continue each other."""
     steps = pieces[:, 1] - pieces[:, 0]
     direction = steps / np.maximum(np.linalg.norm(steps, axis=1), 1e-9)[:, None]
-    root = list(range(len(pieces)))
-
-    def find(index: int) -> int:
-        while root[index] != index:
-            root[index] = root[root[index]]
-            index = root[index]
-        return index
-
+    group = {index: [index] for index in range(len(pieces))}
     ends = pieces.reshape(-1, 2)
     apart = np.linalg.norm(ends[:, None] - ends[None], axis=2)
     first, second = np.nonzero(apart < _GAP * side)
@@ -363,12 +356,11 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
         outward = (pieces[i, 1 - a % 2] - ends[a]) @ (pieces[j, 1 - b % 2] - ends[b])
         gap = ends[b] - ends[a]
         offset = min(abs(float(direction[k, 0] * gap[1] - direction[k, 1] * gap[0])) for k in (i, j))
-        if cosine > np.cos(_TURN) and outward < 0.0 and offset < _OFFSET * side:
-            root[find(i)] = find(j)
-    groups: dict[int, list[int]] = {}
-    for index in range(len(pieces)):
-        groups.setdefault(find(index), []).append(index)
-    return list(groups.values())
+        follows = cosine > np.cos(_TURN) and outward < 0.0 and offset < _OFFSET * side
+        if follows and group[i] is not group[j]:
+            merged = sorted(group[i] + group[j])
+            group |= dict.fromkeys(merged, merged)
+    return list({members[0]: members for members in group.values()}.values())
 
 
 def _sampled(pieces: Float[np.ndarray, "k 2 2"]) -> Float[np.ndarray, "m 2"]:
