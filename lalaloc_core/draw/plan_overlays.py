@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, ON_PAPER, document, path, words, xml_text
-from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_with
+from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_svg
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers.common.import_report import Trace, TracePart
 from lalaloc_core.localise.query import Query
@@ -64,7 +64,7 @@ def draw_path(plan: FloorPlan, drawn: DrawnPath) -> str:
     over = f'<path d="{line}" fill="none" stroke="{FOUND}" stroke-width="{extent / 400:.4f}"/>{dots}{start}'
     last_x, last_y = drawn.position_m[-1]
     marker = Marker(x_m=float(last_x), y_m=float(last_y), heading_deg=drawn.heading_deg)
-    return plan_with(plan, over, marker)
+    return plan_svg(plan, marker, over=over)
 
 
 def draw_places(plan: FloorPlan, places: Sequence[tuple[str, Marker]]) -> str:
@@ -77,7 +77,7 @@ def draw_places(plan: FloorPlan, places: Sequence[tuple[str, Marker]]) -> str:
         f'stroke="#fff" stroke-width="{size / 5:.4f}" paint-order="stroke">{xml_text(text)}</text>'
         for text, marker in places
     )
-    return plan_with(plan, cameras)
+    return plan_svg(plan, over=cameras)
 
 
 def trace_svg(trace: Trace, title: str) -> str:
