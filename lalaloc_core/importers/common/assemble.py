@@ -25,15 +25,7 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
-from lalaloc_core.importers.common.sketch import (
-    Level,
-    Sketch,
-    SketchedFixture,
-    SketchedOpening,
-    SketchedRoom,
-    T,
-    choose_levels,
-)
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
 from lalaloc_core.importers.common.vocabulary import is_roof
 
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
@@ -116,7 +108,8 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
-    fixtures = place_fixtures([_shift_fixture(fixture, shift) for fixture in sketch.fixtures], rooms, builder)
+    drawn = [replace(fixture, shape=affinity.translate(fixture.shape, *shift)) for fixture in sketch.fixtures]
+    fixtures = place_fixtures(drawn, rooms, builder)
     rooms = type_rooms(rooms, fixtures, builder)
     ceiling_m = _usual_ceiling(rooms, options, builder)
     if ceiling_m is not None:
@@ -347,10 +340,6 @@ def _shift_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: Re
 def _shift_opening(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
     (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
     return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
-
-
-def _shift_fixture(fixture: SketchedFixture, shift: tuple[float, float]) -> SketchedFixture:
-    return replace(fixture, shape=affinity.translate(fixture.shape, *shift))
 
 
 def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float | None:
