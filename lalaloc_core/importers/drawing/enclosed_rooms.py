@@ -150,13 +150,20 @@ def find_gaps(
             found.append(gap if index < len(ends) else replace(gap, is_sure=False))
     ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
     gaps = [gap for _, _, gap in sorted(ranked, key=lambda item: item[:2])]
-    tree, is_kept = shapely.STRtree([gap.shape for gap in gaps]), np.zeros(len(gaps), bool)
-    for index, gap in enumerate(gaps):
+    return [gaps[index] for index in without_overlaps([gap.shape for gap in gaps], 0.25, check_time)]
+
+
+def without_overlaps(
+    shapes: Sequence[shapely.Polygon], share: float, check_time: Callable[[], None] = lambda: None
+) -> list[int]:
+    """Return the numbers of the shapes that share less than a part of their area with each that was kept before."""
+    tree, is_kept = shapely.STRtree(shapes), np.zeros(len(shapes), bool)
+    for index, shape in enumerate(shapes):
         check_time()
-        near = tree.query(gap.shape)
-        shared = (shapely.intersection(gap.shape, gaps[k].shape).area for k in near[is_kept[near]])
-        is_kept[index] = all(area < 0.25 * gap.shape.area for area in shared)
-    return [gap for gap, keep in zip(gaps, is_kept, strict=True) if keep]
+        near = tree.query(shape)
+        shared = (shapely.intersection(shape, shapes[k]).area for k in near[is_kept[near]])
+        is_kept[index] = all(area < share * shape.area for area in shared)
+    return np.flatnonzero(is_kept).tolist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,18 +376,9 @@ def _insides(
             for floor in polygons_from_geometry(inside):
                 if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config):
                     rooms.append(floor.simplify(0.004))
-    return _distinct(rooms)
-
-
-def _distinct(rooms: list[shapely.Polygon]) -> list[shapely.Polygon]:
-    """Drop duplicates: rooms inside an island of walls are found twice."""
-    ordered = sorted(rooms, key=lambda room: -room.area)
-    tree, is_kept = shapely.STRtree(ordered), np.zeros(len(ordered), bool)
-    for index, room in enumerate(ordered):
-        near = tree.query(room)
-        larger = [ordered[k] for k in near[is_kept[near]]]
-        is_kept[index] = all(shapely.intersection(room, other).area < 0.5 * room.area for other in larger)
-    return [room for room, keep in zip(ordered, is_kept, strict=True) if keep]
+    # Rooms inside an island of walls are found twice.
+    rooms.sort(key=lambda room: -room.area)
+    return [rooms[index] for index in without_overlaps(rooms, 0.5)]
 
 
 def _is_thin(face: shapely.Polygon, config: WallConfig) -> bool:
