@@ -150,13 +150,13 @@ def _write_copies(
             longitude=None if place is None else place.longitude,
             direction_deg=direction_deg,
         )
-        copied = placed_copy(source.read_bytes(), stated)
-        (folder / source.name).write_bytes(copied.content)
-        if copied.sidecar is not None:
+        copied, sidecar = placed_copy(source.read_bytes(), stated)
+        (folder / source.name).write_bytes(copied)
+        if sidecar is not None:
             beside += 1
             path = (folder / source.name).with_suffix(".xmp")
             # The name that all photo managers know; that with both suffixes for the second file of the same name.
             path = folder / f"{source.name}.xmp" if path in written else path
-            path.write_bytes(copied.sidecar)
+            path.write_bytes(sidecar)
             written.add(path)
     return [f"copies with their place in an .xmp file beside them: {beside}"] if beside else []
