@@ -108,15 +108,6 @@ class Attitude:
     yaw_sd: float = math.inf
 
 
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
-    """Field of view and tilt of a camera about which nothing is known."""
-
-    hfov: float
-    focal_sd: float
-    attitude: Attitude
-
-
 def find_segments(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
     """Return the longest segments (x, y, x, y; pixels from the top left corner) found by OpenCV's LSD."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -156,8 +147,13 @@ def estimate_attitude(lines: Lines) -> Attitude:
     return _attitude(_refined(lines, _starts(lines)))
 
 
-def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, height: int) -> Calibration:
-    """Return the most probable field of view and tilt of a perspective camera without distortion."""
+def estimate_calibration(
+    segments: Float[np.ndarray, "n 4"], *, width: int, height: int
+) -> tuple[float, float, Attitude]:
+    """Return what is most probable for a perspective camera without distortion about which nothing is known.
+
+    These are its horizontal field of view (radians), the relative deviation of its focal length, and its tilt.
+    """
     focals = 0.5 * max(width, height) / np.tan(0.5 * _LONG_FOVS)
     modes: list[_Mode] = []
     for focal in focals:
@@ -171,11 +167,8 @@ def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, heig
     weights /= weights.sum()
     mean = float(weights @ log_focal)
     attitude = _attitude([(angles, score, cov) for (angles, _, cov), score in zip(modes, scores, strict=True)])
-    return Calibration(
-        hfov=2.0 * math.atan(0.5 * width / math.exp(mean)),
-        focal_sd=math.sqrt(float(weights @ (log_focal - mean) ** 2) + _FOCAL_FLOOR**2),
-        attitude=attitude,
-    )
+    focal_sd = math.sqrt(float(weights @ (log_focal - mean) ** 2) + _FOCAL_FLOOR**2)
+    return 2.0 * math.atan(0.5 * width / math.exp(mean)), focal_sd, attitude
 
 
 def _attitude(modes: Sequence[_Mode]) -> Attitude:

@@ -367,9 +367,8 @@ def photograph_of_picture(
     segments = find_segments(picture)
     warnings = lens.warnings
     if lens.camera is None:
-        found = estimate_calibration(segments, width=columns, height=rows)
-        attitude, focal_sd = found.attitude, found.focal_sd
-        camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
+        estimated_hfov, focal_sd, attitude = estimate_calibration(segments, width=columns, height=rows)
+        camera: Camera = Perspective.of_hfov(*full_size, estimated_hfov)
         small = camera.scaled(columns, rows)
         if purpose != "turn":
             origin = "was estimated from straight lines" if len(segments) else "is only usual"
