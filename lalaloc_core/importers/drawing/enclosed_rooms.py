@@ -222,7 +222,7 @@ def _gap_before(wall: _End, areas: WallAreas, config: WallConfig) -> Gap | None:
     width = farthest if farthest - middle <= 0.25 * config.thickest else middle
     if width - nearest > _OUT_OF_LINE_M or not config.narrowest_gap <= width <= config.widest_gap:
         return None
-    is_between_ends = _faces_an_end(wall.start, wall.end, outward, width, areas)
+    is_between_ends = _faces_an_end(wall, width, areas)
     is_sure = width - nearest <= 0.25 * config.thickest and (
         wall.nib >= config.nib or (is_between_ends and width <= _MAX_BETWEEN_NIBS)
     )
@@ -236,15 +236,9 @@ def _gap_before(wall: _End, areas: WallAreas, config: WallConfig) -> Gap | None:
     return Gap(shape, point_xy(begin), point_xy(reach), is_sure, is_between_ends)
 
 
-def _faces_an_end(
-    start: Float[np.ndarray, "2"],
-    end: Float[np.ndarray, "2"],
-    outward: Float[np.ndarray, "2"],
-    width: float,
-    areas: WallAreas,
-) -> bool:
+def _faces_an_end(wall: _End, width: float, areas: WallAreas) -> bool:
     """Return whether the other side of a gap is the end of a wall of similar thickness."""
-    a, b = start + (width + 0.02) * outward, end + (width + 0.02) * outward
+    a, b = wall.start + (width + 0.02) * wall.outward, wall.end + (width + 0.02) * wall.outward
     side = 0.12 * (b - a) / np.linalg.norm(b - a)
     outside = shapely.LineString([a - side, a - 0.3 * side]), shapely.LineString([b + 0.3 * side, b + side])
     return not any(areas.meets(piece) for piece in outside)
