@@ -309,7 +309,7 @@ class _Drawer:
         walls = WallLines([room.shape for room in self._sketch.rooms])
         lost = 0
         for opening, width_m, layer, has_level in self._points:
-            ends = walls.line_at(opening.start, width_m)
+            ends = walls.line_at(shapely.Point(opening.start), width_m)
             self._builder.use(layer, opening.kind if ends is not None else "ignored (on no wall of the level)")
             if ends is not None:
                 self._sketch.openings.append(replace(opening, start=ends[0], end=ends[1]))
