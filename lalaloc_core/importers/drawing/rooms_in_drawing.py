@@ -16,13 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import (
-    check_network,
-    check_overlaps,
-    point_xy,
-    polygons_from_geometry,
-    side_lengths,
-)
+from lalaloc_core.importers.common.geometry import check_network, check_overlaps, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
@@ -289,8 +283,8 @@ def _panes(drawing: Drawing, walls: BaseGeometry, least: int, budget: Budget) ->
     lines = [stroke.line for stroke in drawing.strokes if stroke.role is None and stroke.width < thick_m]
     lines += [area.shape.exterior for area in drawing.areas if area.role is None and not area.is_dark]
     found = drawn_panes(split_lines(lines), walls, least, budget.check_time)
-    ends = [(area, shapely.get_coordinates(line)) for area, line in found]
-    return [Gap(area, point_xy(a), point_xy(b), is_between_ends=True, is_pane=True) for area, (a, b) in ends]
+    ends = [(area, shapely.get_coordinates(line).ravel().tolist()) for area, line in found]
+    return [Gap(area, (x0, y0), (x1, y1), is_between_ends=True, is_pane=True) for area, (x0, y0, x1, y1) in ends]
 
 
 def _rings(shape: shapely.Polygon) -> list[shapely.LinearRing]:
