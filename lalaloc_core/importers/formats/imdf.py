@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -71,15 +71,8 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
         else:
             continue  # IMDF has no feature type for free-standing walls.
         key = feature.get("id") or f"{kind}-{number}"
-        by_type[kind].append(
-            {
-                "id": str(uuid.uuid5(_NAMESPACE, f"{name}/{key}")),
-                "type": "Feature",
-                "feature_type": kind,
-                "geometry": feature["geometry"],
-                "properties": properties,
-            }
-        )
+        own_id = str(uuid.uuid5(_NAMESPACE, f"{name}/{key}"))
+        by_type[kind].append(_feature(kind, own_id, feature["geometry"], properties))
     outline = file_rings([_bounding_box(document)], anchor)
     context = {"venue": {"category": "unspecified", "name": {"en": name}, "address_id": None},
                "building": {"category": "unspecified", "name": {"en": name}, "address_id": None},
@@ -88,10 +81,14 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
                          "name": {"en": name}, "building_ids": [ids["building"]]}}  # fmt: skip
     for kind, properties in context.items():
         geometry = None if kind == "building" else {"type": "Polygon", "coordinates": outline}
-        by_type[kind] = [
-            {"id": ids[kind], "type": "Feature", "feature_type": kind, "geometry": geometry, "properties": properties}
-        ]
-    return _write_archive(by_type)
+        by_type[kind] = [_feature(kind, ids[kind], geometry, properties)]
+    files: dict[str, Any] = {"manifest.json": {"version": "1.0.0", "language": "en", "generated_by": "lalaloc"}}
+    files |= {f"{kind}.geojson": {"type": "FeatureCollection", "features": found} for kind, found in by_type.items()}
+    return pack({name: json.dumps(content, ensure_ascii=False).encode() for name, content in files.items()})
+
+
+def _feature(kind: str, own_id: str, geometry: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
+    return {"id": own_id, "type": "Feature", "feature_type": kind, "geometry": geometry, "properties": properties}
 
 
 def _read_member(files: Mapping[str, bytes], name: str, budget: Budget) -> Any:
@@ -118,13 +115,6 @@ def _levels(document: Any) -> dict[str, Level]:
 def _text(value: Any) -> str | None:
     value = in_english(value)
     return value[:200] if isinstance(value, str) and value.strip() else None
-
-
-def _write_archive(by_type: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
-    files: dict[str, Any] = {"manifest.json": {"version": "1.0.0", "language": "en", "generated_by": "lalaloc"}}
-    for kind, features in by_type.items():
-        files[f"{kind}.geojson"] = {"type": "FeatureCollection", "features": list(features)}
-    return pack({name: json.dumps(content, ensure_ascii=False).encode() for name, content in files.items()})
 
 
 def _bounding_box(document: Mapping[str, Any]) -> list[list[float]]:
