@@ -34,10 +34,6 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _no_walls() -> Float[np.ndarray, "0 4"]:
-    return frozen(np.empty((0, 4)))
-
-
 @dataclass(frozen=True, eq=False)
 class Room:
     """One room.
@@ -59,7 +55,7 @@ class Room:
     id: str = ""
     types: tuple[str, ...] = ()
     holes_m: tuple[Float[np.ndarray, "_ 2"], ...] = ()
-    inner_walls_m: Float[np.ndarray, "k 4"] = field(default_factory=_no_walls)
+    inner_walls_m: Float[np.ndarray, "k 4"] = field(default_factory=lambda: frozen(np.empty((0, 4))))
     states_ceiling: bool = True
 
     @property
