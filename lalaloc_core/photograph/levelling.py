@@ -20,15 +20,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.photograph.cameras import Camera, Perspective, camera_axes
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, Perspective, camera_axes
 
 # Longer side (pixels) at which segments are found, in pictures that are larger by more than the slack.
 _LONG_SIDE, _SLACK = 480, 1.1
 # Shorter segments, as a share of the picture's longer side, are mostly texture.
 _MIN_LENGTH = 0.025
 _MAX_SEGMENTS = 150
-# OpenCV counts from the centre of the first pixel.
-_HALF_PIXEL = 0.5
 # Angular error of a segment: modelling, and of its ends in pixels.
 _SIGMA = math.radians(0.6)
 _SIGMA_PIXELS = 0.6
@@ -118,7 +116,7 @@ def find_segments(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"
     found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     if found is None:
         return np.zeros((0, 4))
-    segments = found.reshape(-1, 4).astype(float) + _HALF_PIXEL
+    segments = found.reshape(-1, 4).astype(float) + HALF_PIXEL
     length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
     order = np.argsort(-length, kind="stable")[:_MAX_SEGMENTS]
     return segments[order[length[order] > _MIN_LENGTH * max(grey.shape)]] / share

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.photograph.cameras import Camera, camera_axes
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, camera_axes
 from lalaloc_core.photograph.levelling import Attitude
 
 # Features that are kept of a photograph, the strongest of each cell of a grid, and the side of the grid.
@@ -46,7 +46,6 @@ _UPRIGHT = 0.2
 _MAX_PAIRS, _MAX_MATCHES = 200, 60
 _UP = np.array([0.0, 0.0, 1.0])
 _TINY = 1e-9
-_HALF_PIXEL = 0.5
 # Standard deviation (radians) of headings up to which a turn is read as one picture.
 LIKELY_SD = math.radians(12.0)
 # Standard deviation of a step that is assumed, as a share of it.
@@ -98,7 +97,7 @@ def find_features(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> Featur
     if not found:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))
     height, width = grey.shape
-    place = (np.array([point.pt for point in found]) + _HALF_PIXEL) / (width, height)
+    place = (np.array([point.pt for point in found]) + HALF_PIXEL) / (width, height)
     response = np.array([point.response for point in found])
     kept = _spread(place, response)
     return Features(place[kept], np.clip(descriptor[kept], 0, 255).astype(np.uint8))
