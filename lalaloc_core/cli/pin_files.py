@@ -48,7 +48,8 @@ def write_pin_files(
         OSError: a file cannot be written.
     """
     from lalaloc_core.draw.pdf import write_pdf
-    from lalaloc_core.draw.pins import DPI, draw_pins, report_pages
+    from lalaloc_core.draw.pins import DPI, pins_svg, report_pages
+    from lalaloc_core.draw.plan import plan_svg
 
     plans = dict(zip(pinned.plan_ids, pinned.plans, strict=True))
     document: dict[str, Any] = pinned.document() | {"moved": list(moved)}
@@ -64,7 +65,8 @@ def write_pin_files(
     rows = [_report_row(list(plans), path, entry) for path, entry in zip(paths, entries, strict=True)]
     for number, plan in enumerate(pinned.plans):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
-        write_text(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
+        pins = [row.pin for row in rows if row.pin and row.plan == number]
+        write_text(out / name, plan_svg(plan, over=pins_svg(plan, pins)))
     title = " / ".join(dict.fromkeys(plan.name for plan in pinned.plans))
     write_pdf(report_pages(title, pinned.plans, rows, _summary(document, copied)), out / "report.pdf", DPI)
     return document
