@@ -91,7 +91,8 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
             f"the features span {2.0 * reach_m:.0f} m; the limit for a plan is {2 * _MAX_REACH_M:g} m; "
             "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
-    return Projection(project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs)
+    anchor = Anchor(frame.latitude, frame.longitude)
+    return Projection(project, anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs)
 
 
 def _flipped(shape: BaseGeometry) -> BaseGeometry:
