@@ -65,25 +65,23 @@ def _check_placements(model: Any) -> None:
     """Check that placements are relative to few others, and not to themselves, which the library follows forever."""
     depths: dict[int, int] = {}
     for placement in model.by_type("IfcLocalPlacement"):
-        chain: list[Any] = []
-        inside: set[int] = set()
+        chain: list[int] = []
         while placement is not None and placement.id() not in depths and placement.is_a("IfcLocalPlacement"):
-            if placement.id() in inside or len(chain) >= _MAX_PLACEMENTS:
+            if placement.id() in chain or len(chain) >= _MAX_PLACEMENTS:
                 break
-            inside.add(placement.id())
-            chain.append(placement)
+            chain.append(placement.id())
             placement = placement.PlacementRelTo
         depth = 0 if placement is None else depths.get(placement.id(), 0)
-        if placement is not None and placement.id() in inside:
+        if placement is not None and placement.id() in chain:
             raise InvalidFloorPlanError(
                 f"the IfcLocalPlacement #{placement.id()} is relative to itself; export the model again"
             )
         if depth + len(chain) >= _MAX_PLACEMENTS:
             raise InvalidFloorPlanError(
-                f"the IfcLocalPlacement #{chain[0].id()} is relative to more than {_MAX_PLACEMENTS} others in a chain, "
+                f"the IfcLocalPlacement #{chain[0]} is relative to more than {_MAX_PLACEMENTS} others in a chain, "
                 "the limit; export the model again"
             )
-        depths |= {link.id(): depth + len(chain) - index for index, link in enumerate(chain)}
+        depths |= {link: depth + len(chain) - index for index, link in enumerate(chain)}
 
 
 def fixture_kind(element: Any) -> str | None:
