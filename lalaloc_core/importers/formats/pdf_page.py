@@ -47,9 +47,11 @@ class PageContent:
     """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts.
 
     `out_of_range` lines are left out, as their coordinates are out of range. `painted` is the area of all fills and
-    pictures, in pages.
+    pictures, in pages. `crop` is the part of the page that is read (points); None for all of it.
     """
 
+    page: pypdfium2.PdfPage
+    crop: tuple[float, float, float, float] | None = None
     drawing: Drawing = field(default_factory=Drawing)
     size_pt: tuple[float, float] = (0.0, 0.0)
     picture_share: float = 0.0
@@ -91,7 +93,7 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
     """Return the paths and texts of a page, and the share that pictures cover."""
     width, height = page.get_size()
     budget.check_copies(_count_shapes(page.raw, budget), _BYTES_PER_SHAPE)
-    found = PageContent(size_pt=(float(width), float(height)))
+    found = PageContent(page, size_pt=(float(width), float(height)))
     for item, matrix in _objects(page.raw, np.eye(3), budget):
         kind = pdfium.FPDFPageObj_GetType(item)
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
