@@ -116,7 +116,10 @@ def import_features(
         for key in keys or ["0"]:
             level = (levels or {}).get(key) or _level(key)
             by_level.setdefault(key, (level, []))[1].append(feature)
-    by_level = _levels_with_rooms(by_level, is_indoor)
+    role_of = _indoor_role if is_indoor else _role
+    # Features without a level do not make one.
+    with_rooms = {key: item for key, item in by_level.items() if any(role_of(member) == "room" for member in item[1])}
+    by_level = with_rooms or by_level
 
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
         builder = ReportBuilder(format, metres_per_unit, source, warnings=list(warnings))
@@ -126,7 +129,7 @@ def import_features(
         sketch.name = level.name if len(by_level) > 1 else None
         drawer = _Drawer(sketch, options, builder)
         for feature in (*members, *on_any_level):
-            drawer.add(feature, _indoor_role(feature) if is_indoor else _role(feature), project(feature.shape))
+            drawer.add(feature, role_of(feature), project(feature.shape))
             budget.check_time()
         drawer.add_points()
         return assemble(sketch, builder, options, budget.limits.plan)
@@ -173,15 +176,6 @@ def _level(key: str) -> Level:
     except ValueError:
         number = math.nan
     return Level(key, number if math.isfinite(number) else None)
-
-
-def _levels_with_rooms(
-    levels: dict[str, tuple[Level, list[Feature]]], is_indoor: bool
-) -> dict[str, tuple[Level, list[Feature]]]:
-    """Drop levels without a room, so that features without a level do not make one."""
-    role = _indoor_role if is_indoor else _role
-    with_rooms = {key: item for key, item in levels.items() if any(role(feature) == "room" for feature in item[1])}
-    return with_rooms or levels
 
 
 def _role(feature: Feature) -> Role:
