@@ -45,11 +45,6 @@ class PlanGeometry:
     exit_m: Float[Array, "r m 4"]
     opening: Int[Array, "r m"]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays, for numpy."""
-        return sum(getattr(self, field.name).nbytes for field in fields(self))
-
     def like(self, array: Array) -> PlanGeometry:
         """Convert to the array library, device and float type of another array."""
         xp, target = array_namespace(array), device(array)
