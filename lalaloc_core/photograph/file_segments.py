@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Iterator
-from itertools import takewhile
+from itertools import islice, takewhile
 
 from lalaloc_core.errors import InvalidPhotographError
 
@@ -65,12 +65,8 @@ def count_scans(content: bytes, limit: int) -> int:
     """
     if not content.startswith(START):
         return 0
-    scans = 0
-    for marker, _ in markers(content):
-        scans += marker == START_OF_SCAN
-        if scans > limit:
-            break
-    return scans
+    scans = (marker for marker, _ in markers(content) if marker == START_OF_SCAN)
+    return sum(1 for _ in islice(scans, limit + 1))
 
 
 def check_segments(content: bytes) -> None:
