@@ -212,13 +212,10 @@ def _clean(
         for simple in _simple(_simplify(floor, label, limits, builder))
     ]
     floors = [floor for floor in floors if floor.area >= limits.min_room_area_m2]
-    if not floors and room.shape.area < _SLIVER_M2:
-        return []
-    if not floors:
+    if not floors and room.shape.area >= _SLIVER_M2:
         builder.notes.append(
             f"{label} of {room.shape.area:.2g} m² was left out: the smallest room is {limits.min_room_area_m2:g} m²"
         )
-        return []
     if len(floors) > 1:
         builder.warnings.append(f"{label} has {len(floors)} separate parts; each became a room")
     cleaned = []

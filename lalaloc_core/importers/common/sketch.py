@@ -174,9 +174,8 @@ def choose_storey(sketch: Sketch, builder: ReportBuilder, in_file: Callable[[Box
     if not is_chosen:
         return sketch
     chosen, near = storeys[0][1], storeys[0][1].buffer(_REACH_M)
-    rooms = [room for room in sketch.rooms if chosen.covers(room.shape)]
     builder.no_room = [area for area in builder.no_room if near.covers(area)]
-    sketch.rooms = rooms
+    sketch.rooms = [room for room in sketch.rooms if chosen.covers(room.shape)]
     sketch.openings = [opening for opening in sketch.openings if near.covers(opening.line)]
     sketch.fixtures = [fixture for fixture in sketch.fixtures if near.covers(fixture.shape)]
     return sketch
