@@ -242,13 +242,21 @@ def areas_of_rooms(
     shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
 ) -> dict[int, tuple[float, float]]:
     """Return the area (m²) that is written in each room, and the room's area, by the index of the room."""
-    tree = shapely.STRtree(shapes)
-    texts: list[list[str]] = [[] for _ in shapes]
+    texts, _ = texts_of_rooms(shapes, letterings)
+    return _written_areas(shapes, [[lettering.text for lettering in found] for found in texts])
+
+
+def texts_of_rooms(
+    shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
+) -> tuple[list[list[Lettering]], list[Lettering]]:
+    """Return the texts in each room, those in several rooms with the smallest, and the texts in none."""
+    tree, outside = shapely.STRtree(shapes), list[Lettering]()
+    inside: list[list[Lettering]] = [[] for _ in shapes]
     for lettering in letterings:
-        inside = tree.query(shapely.Point(lettering.position), predicate="within")
-        if len(inside):
-            texts[min(inside, key=lambda index: shapes[index].area)].append(lettering.text)
-    return _written_areas(shapes, texts)
+        around = tree.query(shapely.Point(lettering.position), predicate="within")
+        texts = inside[min(around, key=lambda index: shapes[index].area)] if len(around) else outside
+        texts.append(lettering)
+    return inside, outside
 
 
 def _written_areas(shapes: Sequence[shapely.Polygon], texts: Sequence[Sequence[str]]) -> dict[int, tuple[float, float]]:

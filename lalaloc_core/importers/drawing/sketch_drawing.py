@@ -32,7 +32,7 @@ from lalaloc_core.importers.drawing.door_leaves import (
     with_half_open_doors,
     without_leaves,
 )
-from lalaloc_core.importers.drawing.drawing_scale import check_areas, written_dimensions
+from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
 from lalaloc_core.importers.drawing.rooms_in_drawing import (
     GapFinder,
@@ -243,23 +243,15 @@ def name_rooms(
 
     Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
     """
-    tree = shapely.STRtree([area.shape for area in shapes])
-    texts: dict[int, list[Lettering]] = {}
-    lost: list[Lettering] = []
-    for lettering in letterings:
-        inside = tree.query(shapely.Point(lettering.position), predicate="within")
-        if len(inside):
-            smallest = min(inside, key=lambda index: shapes[index].shape.area)
-            texts.setdefault(int(smallest), []).append(lettering)
-        elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
-            lost.append(lettering)
+    texts, outside = texts_of_rooms([area.shape for area in shapes], letterings)
+    lost = [found for found in outside if drawn is not None and drawn.covers(shapely.Point(found.position))]
     if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_types)):
         builder.warnings.append(
             f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
         )
     rooms = []
-    for index, area in enumerate(shapes):
-        words = _names(texts.get(index, []))
+    for area, inside in zip(shapes, texts, strict=True):
+        words = _names(inside)
         known = {found.text: types for found in words if (types := found.room_types)}
         name = area.name or next(iter([*known, *(found.text for found in words)]), None)
         written = [kind for types in known.values() for kind in types]
@@ -271,7 +263,7 @@ def name_rooms(
                 f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
                 "between them"
             )
-    check_areas(rooms, [[raw.text for raw in texts.get(index, [])] for index in range(len(rooms))], builder)
+    check_areas(rooms, [[raw.text for raw in inside] for inside in texts], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:
         builder.notes.append(f"{unnamed} rooms have no name in the file")
