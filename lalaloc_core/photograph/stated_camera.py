@@ -7,7 +7,7 @@ are near the middle of the picture, which tells the size that a calibration was 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -96,8 +96,7 @@ class StatedCamera:
         self._check_intrinsics(self.intrinsics)
 
     def _check_intrinsics(self, intrinsics: Intrinsics) -> None:
-        for name in (field.name for field in fields(intrinsics)):
-            value = getattr(intrinsics, name)
+        for name, value in vars(intrinsics).items():
             if value is not None and not math.isfinite(value):
                 raise InvalidPhotographError(f"intrinsics: {name} is {value}; it must be finite")
         for name, focal in (("fx", intrinsics.fx), ("fy", intrinsics.fy)):
@@ -110,10 +109,9 @@ class StatedCamera:
             )
         for name in ("k1", "k2", "k3", "k4", "p1", "p2"):
             _check_range(f"intrinsics: {name}", getattr(intrinsics, name), -_MAX_COEFFICIENT, _MAX_COEFFICIENT)
-        unused = ("p1", "p2") if self.projection == "fisheye" else ("k4",)
+        kind, unused = ("fisheye", ("p1", "p2")) if self.projection == "fisheye" else ("perspective", ("k4",))
         for name in unused:
             if getattr(intrinsics, name) != 0.0:
-                kind = "fisheye" if self.projection == "fisheye" else "perspective"
                 raise InvalidPhotographError(
                     f"intrinsics: {name} does not belong to the projection '{kind}'; leave it out"
                 )
