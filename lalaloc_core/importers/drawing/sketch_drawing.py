@@ -168,7 +168,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
     finder = GapFinder(gaps, bounds)
     closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if finder.closed_by(swing) is not None]
-    swings = [*drawing.swings, *closing]
+    swings = [swing for swing in (*drawing.swings, *closing) if LEAF_M[0] <= swing.radius <= LEAF_M[1]]
     sketch.openings = [*_symbols(drawing, closing, bounds.symbol_m), *_swings(swings, finder, shapes)]
     sketch.leaves_m = _leaf_widths(swings, finder)
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
@@ -318,8 +318,6 @@ def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -
     found: list[SketchedOpening] = []
     closed: set[int] = set()
     for swing in swings:
-        if not LEAF_M[0] <= swing.radius <= LEAF_M[1]:
-            continue
         index = finder.closed_by(swing)
         if index is not None:
             if index not in closed:
@@ -331,10 +329,9 @@ def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -
 
 
 def _leaf_widths(swings: Sequence[Swing], finder: GapFinder) -> list[float]:
-    """Return the widths of leaves that close a gap, one for every gap; of all arcs of their size without gaps."""
-    leaves = [swing for swing in swings if LEAF_M[0] <= swing.radius <= LEAF_M[1]]
-    closing = {index: swing.radius for swing in leaves if (index := finder.closed_by(swing)) is not None}
-    return list(closing.values()) or [swing.radius for swing in leaves]
+    """Return the widths of leaves that close a gap, one for every gap; of all leaves without gaps."""
+    closing = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
+    return list(closing.values()) or [swing.radius for swing in swings]
 
 
 def _closed_leaf(swing: Swing, walls: BaseGeometry) -> SketchedOpening:
