@@ -48,7 +48,8 @@ def write_pin_files(
         OSError: a file cannot be written.
     """
     from lalaloc_core.draw.pdf import write_pdf
-    from lalaloc_core.draw.pins import DPI, draw_pins, report_pages
+    from lalaloc_core.draw.pins import DPI, pins_svg, report_pages
+    from lalaloc_core.draw.plan import plan_svg
 
     plans = dict(zip(pinned.plan_ids, pinned.plans, strict=True))
     document: dict[str, Any] = pinned.document() | {"moved": list(moved)}
@@ -64,7 +65,8 @@ def write_pin_files(
     rows = [_report_row(list(plans), path, entry) for path, entry in zip(paths, entries, strict=True)]
     for number, plan in enumerate(pinned.plans):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
-        write_file(out / name, draw_pins(plan, [row.pin for row in rows if row.pin and row.plan == number]))
+        pins = [row.pin for row in rows if row.pin and row.plan == number]
+        write_file(out / name, plan_svg(plan, over=pins_svg(plan, pins)))
     title = " / ".join(dict.fromkeys(plan.name for plan in pinned.plans))
     write_pdf(report_pages(title, pinned.plans, rows, _summary(document, copied)), out / "report.pdf", DPI)
     return document
@@ -150,13 +152,13 @@ def _write_copies(
             longitude=None if place is None else place.longitude,
             direction_deg=direction_deg,
         )
-        copied = placed_copy(source.read_bytes(), stated)
-        (folder / source.name).write_bytes(copied.content)
-        if copied.sidecar is not None:
+        copied, sidecar = placed_copy(source.read_bytes(), stated)
+        (folder / source.name).write_bytes(copied)
+        if sidecar is not None:
             beside += 1
             path = (folder / source.name).with_suffix(".xmp")
             # The name that all photo managers know; that with both suffixes for the second file of the same name.
             path = folder / f"{source.name}.xmp" if path in written else path
-            path.write_bytes(copied.sidecar)
+            path.write_bytes(sidecar)
             written.add(path)
     return [f"copies with their place in an .xmp file beside them: {beside}"] if beside else []

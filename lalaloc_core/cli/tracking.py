@@ -142,11 +142,11 @@ def _followed(
 def _picture(plan: FloorPlan, found: list[TrackedAnswer]) -> str:
     import numpy as np
 
-    from lalaloc_core.draw.plan_overlays import DrawnPath, draw_path
+    from lalaloc_core.draw.plan_overlays import draw_path
 
     position_m = np.array([[answer.position.x_m, answer.position.y_m] for answer in found])
     is_sure = [answer.mode == "tracking" for answer in found]
-    return draw_path(plan, DrawnPath(position_m, is_sure, found[-1].heading_deg))
+    return draw_path(plan, position_m, is_sure, found[-1].heading_deg)
 
 
 def _text(path: Path) -> str:

@@ -109,7 +109,7 @@ def layout_outline(
     openings = [
         drawn
         for face in plan.room_faces[room_index]
-        for drawn in _opening(plan, face, position_m, heading, camera_height_m, walls_m)
+        for drawn in _opening(plan, face, position_m, heading, camera_height_m)
     ]
     borders = (project_points(azimuth, distance_m, rise_m) for rise_m in (-camera_height_m, above_m))
     return Outline((*borders, *np.stack([low, high], axis=1)), tuple(openings))
@@ -148,21 +148,16 @@ def _turns(
 
 
 def _opening(
-    plan: FloorPlan,
-    face: OpeningFace,
-    position_m: Float[np.ndarray, "2"],
-    heading: float,
-    camera_height_m: float,
-    walls_m: Float[np.ndarray, "w 4"],
+    plan: FloorPlan, face: OpeningFace, position_m: Float[np.ndarray, "2"], heading: float, camera_height_m: float
 ) -> list[OpeningOutline]:
-    opening = plan.openings[face.opening]
+    opening, walls_m = plan.openings[face.opening], plan.rooms[face.room].walls_m
     usual_sill_m, usual_head_m = USUAL_HEIGHTS_M[opening.kind]
     low_m = usual_sill_m if opening.sill_m is None else opening.sill_m
     high_m = usual_head_m if opening.head_m is None else opening.head_m
     high_m = min(high_m, float(plan.ceiling_heights_m[face.room]))
     if not low_m < high_m:
         return []
-    start, end = plan.rooms[face.room].walls_m[face.wall].reshape(2, 2)
+    start, end = walls_m[face.wall].reshape(2, 2)
     share = np.linspace(face.start, face.end, _POINTS_PER_OPENING)[:, None]
     offset = start + share * (end - start) - position_m
     azimuth, distance_m = np.arctan2(offset[:, 0], offset[:, 1]), np.hypot(*offset.T)

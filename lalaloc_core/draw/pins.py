@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, shortened, words, xml_text
-from lalaloc_core.draw.plan import extent_m, plan_part, plan_with
+from lalaloc_core.draw.plan import extent_m, plan_part
 from lalaloc_core.floorplan import FloorPlan
 
 # Blue, orange and green of Okabe and Ito's palette, distinct for colour-blind readers.
@@ -42,11 +42,6 @@ class DrawnPin:
     y_m: float
     heading_deg: float | None
     state: str
-
-
-def draw_pins(plan: FloorPlan, pins: Sequence[DrawnPin]) -> str:
-    """Draw a plan with numbered pins."""
-    return plan_with(plan, pins_svg(plan, pins))
 
 
 def pins_svg(plan: FloorPlan, pins: Sequence[DrawnPin], extent: float | None = None) -> str:

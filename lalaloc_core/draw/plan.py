@@ -48,21 +48,15 @@ class Marker:
 
 
 def plan_svg(
-    plan: FloorPlan, marker: Marker | None = None, *, no_room: Sequence[Sequence[Sequence[float]]] = ()
+    plan: FloorPlan, marker: Marker | None = None, *, no_room: Sequence[Sequence[Sequence[float]]] = (), over: str = ""
 ) -> str:
     """Draw the plan with names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
     The view box is the plan's bounds with a margin, extended to the camera. Its y axis points down: plan point (x, y)
-    is drawn at (x, -y). For `no_room` see `draw_rooms`.
+    is drawn at (x, -y), as in `over`, SVG that is drawn over the rooms. For `no_room` see `draw_rooms`.
     """
     head, tail = svg_around(plan.name, bounds_with(plan.bounds_m, no_room), marker)
-    return head + draw_rooms(plan, no_room).replace(HEAT_PLACE, "") + tail
-
-
-def plan_with(plan: FloorPlan, over: str, marker: Marker | None = None) -> str:
-    """Draw a plan as `plan_svg` does, with SVG in metres, y pointing down, over the rooms."""
-    head, tail = svg_around(plan.name, plan.bounds_m, marker)
-    return head + draw_rooms(plan).replace(HEAT_PLACE, "") + over + tail
+    return head + draw_rooms(plan, no_room).replace(HEAT_PLACE, "") + over + tail
 
 
 def bounds_with(bounds_m: Bounds, no_room: Sequence[Sequence[Sequence[float]]]) -> Bounds:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, ON_PAPER, document, path, words, xml_text
-from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_with
+from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_svg
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers.common.import_report import Trace, TracePart
 from lalaloc_core.localise.query import Query
@@ -40,31 +40,24 @@ _SEEN_SIZE, _PAD, _FOOT = 800.0, 40.0, 150.0
 _MIN_COLUMNS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnPath:
-    """Poses of a path: positions (m), whether each is sure, and the last heading (degrees)."""
-
-    position_m: Float[np.ndarray, "n 2"]
-    is_sure: Sequence[bool]
-    heading_deg: float
-
-
-def draw_path(plan: FloorPlan, drawn: DrawnPath) -> str:
-    """Draw a path from its first pose, a ring, to its last, the camera; unsure poses are grey."""
+def draw_path(
+    plan: FloorPlan, position_m: Float[np.ndarray, "n 2"], is_sure: Sequence[bool], heading_deg: float
+) -> str:
+    """Draw a path from its first position, a ring, to its last, the camera; positions that are not sure are grey."""
     extent = extent_m(plan)
-    flipped = drawn.position_m * [1.0, -1.0]
+    flipped = position_m * [1.0, -1.0]
     line = path([flipped], digits=3)
     dots = "".join(
-        f'<circle cx="{x:.3f}" cy="{y:.3f}" r="{extent / 220:.4f}" fill="{FOUND if is_sure else _UNSURE}"/>'
-        for (x, y), is_sure in zip(flipped.tolist(), drawn.is_sure, strict=True)
+        f'<circle cx="{x:.3f}" cy="{y:.3f}" r="{extent / 220:.4f}" fill="{FOUND if sure else _UNSURE}"/>'
+        for (x, y), sure in zip(flipped.tolist(), is_sure, strict=True)
     )
     x, y = flipped[0]
     start = f'<circle cx="{x:.3f}" cy="{y:.3f}" r="{extent / 100:.4f}" fill="none" stroke="{INK}" '
     start += f'stroke-width="{extent / 500:.4f}"/>'
     over = f'<path d="{line}" fill="none" stroke="{FOUND}" stroke-width="{extent / 400:.4f}"/>{dots}{start}'
-    last_x, last_y = drawn.position_m[-1]
-    marker = Marker(x_m=float(last_x), y_m=float(last_y), heading_deg=drawn.heading_deg)
-    return plan_with(plan, over, marker)
+    last_x, last_y = position_m[-1]
+    marker = Marker(x_m=float(last_x), y_m=float(last_y), heading_deg=heading_deg)
+    return plan_svg(plan, marker, over=over)
 
 
 def draw_places(plan: FloorPlan, places: Sequence[tuple[str, Marker]]) -> str:
@@ -77,7 +70,7 @@ def draw_places(plan: FloorPlan, places: Sequence[tuple[str, Marker]]) -> str:
         f'stroke="#fff" stroke-width="{size / 5:.4f}" paint-order="stroke">{xml_text(text)}</text>'
         for text, marker in places
     )
-    return plan_with(plan, cameras)
+    return plan_svg(plan, over=cameras)
 
 
 def trace_svg(trace: Trace, title: str) -> str:

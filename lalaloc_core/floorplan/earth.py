@@ -106,11 +106,6 @@ class LocalFrame:
         # `atan2` also holds beyond a pole, where longitudes differ by more than 90°.
         return math.degrees(math.atan2(math.sin(span) * math.sin(math.radians(float(latitude))), math.cos(span)))
 
-    @property
-    def anchor(self) -> Anchor:
-        """The point as the anchor of a plan whose +y is north."""
-        return Anchor(latitude=self.latitude, longitude=self.longitude, north_deg=0.0)
-
 
 def to_wgs84(code: str, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Convert points in the reference system of an authority's code, such as "EPSG:25832", to longitude and latitude.

@@ -24,31 +24,22 @@ class PlanGeometry:
         walls_m: (r, n, 4) wall segments (x0, y0, x1, y1).
         wall_count: (r,) number of walls without padding.
         opening_kind: (r, m) codes as in `conventions.OPENING_CLASSES`.
-        opening_m: (r, m, 4) the opening on the room's own wall.
-        opening_wall: (r, m) index of that wall, -1 in the padding.
+        opening_wall: (r, m) index of the room's own wall that the opening lies on, -1 in the padding.
         opening_share: (r, m, 2) start and end of the opening as shares of the wall's length.
         sill_m, head_m: (r, m) heights of the opening; -inf and inf if the plan does not give them.
         behind: (r, m) index of the room behind, -1 for none.
-        exit_m: (r, m, 4) the opening on the wall of the room behind; `opening_m` if there is none.
-        opening: (r, m) index in the plan's `openings`, -1 in the padding.
+        exit_m: (r, m, 4) the opening on the wall of the room behind; on the room's own wall if there is none.
     """
 
     walls_m: Float[Array, "r n 4"]
     wall_count: Int[Array, "r"]
     opening_kind: Int[Array, "r m"]
-    opening_m: Float[Array, "r m 4"]
     opening_wall: Int[Array, "r m"]
     opening_share: Float[Array, "r m 2"]
     sill_m: Float[Array, "r m"]
     head_m: Float[Array, "r m"]
     behind: Int[Array, "r m"]
     exit_m: Float[Array, "r m 4"]
-    opening: Int[Array, "r m"]
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays, for numpy."""
-        return sum(getattr(self, field.name).nbytes for field in fields(self))
 
     def like(self, array: Array) -> PlanGeometry:
         """Convert to the array library, device and float type of another array."""
@@ -73,33 +64,30 @@ def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Se
     for face in faces:
         by_room[face.room].append(face)
     shape = (len(rooms), max(map(len, by_room)))
-    kind, wall, behind, opening = (np.full(shape, value) for value in (WALL_CODE, -1, -1, -1))
+    kind, wall, behind = (np.full(shape, value) for value in (WALL_CODE, -1, -1))
     sill_m, head_m = np.full(shape, -np.inf), np.full(shape, np.inf)
-    opening_m, exit_m, share = np.zeros((*shape, 4)), np.zeros((*shape, 4)), np.zeros((*shape, 2))
+    exit_m, share = np.zeros((*shape, 4)), np.zeros((*shape, 2))
     for room, group in enumerate(by_room):
         for k, face in enumerate(group):
             source = openings[face.opening]
             cell = (room, k)
-            kind[cell], wall[cell], behind[cell], opening[cell] = source.code, face.wall, face.behind, face.opening
+            kind[cell], wall[cell], behind[cell] = source.code, face.wall, face.behind
             sill_m[cell] = -np.inf if source.sill_m is None else source.sill_m
             head_m[cell] = np.inf if source.head_m is None else source.head_m
             share[cell] = face.start, face.end
-            opening_m[cell] = rooms[room].wall_part(face.wall, face.start, face.end).ravel()
-            exit_m[cell] = opening_m[cell]
+            exit_m[cell] = rooms[room].wall_part(face.wall, face.start, face.end).ravel()
             if face.behind >= 0:
                 exit_m[cell] = rooms[face.behind].wall_part(face.exit_wall, face.exit_start, face.exit_end).ravel()
     return PlanGeometry(
         walls_m=frozen(walls_m),
         wall_count=frozen(np.array([len(room.walls_m) for room in rooms])),
         opening_kind=frozen(kind),
-        opening_m=frozen(opening_m),
         opening_wall=frozen(wall),
         opening_share=frozen(share),
         sill_m=frozen(sill_m),
         head_m=frozen(head_m),
         behind=frozen(behind),
         exit_m=frozen(exit_m),
-        opening=frozen(opening),
     )
 
 

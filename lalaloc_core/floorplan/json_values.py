@@ -47,7 +47,6 @@ def read_json(text: str | bytes, max_depth: int, max_values: int | None = None) 
             text = text.decode(json.detect_encoding(text), "surrogatepass")
         structure = _JSON_STRING.sub("", text)
         _check_size(structure, max_depth, max_values)
-        _check_digits(structure)
         return json.loads(text, object_pairs_hook=_object)
     except InvalidFloorPlanError:
         raise
@@ -62,7 +61,7 @@ def read_json(text: str | bytes, max_depth: int, max_values: int | None = None) 
 
 
 def _check_size(structure: str, max_depth: int, max_values: int | None) -> None:
-    """Refuse deep nesting and many values before they are parsed; `structure` is the text without its strings."""
+    """Refuse deep nesting, many values and long numbers before they are parsed, in the text without its strings."""
     characters = np.frombuffer(structure.encode("utf-8", "surrogatepass"), np.uint8)
     steps = np.isin(characters, _OPENING).astype(np.int8) - np.isin(characters, _CLOSING)
     depth = int(np.cumsum(steps, dtype=np.int32).max(initial=0))
@@ -73,6 +72,8 @@ def _check_size(structure: str, max_depth: int, max_values: int | None) -> None:
         raise InvalidFloorPlanError(
             f"the JSON has {values} lists, objects and further items; the limit is {max_values}: simplify it"
         )
+    if (found := _DIGITS.search(structure)) is not None:
+        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits; the limit is {_MAX_DIGITS}")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -82,12 +83,6 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise InvalidFloorPlanError(f"the key '{key[:50]}' occurs twice in one object; remove one of them")
         found[key] = value
     return found
-
-
-def _check_digits(structure: str) -> None:
-    found = _DIGITS.search(structure)
-    if found is not None:
-        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits; the limit is {_MAX_DIGITS}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 import shapely
@@ -34,10 +34,6 @@ def frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _no_walls() -> Float[np.ndarray, "0 4"]:
-    return frozen(np.empty((0, 4)))
-
-
 @dataclass(frozen=True, eq=False)
 class Room:
     """One room.
@@ -59,7 +55,7 @@ class Room:
     id: str = ""
     types: tuple[str, ...] = ()
     holes_m: tuple[Float[np.ndarray, "_ 2"], ...] = ()
-    inner_walls_m: Float[np.ndarray, "k 4"] = field(default_factory=_no_walls)
+    inner_walls_m: Float[np.ndarray, "k 4"] = field(default_factory=lambda: frozen(np.empty((0, 4))))
     states_ceiling: bool = True
 
     @property
@@ -174,8 +170,17 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
     """Return a warning for each of the first twenty pairs of rooms that overlap, within a bounded amount of work."""
     shapes = [room.shape for room in rooms]
     pairs = _near_pairs(shapes)
-    crossings = _Crossings(rooms)
     warnings: list[str] = []
+
+    @cache
+    def wall_tree(room: int) -> shapely.STRtree:
+        return shapely.STRtree([shapely.LineString(wall) for wall in rooms[room].walls_m.reshape(-1, 2, 2)])
+
+    def crossings(first: int, second: int) -> int:
+        """Estimate the cost of intersecting two rooms: their walls, and wall pairs whose bounding boxes meet."""
+        met = wall_tree(first).query(wall_tree(second).geometries).shape[1]
+        return len(rooms[first].walls_m) + len(rooms[second].walls_m) + met
+
     work, is_complete = 0, len(pairs) <= _MAX_PAIRS
     for i, j in pairs[:_MAX_PAIRS]:
         if len(warnings) == _MAX_OVERLAPS:
@@ -184,7 +189,7 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
         # Pairs of simple rooms are always tested.
         if len(rooms[i].walls_m) * len(rooms[j].walls_m) > _FEW:
             # Counting is work too, so it stops above the limit.
-            work += crossings.between(i, j) if work <= _MAX_WORK else 0
+            work += crossings(i, j) if work <= _MAX_WORK else 0
             if work > _MAX_WORK:
                 is_complete = False
                 continue
@@ -205,21 +210,3 @@ def _near_pairs(shapes: Sequence[shapely.Polygon]) -> list[tuple[int, int]]:
         if len(pairs) > _MAX_PAIRS:
             break
     return pairs[: _MAX_PAIRS + 1]
-
-
-class _Crossings:
-    """Counter of wall pairs whose bounding boxes meet: an estimate of the cost of intersecting two rooms."""
-
-    def __init__(self, rooms: Sequence[Room]) -> None:
-        self._rooms = rooms
-        self._trees: dict[int, shapely.STRtree] = {}
-
-    def between(self, first: int, second: int) -> int:
-        pairs = self._tree(first).query(self._tree(second).geometries).shape[1]
-        return len(self._rooms[first].walls_m) + len(self._rooms[second].walls_m) + pairs
-
-    def _tree(self, room: int) -> shapely.STRtree:
-        if room not in self._trees:
-            ends = self._rooms[room].walls_m.reshape(-1, 2, 2)
-            self._trees[room] = shapely.STRtree([shapely.LineString(wall) for wall in ends])
-        return self._trees[room]

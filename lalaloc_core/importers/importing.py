@@ -168,15 +168,9 @@ def import_plans(
 ) -> tuple[ImportedPlan, ...]:
     """Return the plans in a file, one per storey, lowest first.
 
-    Args:
-        content: the file.
-        options: options of the import.
-        limits: limits of the file and its plans.
-        clock: clock for the time limit.
-        building: name for a plan that has none, and for plans of several storeys, unless the options have one:
-            "Duplex – Level 1". Several plans in the native format keep their own names.
-        trace: receives what is read from a drawing or a picture, also of a file that is refused.
-        on_step: called with every step as it begins.
+    `building` names a plan that has no name, and plans of several storeys, unless the options have one: "Duplex – Level
+    1". Several plans in the native format keep their own names. `trace` receives what is read from a drawing or a
+    picture, also of a file that is refused. `on_step` is called with every step as it begins.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.

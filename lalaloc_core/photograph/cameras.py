@@ -2,7 +2,7 @@
 
 Rays are in the camera's frame (right, forward, up). Pixel coordinates are continuous: x to the right and y down from
 the picture's top left corner, so the centre of pixel (row i, column j) is (j + 0.5, i + 0.5). OpenCV counts from the
-centre of that pixel instead; `stated_camera.py` converts.
+centre of that pixel instead, `HALF_PIXEL` from the corner; `stated_camera.py` converts.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+# Place of OpenCV's origin, the centre of the first pixel.
+HALF_PIXEL = 0.5
 # Newton steps that undo distortions; each doubles the number of correct digits.
 _STEPS = 12
 _TINY = 1e-12

@@ -236,11 +236,8 @@ def read_taken(exif: Image.Exif, *, width: int, height: int) -> Taken:
 def _time(exif: Image.Exif) -> datetime | None:
     """Return when a photograph was taken; the time of the file's last change is not used."""
     tags = exif.get_ifd(ExifTags.IFD.Exif)
-    for tag, subseconds, offset in _TIMES:
-        at = read_time(_text(tags.get(tag)), _text(tags.get(subseconds)), _text(tags.get(offset)))
-        if at is not None:
-            return at
-    return None
+    times = (read_time(*(_text(tags.get(tag)) for tag in names)) for names in _TIMES)
+    return next(filter(None, times), None)
 
 
 def read_time(text: str, subseconds: str = "", offset: str = "") -> datetime | None:

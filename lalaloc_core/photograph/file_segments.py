@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Iterator
+from itertools import islice, takewhile
 
 from lalaloc_core.errors import InvalidPhotographError
 
@@ -39,14 +40,11 @@ MAX_TEXT_BYTES = 256 * 1024
 
 
 def markers(content: bytes) -> Iterator[tuple[int, int]]:
-    """Yield every marker of a JPEG up to its end, as a decoder reads them, and the offset of its segment's length.
+    """Return every marker of a JPEG up to its end, as a decoder reads them, and the offset of its segment's length.
 
     Data after the end of the picture, such as the video of a motion photo, is ignored.
     """
-    for marker, position in _all_markers(content):
-        if marker == END_OF_IMAGE:
-            return
-        yield marker, position
+    return takewhile(lambda found: found[0] != END_OF_IMAGE, _all_markers(content))
 
 
 def _all_markers(content: bytes) -> Iterator[tuple[int, int]]:
@@ -67,12 +65,8 @@ def count_scans(content: bytes, limit: int) -> int:
     """
     if not content.startswith(START):
         return 0
-    scans = 0
-    for marker, _ in markers(content):
-        scans += marker == START_OF_SCAN
-        if scans > limit:
-            break
-    return scans
+    scans = (marker for marker, _ in markers(content) if marker == START_OF_SCAN)
+    return sum(1 for _ in islice(scans, limit + 1))
 
 
 def check_segments(content: bytes) -> None:

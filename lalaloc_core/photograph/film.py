@@ -173,7 +173,7 @@ def read_film(
         dropped=dict(samples.dropped),
         duration_s=samples.last_s,
         turned=tracker.turned,
-        warnings=(*_on_bars(samples), *_warnings(tracker), *_assumed([angles[index] for index in joined])),
+        warnings=(*_warnings(samples, tracker), *_assumed([angles[index] for index in joined])),
     )
 
 
@@ -215,13 +215,10 @@ def _assumed(angles: Sequence[TurnAngles]) -> list[str]:
     ]
 
 
-def _on_bars(samples: _Samples) -> list[str]:
-    share = samples.bars_share
-    return [f"the film has black bars, {share:.0%} of its picture: they were cut off"] if share > 0.0 else []
-
-
-def _warnings(tracker: FlowTracker) -> list[str]:
+def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
     warnings = []
+    if (share := samples.bars_share) > 0.0:
+        warnings.append(f"the film has black bars, {share:.0%} of its picture: they were cut off")
     if tracker.turned < _LEAST_TURN:
         warnings.append(
             f"the camera turns by {math.degrees(tracker.turned):.0f}° only: film one slow turn, once around on the spot"

@@ -75,7 +75,7 @@ class FlowTracker:
         gradients = [_gradient(picture) for picture in (before, after)]
         if min(float(np.percentile(np.abs(gradient), 99)) for gradient in gradients) < _BLANK:
             return math.nan, _GUESSED_SHARE
-        moved, focal = _moved(before, after), self._focal(after)
+        moved, focal = _moved(before, after), self._focal(after.shape[1], after.shape[0])
         shift = _edges_shift(*gradients)
         swept = None if shift is None else math.atan(-shift / focal)
         if moved is None:
@@ -105,16 +105,12 @@ class FlowTracker:
         heading, error = np.concatenate([np.zeros((2, 1)), summed], axis=1)
         return heading, error
 
-    def _focal(self, grey: UInt8[np.ndarray, "h w"]) -> float:
-        height, width = grey.shape
-        if self._hfov is not None:
-            return _focal_of(self._hfov, width)
-        return _focal_of(_USUAL_FIELD, min(width, height))
+    def _focal(self, width: int, height: int) -> float:
+        return _focal_of(self._hfov, width) if self._hfov else _focal_of(_USUAL_FIELD, min(width, height))
 
     def calibrate(self, hfov: float, size: tuple[int, int]) -> None:
         """Set the scale by the true horizontal field of view (radians) of pictures of a size (width, height)."""
-        presumed = _focal_of(self._hfov, size[0]) if self._hfov else _focal_of(_USUAL_FIELD, min(size))
-        self.scale = presumed / _focal_of(hfov, size[0])
+        self.scale = self._focal(*size) / _focal_of(hfov, size[0])
 
     @property
     def number(self) -> int:

@@ -20,15 +20,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.photograph.cameras import Camera, Perspective, camera_axes
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, Perspective, camera_axes
 
 # Longer side (pixels) at which segments are found, in pictures that are larger by more than the slack.
 _LONG_SIDE, _SLACK = 480, 1.1
 # Shorter segments, as a share of the picture's longer side, are mostly texture.
 _MIN_LENGTH = 0.025
 _MAX_SEGMENTS = 150
-# OpenCV counts from the centre of the first pixel.
-_HALF_PIXEL = 0.5
 # Angular error of a segment: modelling, and of its ends in pixels.
 _SIGMA = math.radians(0.6)
 _SIGMA_PIXELS = 0.6
@@ -108,15 +106,6 @@ class Attitude:
     yaw_sd: float = math.inf
 
 
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
-    """Field of view and tilt of a camera about which nothing is known."""
-
-    hfov: float
-    focal_sd: float
-    attitude: Attitude
-
-
 def find_segments(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"]:
     """Return the longest segments (x, y, x, y; pixels from the top left corner) found by OpenCV's LSD."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
@@ -127,7 +116,7 @@ def find_segments(pixels: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "n 4"
     found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     if found is None:
         return np.zeros((0, 4))
-    segments = found.reshape(-1, 4).astype(float) + _HALF_PIXEL
+    segments = found.reshape(-1, 4).astype(float) + HALF_PIXEL
     length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
     order = np.argsort(-length, kind="stable")[:_MAX_SEGMENTS]
     return segments[order[length[order] > _MIN_LENGTH * max(grey.shape)]] / share
@@ -156,8 +145,13 @@ def estimate_attitude(lines: Lines) -> Attitude:
     return _attitude(_refined(lines, _starts(lines)))
 
 
-def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, height: int) -> Calibration:
-    """Return the most probable field of view and tilt of a perspective camera without distortion."""
+def estimate_calibration(
+    segments: Float[np.ndarray, "n 4"], *, width: int, height: int
+) -> tuple[float, float, Attitude]:
+    """Return what is most probable for a perspective camera without distortion about which nothing is known.
+
+    These are its horizontal field of view (radians), the relative deviation of its focal length, and its tilt.
+    """
     focals = 0.5 * max(width, height) / np.tan(0.5 * _LONG_FOVS)
     modes: list[_Mode] = []
     for focal in focals:
@@ -171,11 +165,8 @@ def estimate_calibration(segments: Float[np.ndarray, "n 4"], *, width: int, heig
     weights /= weights.sum()
     mean = float(weights @ log_focal)
     attitude = _attitude([(angles, score, cov) for (angles, _, cov), score in zip(modes, scores, strict=True)])
-    return Calibration(
-        hfov=2.0 * math.atan(0.5 * width / math.exp(mean)),
-        focal_sd=math.sqrt(float(weights @ (log_focal - mean) ** 2) + _FOCAL_FLOOR**2),
-        attitude=attitude,
-    )
+    focal_sd = math.sqrt(float(weights @ (log_focal - mean) ** 2) + _FOCAL_FLOOR**2)
+    return 2.0 * math.atan(0.5 * width / math.exp(mean)), focal_sd, attitude
 
 
 def _attitude(modes: Sequence[_Mode]) -> Attitude:
@@ -343,14 +334,7 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
     """Return groups of pieces that continue each other."""
     steps = pieces[:, 1] - pieces[:, 0]
     direction = steps / np.maximum(np.linalg.norm(steps, axis=1), 1e-9)[:, None]
-    root = list(range(len(pieces)))
-
-    def find(index: int) -> int:
-        while root[index] != index:
-            root[index] = root[root[index]]
-            index = root[index]
-        return index
-
+    group = {index: [index] for index in range(len(pieces))}
     ends = pieces.reshape(-1, 2)
     apart = np.linalg.norm(ends[:, None] - ends[None], axis=2)
     first, second = np.nonzero(apart < _GAP * side)
@@ -363,12 +347,11 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
         outward = (pieces[i, 1 - a % 2] - ends[a]) @ (pieces[j, 1 - b % 2] - ends[b])
         gap = ends[b] - ends[a]
         offset = min(abs(float(direction[k, 0] * gap[1] - direction[k, 1] * gap[0])) for k in (i, j))
-        if cosine > np.cos(_TURN) and outward < 0.0 and offset < _OFFSET * side:
-            root[find(i)] = find(j)
-    groups: dict[int, list[int]] = {}
-    for index in range(len(pieces)):
-        groups.setdefault(find(index), []).append(index)
-    return list(groups.values())
+        follows = cosine > np.cos(_TURN) and outward < 0.0 and offset < _OFFSET * side
+        if follows and group[i] is not group[j]:
+            merged = sorted(group[i] + group[j])
+            group |= dict.fromkeys(merged, merged)
+    return list({members[0]: members for members in group.values()}.values())
 
 
 def _sampled(pieces: Float[np.ndarray, "k 2 2"]) -> Float[np.ndarray, "m 2"]:

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.photograph.cameras import Camera, camera_axes
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, camera_axes
 from lalaloc_core.photograph.levelling import Attitude
 
 # Features that are kept of a photograph, the strongest of each cell of a grid, and the side of the grid.
@@ -46,7 +46,6 @@ _UPRIGHT = 0.2
 _MAX_PAIRS, _MAX_MATCHES = 200, 60
 _UP = np.array([0.0, 0.0, 1.0])
 _TINY = 1e-9
-_HALF_PIXEL = 0.5
 # Standard deviation (radians) of headings up to which a turn is read as one picture.
 LIKELY_SD = math.radians(12.0)
 # Standard deviation of a step that is assumed, as a share of it.
@@ -98,7 +97,7 @@ def find_features(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> Featur
     if not found:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))
     height, width = grey.shape
-    place = (np.array([point.pt for point in found]) + _HALF_PIXEL) / (width, height)
+    place = (np.array([point.pt for point in found]) + HALF_PIXEL) / (width, height)
     response = np.array([point.response for point in found])
     kept = _spread(place, response)
     return Features(place[kept], np.clip(descriptor[kept], 0, 255).astype(np.uint8))
@@ -304,10 +303,8 @@ def headings_in_order(
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return headings of all photographs minus that of the first, and the deviations of the places of their groups.
 
-    Args:
-        group: numbers of the groups of photographs that overlap, from 0.
-        heading: headings (radians) within the groups.
-        steps: from each photograph to the next one, and for turns that close from the last to the first.
+    Headings (radians) are given within the groups of photographs that overlap, whose numbers count from 0. Steps are
+    from each photograph to the next one, and for turns that close from the last to the first.
     """
     first = np.arange(len(steps))
     second = (first + 1) % len(group)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.conventions import TWO_PI, unit_rays
-from lalaloc_core.photograph.cameras import Camera, camera_axes
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, camera_axes
 
 # Colour of pixels that the photograph does not show.
 UNSEEN = 127
@@ -29,8 +29,6 @@ _JOINED, _AROUND = 8, 0.97
 _SAMPLES, _MAX_ELEVATION = 33, math.radians(45.0)
 # Thumbnails have about so many pixels, and sides that are multiples of the step.
 _THUMBNAIL_PIXELS, _THUMBNAIL_STEP, _MAX_ASPECT = 320 * 256, 32, 8.0
-# cv2.remap counts from the centre of the first pixel.
-_HALF_PIXEL = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +140,7 @@ def _patch(picture: np.ndarray, camera: Camera, axes: np.ndarray, azimuth: float
     turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], np.float32)
     rays = _level_rays(size) @ (axes @ turn).T
     pixels, seen = camera.pixels(rays)
-    where = (np.where(seen[..., None], pixels, 0.0) - _HALF_PIXEL).astype(np.float32)
+    where = (np.where(seen[..., None], pixels, 0.0) - HALF_PIXEL).astype(np.float32)
     colours = cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     colours[~seen] = UNSEEN
     return Patch(pixels=colours, seen=seen, azimuth_rad=azimuth)

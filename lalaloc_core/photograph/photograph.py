@@ -33,23 +33,8 @@ from lalaloc_core.photograph.levelling import (
 from lalaloc_core.photograph.overlap import find_features
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
-from lalaloc_core.photograph.picture_files import (
-    FORMATS,
-    NEUTRAL,
-    PhotographLimits,
-    PictureFile,
-    opened_picture,
-    scaled,
-)
-from lalaloc_core.photograph.projection import (
-    COARSEST,
-    Lens,
-    Projection,
-    Source,
-    find_lens,
-    is_closed,
-    is_twice_as_wide,
-)
+from lalaloc_core.photograph.picture_files import FORMATS, PhotographLimits, PictureFile, opened_picture, scaled
+from lalaloc_core.photograph.projection import COARSEST, Lens, Source, find_lens, is_closed, is_twice_as_wide
 from lalaloc_core.photograph.sphere_formats import (
     THUMBNAIL_SIDE,
     SphereFormat,
@@ -58,7 +43,7 @@ from lalaloc_core.photograph.sphere_formats import (
     looks_spherical,
 )
 from lalaloc_core.photograph.spheres import level_sphere
-from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
+from lalaloc_core.photograph.stated_camera import AUTO, Projection, StatedCamera
 from lalaloc_core.photograph.turn_angles import Overview
 
 # Use of a photograph: by itself, in an album, or in a turn, where `turned.py` finds its tilt and cuts its patches.
@@ -176,7 +161,7 @@ def warm_up(*, sphere_size: tuple[int, int], patch_size: PatchSize) -> None:
         ("JPEG", 192, StatedCamera(projection="perspective", hfov_deg=70.0)),
     ):
         buffer = io.BytesIO()
-        Image.new("RGB", (256, height), NEUTRAL).save(buffer, name)
+        Image.new("RGB", (256, height), "gray").save(buffer, name)
         open_photograph(buffer.getvalue(), sphere_size=sphere_size, stated=stated, patch_size=patch_size)
 
 
@@ -367,9 +352,8 @@ def photograph_of_picture(
     segments = find_segments(picture)
     warnings = lens.warnings
     if lens.camera is None:
-        found = estimate_calibration(segments, width=columns, height=rows)
-        attitude, focal_sd = found.attitude, found.focal_sd
-        camera: Camera = Perspective.of_hfov(*full_size, found.hfov)
+        estimated_hfov, focal_sd, attitude = estimate_calibration(segments, width=columns, height=rows)
+        camera: Camera = Perspective.of_hfov(*full_size, estimated_hfov)
         small = camera.scaled(columns, rows)
         if purpose != "turn":
             origin = "was estimated from straight lines" if len(segments) else "is only usual"

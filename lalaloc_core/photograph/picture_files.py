@@ -202,10 +202,8 @@ def turned(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 def scaled(file: PictureFile, size: tuple[int, int], *, oversampling: int = 2) -> Image.Image:
     """Scale the part of a picture that counts to a size as RGB, and rotate it upright.
 
-    Args:
-        file: file of `opened_picture`.
-        size: width and height of the upright picture.
-        oversampling: least ratio of the decoded to the requested size, for pictures that are large enough.
+    `size` is that of the upright picture (width, height). `oversampling` is the least ratio of the decoded to the
+    requested size, for pictures that are large enough.
     """
     if file.box != _WHOLE:
         return _scaled_part(file, size)

@@ -53,16 +53,8 @@ class Place:
     direction_deg: float | None = None
 
 
-@dataclass(frozen=True)
-class PlacedCopy:
-    """A copy: its content, and the content of an XMP file beside it; None if the copy has the place itself."""
-
-    content: bytes
-    sidecar: bytes | None
-
-
-def placed_copy(content: bytes, place: Place) -> PlacedCopy:
-    """Return a copy of a picture file with a place.
+def placed_copy(content: bytes, place: Place) -> tuple[bytes, bytes | None]:
+    """Return a copy of a picture file with a place, and an XMP file to lie beside it; None if the copy has the place.
 
     Positions and directions that the file states are replaced, keywords are added to its own.
     """
@@ -72,10 +64,10 @@ def placed_copy(content: bytes, place: Place) -> PlacedCopy:
         xmp = _xmp(packet, place)
         stated = _exif(exif, place)
     if kind == "JPEG" and len(_XMP) + len(xmp) <= _MAX_SEGMENT:
-        return PlacedCopy(_in_jpeg(content, stated, xmp), None)
+        return _in_jpeg(content, stated, xmp), None
     if kind == "PNG":
-        return PlacedCopy(_in_png(content, stated, xmp), None)
-    return PlacedCopy(content, xmp)
+        return _in_png(content, stated, xmp), None
+    return content, xmp
 
 
 def _exif(exif: Image.Exif, place: Place) -> bytes | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -92,18 +92,12 @@ def find_lens(
     """
     stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)
+    unknown = Lens(projection=projection, projection_source=source)
 
     def known(camera: Camera, hfov_source: Source, warnings: tuple[str, ...] = ()) -> Lens:
         if isinstance(camera, Perspective) and exif.fisheye is None:
             warnings += compare_focal_lengths(camera.fx, exif.focal, width)
-        return Lens(
-            projection=projection,
-            projection_source=source,
-            camera=camera,
-            hfov_source=hfov_source,
-            focal_sd=_GIVEN_SD,
-            warnings=warnings,
-        )
+        return replace(unknown, camera=camera, hfov_source=hfov_source, focal_sd=_GIVEN_SD, warnings=warnings)
 
     if stated.intrinsics is not None and projection in ("perspective", "fisheye"):
         intrinsics, warnings = fit_intrinsics(stated.intrinsics, width, height, orientation)
@@ -113,7 +107,7 @@ def find_lens(
         return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
     if projection == "equirectangular":
         unused = () if stated.intrinsics is None else ("intrinsics are not used: the photograph is a sphere",)
-        return Lens(projection=projection, projection_source=source, hfov_source=source, warnings=unused)
+        return replace(unknown, hfov_source=source, warnings=unused)
     if projection == "cylindrical" and sphere.cylinder is not None and (sphere.cylinder < TWO_PI or closes()):
         return known(camera_of_hfov(projection, width, height, sphere.cylinder), "gpano")
     if projection == "cylindrical":
@@ -122,12 +116,12 @@ def find_lens(
             "send hfov_deg, its horizontal field of view (up to 360)"
         )
     if projection == "fisheye" and exif.fisheye is not None:
-        return _action_camera(width, height, source, exif, exif.fisheye)
+        return _action_camera(width, height, unknown, exif, exif.fisheye)
     if projection == "fisheye":
         raise InvalidPhotographError(
             "a fisheye photograph needs hfov_deg, its horizontal field of view, or intrinsics (OpenCV's fisheye model)"
         )
-    return _perspective(width, height, source, exif)
+    return _perspective(width, height, replace(unknown, warnings=exif.warnings), exif)
 
 
 def is_sphere(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
@@ -207,36 +201,24 @@ def _projection(
     return "perspective", "exif" if exif.focal is not None else "assumed"
 
 
-def _action_camera(width: int, height: int, source: Source, exif: ExifLens, angle: float) -> Lens:
+def _action_camera(width: int, height: int, lens: Lens, exif: ExifLens, angle: float) -> Lens:
     """Return the lens of an action camera by its maker and model."""
     text = (
         f"{exif.camera} has a fisheye lens of about {math.degrees(angle):.0f}° across the longer side, which is "
         "assumed; for a linear mode send projection=perspective and hfov_deg"
     )
-    return Lens(
-        projection="fisheye",
-        projection_source=source,
-        camera=camera_of_hfov("fisheye", width, height, angle * width / max(width, height)),
-        hfov_source="assumed",
-        focal_sd=_ACTION_SD,
-        warnings=(*exif.warnings, text),
-    )
+    camera = camera_of_hfov("fisheye", width, height, angle * width / max(width, height))
+    warnings = (*exif.warnings, text)
+    return replace(lens, camera=camera, hfov_source="assumed", focal_sd=_ACTION_SD, warnings=warnings)
 
 
-def _perspective(width: int, height: int, source: Source, exif: ExifLens) -> Lens:
+def _perspective(width: int, height: int, lens: Lens, exif: ExifLens) -> Lens:
     """Return the lens of an ordinary photograph by its EXIF focal length, if that is plausible."""
     if exif.focal is None:
-        return Lens(projection="perspective", projection_source=source, warnings=exif.warnings)
+        return lens
     camera = Perspective(width=width, height=height, fx=exif.focal, fy=exif.focal, cx=0.5 * width, cy=0.5 * height)
     low, high = HFOV_RANGE_DEG["perspective"]
     if not low <= math.degrees(camera.hfov) <= high:
         warning = f"the EXIF focal length gives a field of view of {math.degrees(camera.hfov):.3g}° and is ignored"
-        return Lens(projection="perspective", projection_source=source, warnings=(*exif.warnings, warning))
-    return Lens(
-        projection="perspective",
-        projection_source=source,
-        camera=camera,
-        hfov_source="exif",
-        focal_sd=exif.focal_sd,
-        warnings=exif.warnings,
-    )
+        return replace(lens, warnings=(*exif.warnings, warning))
+    return replace(lens, camera=camera, hfov_source="exif", focal_sd=exif.focal_sd)

@@ -50,8 +50,12 @@ def level_sphere(
         part, turn = part.centred, 0.0
     finer = 1 if part is None and sphere.level else _FINER
     canvas_size = (width * finer, height * finer)
-    picture = scaled(file, _shown_size(part, canvas_size))
-    canvas = picture if part is None else _placed(picture, part, canvas_size)
+    if part is None:
+        canvas = scaled(file, canvas_size)
+    else:
+        # At least as fine as the canvas.
+        shown_size = math.ceil(canvas_size[0] * part.width), math.ceil(canvas_size[1] * part.height)
+        canvas = _placed(scaled(file, shown_size), part, canvas_size)
     if not sphere.level or turn:
         canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll, turn=turn))
     return np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
@@ -69,12 +73,6 @@ def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: Photograp
             f"the photograph is {width} x {height}; a full 360° sphere is twice as wide as high, within "
             f"{limits.aspect_tolerance:.0%}{fault}"
         )
-
-
-def _shown_size(part: SpherePart | None, canvas_size: tuple[int, int]) -> tuple[int, int]:
-    """Return the size to scale a picture of a part of the sphere to, at least as fine as the canvas."""
-    width, height = canvas_size
-    return (width, height) if part is None else (math.ceil(width * part.width), math.ceil(height * part.height))
 
 
 def _placed(picture: Image.Image, part: SpherePart, size: tuple[int, int]) -> Image.Image:

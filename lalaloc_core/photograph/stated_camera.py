@@ -7,13 +7,13 @@ are near the middle of the picture, which tells the size that a calibration was 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Around, Camera, Fisheye, Perspective
 
 Projection = Literal["equirectangular", "perspective", "cylindrical", "fisheye"]
 AUTO = "auto"
@@ -28,8 +28,6 @@ HFOV_RANGE_DEG = {
 MAX_PITCH_DEG, MAX_ROLL_DEG = 60.0, 180.0
 _MAX_FOCAL_RATIO = 2.0
 _MAX_COEFFICIENT = 100.0
-# OpenCV counts pixels from the centre of the first one.
-_HALF_PIXEL = 0.5
 # Largest error (pixels) of distorting again what was undistorted.
 _ROUND_TRIP = 0.5
 # Distance of the principal point from the middle, a share of the side, beyond which a calibration hardly fits.
@@ -98,8 +96,7 @@ class StatedCamera:
         self._check_intrinsics(self.intrinsics)
 
     def _check_intrinsics(self, intrinsics: Intrinsics) -> None:
-        for name in (field.name for field in fields(intrinsics)):
-            value = getattr(intrinsics, name)
+        for name, value in vars(intrinsics).items():
             if value is not None and not math.isfinite(value):
                 raise InvalidPhotographError(f"intrinsics: {name} is {value}; it must be finite")
         for name, focal in (("fx", intrinsics.fx), ("fy", intrinsics.fy)):
@@ -112,10 +109,9 @@ class StatedCamera:
             )
         for name in ("k1", "k2", "k3", "k4", "p1", "p2"):
             _check_range(f"intrinsics: {name}", getattr(intrinsics, name), -_MAX_COEFFICIENT, _MAX_COEFFICIENT)
-        unused = ("p1", "p2") if self.projection == "fisheye" else ("k4",)
+        kind, unused = ("fisheye", ("p1", "p2")) if self.projection == "fisheye" else ("perspective", ("k4",))
         for name in unused:
             if getattr(intrinsics, name) != 0.0:
-                kind = "fisheye" if self.projection == "fisheye" else "perspective"
                 raise InvalidPhotographError(
                     f"intrinsics: {name} does not belong to the projection '{kind}'; leave it out"
                 )
@@ -136,7 +132,7 @@ def camera_of_intrinsics(
     """Return the camera of checked intrinsics."""
     centre: list[float] = []
     for name, value, side in (("cx", intrinsics.cx, width), ("cy", intrinsics.cy, height)):
-        position = 0.5 * side if value is None else value + _HALF_PIXEL
+        position = 0.5 * side if value is None else value + HALF_PIXEL
         if not 0.0 <= position <= side:
             raise InvalidPhotographError(
                 f"intrinsics: {name} is {value:g}, outside of the upright picture of {width} x {height}"
@@ -164,7 +160,7 @@ def camera_of_intrinsics(
 
 def intrinsics_of(camera: Perspective | Fisheye) -> Intrinsics:
     """Return the intrinsics of a camera, from which `camera_of_intrinsics` makes it again."""
-    matrix = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - _HALF_PIXEL, "cy": camera.cy - _HALF_PIXEL}
+    matrix = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx - HALF_PIXEL, "cy": camera.cy - HALF_PIXEL}
     if isinstance(camera, Fisheye):
         k1, k2, k3, k4 = camera.radial
         return Intrinsics(**matrix, k1=k1, k2=k2, k3=k3, k4=k4)
@@ -194,7 +190,7 @@ def fit_intrinsics(stated: Intrinsics, width: int, height: int, orientation: int
     """Return the intrinsics of the upright picture, and a warning if they were changed or do not fit."""
     if stated.cx is None or stated.cy is None:
         return stated, ()
-    x, y = stated.cx + _HALF_PIXEL, stated.cy + _HALF_PIXEL
+    x, y = stated.cx + HALF_PIXEL, stated.cy + HALF_PIXEL
     named = f"intrinsics: (cx, cy) is ({stated.cx:g}, {stated.cy:g})"
     if max(abs(x / width - 0.5), abs(y / height - 0.5)) <= _FAR or min(x, y) <= 0.0:
         return stated, ()
@@ -231,10 +227,10 @@ def _scaled(stated: Intrinsics, width: int, height: int, named: str) -> tuple[In
     """Return the intrinsics scaled to a picture in whose middle the principal point is."""
     assert stated.cx is not None
     assert stated.cy is not None
-    x, y = stated.cx + _HALF_PIXEL, stated.cy + _HALF_PIXEL
+    x, y = stated.cx + HALF_PIXEL, stated.cy + HALF_PIXEL
     scale = 0.5 * math.sqrt(width * height / (x * y))
     fitted = replace(
-        stated, fx=stated.fx * scale, fy=stated.fy * scale, cx=x * scale - _HALF_PIXEL, cy=y * scale - _HALF_PIXEL
+        stated, fx=stated.fx * scale, fy=stated.fy * scale, cx=x * scale - HALF_PIXEL, cy=y * scale - HALF_PIXEL
     )
     text = (
         f"{named}, the middle of a picture of {2.0 * x:.0f} x {2.0 * y:.0f}, and the photograph has {width} x "
@@ -247,6 +243,6 @@ def _turned(stated: Intrinsics, width: int, height: int, *, is_clockwise: bool) 
     """Return the intrinsics of the upright picture, by a quarter turn of the stored one."""
     assert stated.cx is not None
     assert stated.cy is not None
-    x, y = stated.cx + _HALF_PIXEL, stated.cy + _HALF_PIXEL
+    x, y = stated.cx + HALF_PIXEL, stated.cy + HALF_PIXEL
     cx, cy, p1, p2 = (width - y, x, stated.p2, -stated.p1) if is_clockwise else (y, height - x, -stated.p2, stated.p1)
-    return replace(stated, fx=stated.fy, fy=stated.fx, cx=cx - _HALF_PIXEL, cy=cy - _HALF_PIXEL, p1=p1, p2=p2)
+    return replace(stated, fx=stated.fy, fy=stated.fx, cx=cx - HALF_PIXEL, cy=cy - HALF_PIXEL, p1=p1, p2=p2)

@@ -108,13 +108,8 @@ def _turned(photograph: Photograph, turn_view: TurnView, angles: TurnAngles, siz
     origin = "was estimated from all photographs of the turn"
     if not _is_possible(photograph, camera, pitch.value, roll.value):
         assert photograph.camera is not None
-        camera, hfov, pitch, roll, origin = (
-            photograph.camera,
-            photograph.hfov,
-            photograph.pitch,
-            photograph.roll,
-            "was estimated from straight lines",
-        )
+        camera, hfov, pitch, roll = photograph.camera, photograph.hfov, photograph.pitch, photograph.roll
+        origin = "was estimated from straight lines"
     if hfov.source == "estimated":
         warnings = (*warnings, field_warning(hfov.value, hfov.sd, origin))
     rows, columns = photograph.overview.picture.shape[:2]

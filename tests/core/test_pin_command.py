@@ -137,8 +137,8 @@ def test_shown_names_hold_no_formulas_or_control_characters() -> None:
     assert [no_formula(text) for text in ("=1", "-1", " ＝1", "a=1", "")] == ["'=1", "'-1", "' ＝1", "a=1", ""]
     name = printable("K\udcffche\x07\ufffe.jpg")
     assert name == "K\ufffdche\ufffd\ufffd.jpg"
-    copy = placed_copy(_picture("JPEG"), replace(PLACE, room="K\ufffeche"))
-    with Image.open(io.BytesIO(copy.content)) as picture:
+    copy, _ = placed_copy(_picture("JPEG"), replace(PLACE, room="K\ufffeche"))
+    with Image.open(io.BytesIO(copy)) as picture:
         assert picture.getxmp()["xmpmeta"]["RDF"]["Description"]["Location"] == "K\ufffdche"
 
 
@@ -202,10 +202,10 @@ def test_copy_states_the_place_and_keeps_everything_else(kind: str) -> None:
     exif[ExifTags.Base.Make] = "Maker"
     exif[ExifTags.IFD.Exif] = {ExifTags.Base.DateTimeOriginal: "2026:05:01 12:00:00"}
     content = _picture(kind, exif=exif.tobytes())
-    first = placed_copy(content, PLACE)
-    assert first.sidecar is None
+    first, sidecar = placed_copy(content, PLACE)
+    assert sidecar is None
     # Twice, as for a copy of a copy: nothing is written double.
-    again = placed_copy(first.content, PLACE).content
+    again, _ = placed_copy(first, PLACE)
     with Image.open(io.BytesIO(again)) as copy, Image.open(io.BytesIO(content)) as original:
         np.testing.assert_array_equal(np.asarray(copy), np.asarray(original))
         found, xmp = copy.getexif(), copy.getxmp()["xmpmeta"]["RDF"]["Description"]
@@ -227,11 +227,11 @@ def test_other_formats_get_a_file_beside_them(kind: str) -> None:
     if kind == "HEIF":
         pytest.importorskip("pillow_heif").register_heif_opener()
     content = _picture(kind)
-    copy = placed_copy(content, PLACE)
+    copy, sidecar = placed_copy(content, PLACE)
     # Byte by byte, so that the pixels are the same whatever decodes them.
-    assert copy.content == content
-    assert copy.sidecar is not None
-    root = fromstring(copy.sidecar.decode().partition("?>")[2].rpartition("<?xpacket")[0])
+    assert copy == content
+    assert sidecar is not None
+    root = fromstring(sidecar.decode().partition("?>")[2].rpartition("<?xpacket")[0])
     names = [element.text for element in root.iter() if element.tag.endswith("}li")]
     assert names == ["Küche", "Ground & first", "Ground & first|Küche"]
     stated = {element.tag.rpartition("}")[2]: element.text for element in root.iter()}
@@ -263,7 +263,7 @@ def test_keywords_of_the_file_stay() -> None:
         b'<rdf:Description xmlns:dc="http://purl.org/dc/elements/1.1/"><dc:subject><rdf:Bag><rdf:li>site</rdf:li>'
         b"</rdf:Bag></dc:subject></rdf:Description></rdf:RDF></x:xmpmeta>"
     )
-    copy = placed_copy(_picture("JPEG", xmp=packet), PLACE).content
+    copy, _ = placed_copy(_picture("JPEG", xmp=packet), PLACE)
     with Image.open(io.BytesIO(copy)) as picture:
         words = picture.getxmp()["xmpmeta"]["RDF"]["Description"]["subject"]["Bag"]["li"]
     assert words == ["site", "Küche", "Ground & first"]

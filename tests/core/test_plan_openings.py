@@ -41,7 +41,7 @@ def test_opening_belongs_to_both_rooms_of_a_wall() -> None:
     plan = with_openings(DOOR)
     first, second = plan.opening_faces
     assert (first.room, first.behind, second.room, second.behind) == (0, 1, 1, 0)
-    np.testing.assert_allclose(plan.geometry.opening_m[0, 0], [4.0, 1.0, 4.0, 1.9])
+    np.testing.assert_allclose(plan.rooms[0].wall_part(first.wall, first.start, first.end), [[4.0, 1.0], [4.0, 1.9]])
     np.testing.assert_allclose(plan.geometry.exit_m[0, 0][[0, 2]], [4.2, 4.2])
     assert plan.geometry.opening_kind.tolist() == [[1], [1]]
     assert plan.warnings == ()

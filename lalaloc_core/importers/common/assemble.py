@@ -25,15 +25,7 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
-from lalaloc_core.importers.common.sketch import (
-    Level,
-    Sketch,
-    SketchedFixture,
-    SketchedOpening,
-    SketchedRoom,
-    T,
-    choose_levels,
-)
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
 from lalaloc_core.importers.common.vocabulary import is_roof
 
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
@@ -102,14 +94,12 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     rooms = _without_areas(_without_low_rooms(rooms, builder), builder)
     rooms, shift = _near_origin(rooms, builder)
     openings = [_shift_opening(opening, shift) for opening in sketch.openings]
-    placed = place_openings(openings, [room.shape for room in rooms])
-    if placed.off_wall:
-        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in placed.off_wall[:_MAX_NAMED])
-        builder.warnings.append(
-            f"{len(placed.off_wall)} openings lie on no wall and were left out, for example at {places}"
-        )
-    if placed.overlapping:
-        builder.notes.append(f"{placed.overlapping} openings that overlap other openings were left out")
+    openings, off_wall, overlapping = place_openings(openings, [room.shape for room in rooms])
+    if off_wall:
+        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in off_wall[:_MAX_NAMED])
+        builder.warnings.append(f"{len(off_wall)} openings lie on no wall and were left out, for example at {places}")
+    if overlapping:
+        builder.notes.append(f"{overlapping} openings that overlap other openings were left out")
     name = options.name or clean_name(sketch.name)
     document: dict[str, Any] = {} if name is None else {"name": name}
     if sketch.north_deg is not None:
@@ -118,14 +108,15 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
-    fixtures = place_fixtures([_shift_fixture(fixture, shift) for fixture in sketch.fixtures], rooms, builder)
+    drawn = [replace(fixture, shape=affinity.translate(fixture.shape, *shift)) for fixture in sketch.fixtures]
+    fixtures = place_fixtures(drawn, rooms, builder)
     rooms = type_rooms(rooms, fixtures, builder)
     ceiling_m = _usual_ceiling(rooms, options, builder)
     if ceiling_m is not None:
         document["ceiling_height_m"] = ceiling_m
     document["rooms"] = [_room(room, ceiling_m, sketch, shift) for room in rooms]
-    if placed.openings:
-        document["openings"] = [_opening(opening) for opening in placed.openings]
+    if openings:
+        document["openings"] = [_opening(opening) for opening in openings]
     if fixtures:
         document["fixtures"] = [
             {"kind": fixture.kind, "outline": _ring(fixture.shape.exterior)} for _, fixture in fixtures
@@ -163,11 +154,8 @@ def assemble_levels(
 ) -> tuple[ImportedPlan, ...]:
     """Return the plans of the chosen levels, lowest first; of several levels, those without a room are left out.
 
-    Args:
-        levels: levels of a file, with their contents.
-        options: options of the import.
-        budget: limits of the import, which is told every level as it begins.
-        make: makes the plan of a level.
+    `levels` are the levels of a file with their contents, and `make` makes the plan of one of them; the budget is told
+    every level as it begins.
     """
     chosen = choose_levels(levels, options)
     if len(chosen) > (most := budget.limits.max_levels):
@@ -224,13 +212,10 @@ def _clean(
         for simple in _simple(_simplify(floor, label, limits, builder))
     ]
     floors = [floor for floor in floors if floor.area >= limits.min_room_area_m2]
-    if not floors and room.shape.area < _SLIVER_M2:
-        return []
-    if not floors:
+    if not floors and room.shape.area >= _SLIVER_M2:
         builder.notes.append(
             f"{label} of {room.shape.area:.2g} m² was left out: the smallest room is {limits.min_room_area_m2:g} m²"
         )
-        return []
     if len(floors) > 1:
         builder.warnings.append(f"{label} has {len(floors)} separate parts; each became a room")
     cleaned = []
@@ -352,10 +337,6 @@ def _shift_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: Re
 def _shift_opening(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
     (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
     return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
-
-
-def _shift_fixture(fixture: SketchedFixture, shift: tuple[float, float]) -> SketchedFixture:
-    return replace(fixture, shape=affinity.translate(fixture.shape, *shift))
 
 
 def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float | None:

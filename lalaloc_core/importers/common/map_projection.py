@@ -43,16 +43,22 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
     if options.units is not None:
         factor = METRES_PER_UNIT[options.units]
         return Projection(_scaling(factor, options), None, factor, "option units")
+
+    def convert(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        converted = points if crs is None else to_wgs84(crs, points)
+        if not np.isfinite(converted).all():
+            raise InvalidFloorPlanError(
+                "coordinates lie outside the area of their reference system; check crs, or set units for a drawing"
+            )
+        return converted
+
     if crs is not None:
         try:
-            convert = _refuse_infinite(lambda points: to_wgs84(crs, points))
             low, high = (convert(np.array([corner]))[0] for corner in (low, high))
         except ProjError as error:
             raise InvalidFloorPlanError(
                 f"the crs '{crs}' is unknown or cannot be used; export the file in WGS84"
             ) from error
-    else:
-        convert = _refuse_infinite(lambda points: points)
     if not (np.abs([low, high]) <= [180.0, 90.0]).all():
         raise InvalidFloorPlanError(
             f"coordinates reach ({high[0]:g}, {high[1]:g}), outside longitude ±180 and latitude ±90; "
@@ -85,7 +91,8 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
             f"the features span {2.0 * reach_m:.0f} m; the limit for a plan is {2 * _MAX_REACH_M:g} m; "
             "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
-    return Projection(project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs)
+    anchor = Anchor(frame.latitude, frame.longitude)
+    return Projection(project, anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs)
 
 
 def _flipped(shape: BaseGeometry) -> BaseGeometry:
@@ -114,18 +121,6 @@ def _middle(lon_lat: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
     directions = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
     x, y, z = (float(direction.mean()) for direction in directions)
     return math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
-
-
-def _refuse_infinite(convert: Any) -> Any:
-    def convert_finite(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        converted = convert(points)
-        if not np.isfinite(converted).all():
-            raise InvalidFloorPlanError(
-                "coordinates lie outside the area of their reference system; check crs, or set units for a drawing"
-            )
-        return converted
-
-    return convert_finite
 
 
 def _scaling(factor: float, options: ImportOptions) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -26,19 +26,13 @@ _ON_WALL_M = 0.05
 _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
-@dataclass(frozen=True)
-class _PlacedOpenings:
-    """Openings on walls, openings on no wall, and the number left out because another takes their place."""
-
-    openings: list[SketchedOpening]
-    off_wall: list[SketchedOpening]
-    overlapping: int
-
-
-def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> _PlacedOpenings:
+def place_openings(
+    openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]
+) -> tuple[list[SketchedOpening], list[SketchedOpening], int]:
     """Move every opening onto the walls beside it.
 
-    If two openings overlap in a wall, a door is kept before a window and a window before a passage.
+    Returns the openings on walls, those on no wall, and the number of those left out: if two overlap in a wall, a door
+    is kept before a window and a window before a passage.
     """
     edges = _edges(rooms)
     tree = shapely.STRtree([_segment(edge) for edge in edges])
@@ -55,7 +49,7 @@ def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.
             _stack_window(placed, kept)
         else:
             kept.append(free)
-    return _PlacedOpenings(kept, off_wall, overlapping)
+    return kept, off_wall, overlapping
 
 
 class WallLines:
@@ -68,11 +62,11 @@ class WallLines:
         self._edges = _edges([part for room in rooms for part in polygons_from_geometry(room.simplify(_ON_WALL_M))])
         self._tree = shapely.STRtree([_segment(edge) for edge in self._edges])
 
-    def line_at(self, point: Point, width_m: float) -> tuple[Point, Point] | None:
+    def line_at(self, point: shapely.Point, width_m: float) -> tuple[Point, Point] | None:
         """Return the ends of an opening of a width on the longest of the walls nearest to a point, None if none is."""
-        near = self._tree.query(shapely.Point(point), predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
+        near = self._tree.query(point, predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
         segments = [_segment(self._edges[index]) for index in near]
-        apart = [segment.distance(shapely.Point(point)) for segment in segments]
+        apart = [segment.distance(point) for segment in segments]
         nearest = min(apart, default=0.0) + _ON_WALL_M
         wall = max(
             (s for s, away in zip(segments, apart, strict=True) if away <= nearest),
@@ -82,7 +76,7 @@ class WallLines:
         if wall is None:
             return None
         half = 0.5 * min(width_m, wall.length)
-        middle = min(max(wall.project(shapely.Point(point)), half), wall.length - half)
+        middle = min(max(wall.project(point), half), wall.length - half)
         start, end = wall.interpolate(middle - half), wall.interpolate(middle + half)
         return (start.x, start.y), (end.x, end.y)
 

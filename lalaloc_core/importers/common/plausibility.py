@@ -29,8 +29,8 @@ from lalaloc_core.importers.common.import_options import METRES_PER_UNIT
 USUAL_CEILING_M = (1.9, 6.0)
 _USUAL_DOOR_M = (0.5, 3.0)
 _USUAL_ROOM_M2 = (0.64, 1600.0)
-# Largest distance of two rooms that share a wall, and reach of an opening to either side (m).
-_USUAL_WALL_M, _REACH_M = 0.6, 0.45
+# Largest distance of two rooms that share a wall, reach of an opening to either side, and shortest outer wall (m).
+_WALL_M, _REACH_M, _OUTER_M = 0.6, 0.45, 1.5
 # Usual door leaves, sides of rooms and buildings in drawings without a unit (m).
 _USUAL_LEAF_M, _USUAL_SIDE_M, _USUAL_EXTENT_M = (0.55, 1.3), (1.0, 40.0), (4.0, 120.0)
 _IMPERIAL = 0.7
@@ -43,8 +43,6 @@ _IN_PART, _NOT_DRAWN, _STRENGTH = 0.2, 0.25, 20.0
 _ABSENT_PASSAGES = 0.7
 # Trust in passages of a plan without doors, relative to others: they can be doors whose leaves are not drawn.
 _LEAFLESS = 0.6
-# Thickest wall between two rooms, and shortest outer wall (m).
-_WALL_M, _OUTER_M = 0.6, 1.5
 # Smaller rooms (m²) can be ducts without an entry, or lack a window.
 _MIN_ENTERED_M2, _MIN_LIT_M2 = 1.5, 6.0
 _UNLIT_TYPES = {
@@ -133,7 +131,7 @@ def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list
 
 
 def _door_warnings(document: Mapping[str, Any]) -> list[str]:
-    widths = [_length(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == "door"]
+    widths = [line.length for line in _lines(document, "door")]
     if not widths:
         return []
     return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M)
@@ -150,18 +148,16 @@ def _size_warnings(rooms: Sequence[shapely.Polygon]) -> list[str]:
 
 def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:
     """Find rooms farther from all others than a wall is thick."""
-    if len(rooms) < 2:
-        return []
     tree = shapely.STRtree(rooms)
-    isolated = []
-    for index, room in enumerate(rooms):
-        near = tree.query(room, predicate="dwithin", distance=_USUAL_WALL_M)
-        if len(near) < 2:
-            isolated.append(names[index])
-    if not isolated:
+    isolated = [
+        name
+        for name, room in zip(names, rooms, strict=True)
+        if len(tree.query(room, predicate="dwithin", distance=_WALL_M)) < 2
+    ]
+    if len(rooms) < 2 or not isolated:
         return []
     return [
-        f"rooms farther than a wall's thickness ({_USUAL_WALL_M:g} m) from every other room: {_list_names(isolated)}; "
+        f"rooms farther than a wall's thickness ({_WALL_M:g} m) from every other room: {_list_names(isolated)}; "
         "check the scale and look for missing rooms"
     ]
 
@@ -180,11 +176,6 @@ def _unreachable_rooms(
         if len(tree.query(room.exterior, predicate="dwithin", distance=_REACH_M)) == 0
     ]
     return [f"no door or passage reaches {_list_names(unreachable)}"] if unreachable else []
-
-
-def _length(line: Sequence[Sequence[float]]) -> float:
-    (x0, y0), (x1, y1) = line
-    return float(np.hypot(x1 - x0, y1 - y0))
 
 
 def _list_names(names: Sequence[str]) -> str:

@@ -150,11 +150,8 @@ def _height(level: Level) -> float:
 def choose_storey(sketch: Sketch, builder: ReportBuilder, in_file: Callable[[Box], Box], *, is_chosen: bool) -> Sketch:
     """Return the largest of several storeys that are drawn side by side; warn with the `crop` of every one.
 
-    Args:
-        sketch: rooms in metres.
-        builder: receives the warning.
-        in_file: converts a box in metres (left, lowest, right, highest) to the file's coordinates.
-        is_chosen: leave out the other storeys; otherwise they are only named.
+    `in_file` converts a box in metres (left, lowest, right, highest) to the file's coordinates. The other storeys are
+    left out if `is_chosen`, else they are only named.
     """
     together = shapely.union_all([room.shape.buffer(0.5 * _APART_M) for room in sketch.rooms])
     parts = polygons_from_geometry(together)
@@ -177,9 +174,8 @@ def choose_storey(sketch: Sketch, builder: ReportBuilder, in_file: Callable[[Box
     if not is_chosen:
         return sketch
     chosen, near = storeys[0][1], storeys[0][1].buffer(_REACH_M)
-    rooms = [room for room in sketch.rooms if chosen.covers(room.shape)]
     builder.no_room = [area for area in builder.no_room if near.covers(area)]
-    sketch.rooms = rooms
+    sketch.rooms = [room for room in sketch.rooms if chosen.covers(room.shape)]
     sketch.openings = [opening for opening in sketch.openings if near.covers(opening.line)]
     sketch.fixtures = [fixture for fixture in sketch.fixtures if near.covers(fixture.shape)]
     return sketch

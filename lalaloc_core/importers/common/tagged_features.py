@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -30,7 +30,6 @@ from lalaloc_core.importers.common.sketch import (
     ROOM_HEIGHT_M,
     Level,
     OpeningKind,
-    Point,
     Sketch,
     SketchedFixture,
     SketchedOpening,
@@ -78,19 +77,6 @@ class Feature:
     id: str | None
 
 
-@dataclass(frozen=True)
-class _PointOpening:
-    """Opening drawn as a point on a wall, as in OpenStreetMap; `has_level` is False if it may belong to any level."""
-
-    kind: OpeningKind
-    position: Point
-    width_m: float
-    name: str | None
-    head_m: float | None
-    layer: str
-    has_level: bool
-
-
 def import_features(
     features: Sequence[Feature],
     crs: str | None,
@@ -130,7 +116,10 @@ def import_features(
         for key in keys or ["0"]:
             level = (levels or {}).get(key) or _level(key)
             by_level.setdefault(key, (level, []))[1].append(feature)
-    by_level = _levels_with_rooms(by_level, is_indoor)
+    role_of = _indoor_role if is_indoor else _role
+    # Features without a level do not make one.
+    with_rooms = {key: item for key, item in by_level.items() if any(role_of(member) == "room" for member in item[1])}
+    by_level = with_rooms or by_level
 
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
         builder = ReportBuilder(format, metres_per_unit, source, warnings=list(warnings))
@@ -140,7 +129,7 @@ def import_features(
         sketch.name = level.name if len(by_level) > 1 else None
         drawer = _Drawer(sketch, options, builder)
         for feature in (*members, *on_any_level):
-            drawer.add(feature, _indoor_role(feature) if is_indoor else _role(feature), project(feature.shape))
+            drawer.add(feature, role_of(feature), project(feature.shape))
             budget.check_time()
         drawer.add_points()
         return assemble(sketch, builder, options, budget.limits.plan)
@@ -187,15 +176,6 @@ def _level(key: str) -> Level:
     except ValueError:
         number = math.nan
     return Level(key, number if math.isfinite(number) else None)
-
-
-def _levels_with_rooms(
-    levels: dict[str, tuple[Level, list[Feature]]], is_indoor: bool
-) -> dict[str, tuple[Level, list[Feature]]]:
-    """Drop levels without a room, so that features without a level do not make one."""
-    role = _indoor_role if is_indoor else _role
-    with_rooms = {key: item for key, item in levels.items() if any(role(feature) == "room" for feature in item[1])}
-    return with_rooms or levels
 
 
 def _role(feature: Feature) -> Role:
@@ -251,7 +231,9 @@ class _Drawer:
 
     def __init__(self, sketch: Sketch, options: ImportOptions, builder: ReportBuilder) -> None:
         self._sketch, self._options, self._builder = sketch, options, builder
-        self._points: list[_PointOpening] = []
+        # Openings that begin and end at a point on a wall, as in OpenStreetMap; their widths (m), layers, and whether
+        # they can only belong to this level.
+        self._points: list[tuple[SketchedOpening, float, str, bool]] = []
 
     def add(self, feature: Feature, role: Role, shape: BaseGeometry) -> None:
         """Add a feature by its role; openings without a direction wait for `add_points`."""
@@ -305,8 +287,9 @@ class _Drawer:
             if width_m is None or width_m <= 0.0:
                 width_m = _USUAL_WIDTH_M[kind]
                 self._builder.unsure.append(f"{kind}s drawn as points without a width; {width_m:g} m is assumed")
-            position, has_level = (shape.x, shape.y), bool(_levels_of(feature))
-            self._points.append(_PointOpening(kind, position, width_m, name, head_m, layer, has_level))
+            point = (shape.x, shape.y)
+            opening = SketchedOpening(kind, point, point, name, None, head_m)
+            self._points.append((opening, width_m, layer, bool(_levels_of(feature))))
             return
         ends = opening_line(shape)
         self._builder.use(layer, kind if ends is not None else "ignored (no length)")
@@ -319,12 +302,12 @@ class _Drawer:
             return
         walls = WallLines([room.shape for room in self._sketch.rooms])
         lost = 0
-        for point in self._points:
-            ends = walls.line_at(point.position, point.width_m)
-            self._builder.use(point.layer, point.kind if ends is not None else "ignored (on no wall of the level)")
+        for opening, width_m, layer, has_level in self._points:
+            ends = walls.line_at(shapely.Point(opening.start), width_m)
+            self._builder.use(layer, opening.kind if ends is not None else "ignored (on no wall of the level)")
             if ends is not None:
-                self._sketch.openings.append(SketchedOpening(point.kind, *ends, point.name, None, point.head_m))
-            lost += ends is None and point.has_level
+                self._sketch.openings.append(replace(opening, start=ends[0], end=ends[1]))
+            lost += ends is None and has_level
         if lost:
             self._builder.warnings.append(f"{lost} openings drawn as points lie on no wall and were left out")
 

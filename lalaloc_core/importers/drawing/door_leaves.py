@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -28,16 +28,10 @@ _TOUCH_M = 0.03
 _NEAR: dict[str, Any] = {"predicate": "dwithin", "distance": 5 * _TOUCH_M}
 
 
-@dataclass(frozen=True)
-class Leaves:
-    """Lines of a drawing without door leaves, and the leaves."""
-
-    strokes: list[Stroke]
-    swings: list[Swing]
-
-
-def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing], areas: Sequence[Area] = ()) -> Leaves:
-    """Separate door leaves and their arcs from the lines that could be walls, in metres.
+def take_leaves(
+    strokes: Sequence[Stroke], swings: Sequence[Swing], areas: Sequence[Area] = ()
+) -> tuple[list[Stroke], list[Swing]]:
+    """Separate the lines that could be walls, in metres, from door leaves and their arcs; return both.
 
     A leaf is a line as long as a door is wide with one free end, whose other end is the hinge, at a line or a wall that
     is drawn as an area: it is slanted against most lines, or an arc turns about its hinge.
@@ -56,7 +50,7 @@ def take_leaves(strokes: Sequence[Stroke], swings: Sequence[Swing], areas: Seque
         # The arc of a leaf shows its width and both positions.
         elif not len(hinges.query(shapely.Point(leaf.hinge), **_NEAR)):
             leaves.append(leaf)
-    return Leaves(kept, leaves)
+    return kept, leaves
 
 
 def with_half_open_doors(drawing: Drawing) -> Drawing:

@@ -85,65 +85,53 @@ def drawing_scale(
     the first drawing that has them, then the `guess`. `subject` names the file in the error message, and `check_time`
     raises an exception to stop. The option `multiply` multiplies any of them.
     """
-    factor, source = _given_scale(options, subject, drawings, check_time, paper_m_per_unit, paper_m, own, guess)
+
+    def checked(metres_per_unit: float, source: str) -> tuple[float, str]:
+        low, high = _METRES_PER_UNIT
+        if not low <= metres_per_unit <= high:
+            raise InvalidFloorPlanError(
+                f"{subject} has {metres_per_unit:g} m per unit ({source}); the limits are {low:g} and {high:g}; "
+                "correct its size, or set metres_per_pixel"
+            )
+        return metres_per_unit, source
+
+    def given() -> tuple[float, str]:
+        if options.known_distance is not None:
+            return options.known_distance.metres_per_unit, "option known_distance"
+        if options.metres_per_pixel is not None:
+            return options.metres_per_pixel, "option metres_per_pixel"
+        if options.scale is not None:
+            if paper_m_per_unit is None:
+                raise InvalidFloorPlanError(
+                    f"{subject} has no size on paper, so scale=1:{options.scale:g} cannot be used; "
+                    "set metres_per_pixel or known_distance instead"
+                )
+            return checked(options.scale * paper_m_per_unit, "option scale")
+        if options.units is not None:
+            return METRES_PER_UNIT[options.units], "option units"
+        if own is not None:
+            return checked(*own)
+        texts = [lettering.text for drawing in drawings for lettering in drawing.letterings]
+        written = _written_scale(texts)
+        if written is not None and paper_m_per_unit is not None:
+            sheet, larger = _sheet(texts, paper_m)
+            source = f"1:{written:g}, written in the drawing"
+            source += f" for {sheet}, {larger:.3g} times the page" if sheet else ""
+            return checked(written * larger * paper_m_per_unit, source)
+        found = next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None) or guess()
+        if found:
+            return checked(*found)
+        hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
+        raise InvalidFloorPlanError(
+            f"{subject} gives no scale{hint}, and too few doors, stairs, areas or dimensions are found to estimate it: "
+            "set scale (1:100), metres_per_pixel (metres per unit of the drawing) or known_distance (x0, y0, x1, y1, "
+            "metres)"
+        )
+
+    factor, source = given()
     if options.multiply is None:
         return factor, source
-    return _checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)", subject)
-
-
-def _given_scale(
-    options: ImportOptions,
-    subject: str,
-    drawings: Sequence[Drawing],
-    check_time: Callable[[], None],
-    paper_m_per_unit: float | None,
-    paper_m: float | None,
-    own: tuple[float, str] | None,
-    guess: Callable[[], tuple[float, str] | None],
-) -> tuple[float, str]:
-    """Return metres per unit and their source without the option `multiply`; see `drawing_scale`."""
-    if options.known_distance is not None:
-        return options.known_distance.metres_per_unit, "option known_distance"
-    if options.metres_per_pixel is not None:
-        return options.metres_per_pixel, "option metres_per_pixel"
-    if options.scale is not None:
-        if paper_m_per_unit is None:
-            raise InvalidFloorPlanError(
-                f"{subject} has no size on paper, so scale=1:{options.scale:g} cannot be used; "
-                "set metres_per_pixel or known_distance instead"
-            )
-        return _checked(options.scale * paper_m_per_unit, "option scale", subject)
-    if options.units is not None:
-        return METRES_PER_UNIT[options.units], "option units"
-    if own is not None:
-        return _checked(*own, subject)
-    texts = [lettering.text for drawing in drawings for lettering in drawing.letterings]
-    written = _written_scale(texts)
-    if written is not None and paper_m_per_unit is not None:
-        sheet, larger = _sheet(texts, paper_m)
-        source = f"1:{written:g}, written in the drawing"
-        source += f" for {sheet}, {larger:.3g} times the page" if sheet else ""
-        return _checked(written * larger * paper_m_per_unit, source, subject)
-    if measured := next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None):
-        return _checked(*measured, subject)
-    if guessed := guess():
-        return _checked(*guessed, subject)
-    hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
-    raise InvalidFloorPlanError(
-        f"{subject} gives no scale{hint}, and too few doors, stairs, areas or dimensions are found to estimate it: set "
-        "scale (1:100), metres_per_pixel (metres per unit of the drawing) or known_distance (x0, y0, x1, y1, metres)"
-    )
-
-
-def _checked(metres_per_unit: float, source: str, subject: str) -> tuple[float, str]:
-    """Return a scale with its source."""
-    low, high = _METRES_PER_UNIT
-    if not low <= metres_per_unit <= high:
-        raise InvalidFloorPlanError(
-            f"{subject} has {metres_per_unit:g} m per unit ({source}); the limits are {low:g} and {high:g}; correct "
-            "its size, or set metres_per_pixel"
-        )
-    return metres_per_unit, source
+    return checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)")
 
 
 def _written_scale(texts: Iterable[str]) -> int | None:
@@ -254,13 +242,21 @@ def areas_of_rooms(
     shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
 ) -> dict[int, tuple[float, float]]:
     """Return the area (m²) that is written in each room, and the room's area, by the index of the room."""
-    tree = shapely.STRtree(shapes)
-    texts: list[list[str]] = [[] for _ in shapes]
+    texts, _ = texts_of_rooms(shapes, letterings)
+    return _written_areas(shapes, [[lettering.text for lettering in found] for found in texts])
+
+
+def texts_of_rooms(
+    shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
+) -> tuple[list[list[Lettering]], list[Lettering]]:
+    """Return the texts in each room, those in several rooms with the smallest, and the texts in none."""
+    tree, outside = shapely.STRtree(shapes), list[Lettering]()
+    inside: list[list[Lettering]] = [[] for _ in shapes]
     for lettering in letterings:
-        inside = tree.query(shapely.Point(lettering.position), predicate="within")
-        if len(inside):
-            texts[min(inside, key=lambda index: shapes[index].area)].append(lettering.text)
-    return _written_areas(shapes, texts)
+        around = tree.query(shapely.Point(lettering.position), predicate="within")
+        texts = inside[min(around, key=lambda index: shapes[index].area)] if len(around) else outside
+        texts.append(lettering)
+    return inside, outside
 
 
 def _written_areas(shapes: Sequence[shapely.Polygon], texts: Sequence[Sequence[str]]) -> dict[int, tuple[float, float]]:

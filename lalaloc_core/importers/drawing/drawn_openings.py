@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -46,11 +45,9 @@ def drawn_panes(
 ) -> list[tuple[shapely.Polygon, shapely.LineString]]:
     """Return the windows among the thin lines of a drawing (m), as areas and as lines along their middle.
 
-    Args:
-        lines: straight lines.
-        walls: the walls; with the areas between the lines of windows, if walls are drawn with two lines.
-        least: lines that make a window. Two do in a gap; a wall with two faces is such a pair itself.
-        check_time: called between steps; raises an exception to stop.
+    The walls include the areas between the lines of windows, if walls are drawn with two lines. At least `least` lines
+    make a window: two do in a gap; a wall with two faces is such a pair itself. `check_time` is called between steps
+    and raises an exception to stop.
     """
     candidates = [line for line in lines if _LENGTH_M[0] <= line.length <= _LENGTH_M[1]]
     if not candidates or walls.is_empty:
@@ -127,23 +124,15 @@ def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:
     return sum(share(*corner) > 0.5 for corner in corners) <= _CORNERS
 
 
-@dataclass(frozen=True, eq=False)
-class _PaintedWalls:
-    """Visible parts of walls, and the gaps that are painted into them."""
-
-    bodies: list[shapely.Polygon]
-    gaps: list[Gap]
-
-
 def cut_painted(
     bodies: Sequence[tuple[shapely.Polygon, int]],
     patches: Sequence[Patch],
     thickest_m: float,
     check_time: Callable[[], None],
-) -> _PaintedWalls:
+) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Take what is hidden from walls, which come with their places in the order of painting, in metres.
 
-    Gaps are in walls of at most `thickest_m`.
+    Returns the visible parts of walls, and the gaps that are painted into walls of at most `thickest_m`.
     """
     tree = shapely.STRtree([patch.shape for patch in patches])
     visible: list[shapely.Polygon] = []
@@ -172,7 +161,7 @@ def cut_painted(
             gap = _gap(piece, walls, patches[k], thickest_m)
             if gap is not None:
                 gaps.append(gap)
-    return _PaintedWalls(visible, gaps)
+    return visible, gaps
 
 
 def _gap(piece: shapely.Polygon, walls: shapely.STRtree, patch: Patch, thickest_m: float) -> Gap | None:

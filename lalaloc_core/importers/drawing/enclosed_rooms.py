@@ -150,13 +150,20 @@ def find_gaps(
             found.append(gap if index < len(ends) else replace(gap, is_sure=False))
     ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
     gaps = [gap for _, _, gap in sorted(ranked, key=lambda item: item[:2])]
-    tree, is_kept = shapely.STRtree([gap.shape for gap in gaps]), np.zeros(len(gaps), bool)
-    for index, gap in enumerate(gaps):
+    return [gaps[index] for index in without_overlaps([gap.shape for gap in gaps], 0.25, check_time)]
+
+
+def without_overlaps(
+    shapes: Sequence[shapely.Polygon], share: float, check_time: Callable[[], None] = lambda: None
+) -> list[int]:
+    """Return the numbers of the shapes that share less than a part of their area with each that was kept before."""
+    tree, is_kept = shapely.STRtree(shapes), np.zeros(len(shapes), bool)
+    for index, shape in enumerate(shapes):
         check_time()
-        near = tree.query(gap.shape)
-        shared = (shapely.intersection(gap.shape, gaps[k].shape).area for k in near[is_kept[near]])
-        is_kept[index] = all(area < 0.25 * gap.shape.area for area in shared)
-    return [gap for gap, keep in zip(gaps, is_kept, strict=True) if keep]
+        near = tree.query(shape)
+        shared = (shapely.intersection(shape, shapes[k]).area for k in near[is_kept[near]])
+        is_kept[index] = all(area < share * shape.area for area in shared)
+    return np.flatnonzero(is_kept).tolist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +222,7 @@ def _gap_before(wall: _End, areas: WallAreas, config: WallConfig) -> Gap | None:
     width = farthest if farthest - middle <= 0.25 * config.thickest else middle
     if width - nearest > _OUT_OF_LINE_M or not config.narrowest_gap <= width <= config.widest_gap:
         return None
-    is_between_ends = _faces_an_end(wall.start, wall.end, outward, width, areas)
+    is_between_ends = _faces_an_end(wall, width, areas)
     is_sure = width - nearest <= 0.25 * config.thickest and (
         wall.nib >= config.nib or (is_between_ends and width <= _MAX_BETWEEN_NIBS)
     )
@@ -229,15 +236,9 @@ def _gap_before(wall: _End, areas: WallAreas, config: WallConfig) -> Gap | None:
     return Gap(shape, point_xy(begin), point_xy(reach), is_sure, is_between_ends)
 
 
-def _faces_an_end(
-    start: Float[np.ndarray, "2"],
-    end: Float[np.ndarray, "2"],
-    outward: Float[np.ndarray, "2"],
-    width: float,
-    areas: WallAreas,
-) -> bool:
+def _faces_an_end(wall: _End, width: float, areas: WallAreas) -> bool:
     """Return whether the other side of a gap is the end of a wall of similar thickness."""
-    a, b = start + (width + 0.02) * outward, end + (width + 0.02) * outward
+    a, b = wall.start + (width + 0.02) * wall.outward, wall.end + (width + 0.02) * wall.outward
     side = 0.12 * (b - a) / np.linalg.norm(b - a)
     outside = shapely.LineString([a - side, a - 0.3 * side]), shapely.LineString([b + 0.3 * side, b + side])
     return not any(areas.meets(piece) for piece in outside)
@@ -369,18 +370,9 @@ def _insides(
             for floor in polygons_from_geometry(inside):
                 if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config):
                     rooms.append(floor.simplify(0.004))
-    return _distinct(rooms)
-
-
-def _distinct(rooms: list[shapely.Polygon]) -> list[shapely.Polygon]:
-    """Drop duplicates: rooms inside an island of walls are found twice."""
-    ordered = sorted(rooms, key=lambda room: -room.area)
-    tree, is_kept = shapely.STRtree(ordered), np.zeros(len(ordered), bool)
-    for index, room in enumerate(ordered):
-        near = tree.query(room)
-        larger = [ordered[k] for k in near[is_kept[near]]]
-        is_kept[index] = all(shapely.intersection(room, other).area < 0.5 * room.area for other in larger)
-    return [room for room, keep in zip(ordered, is_kept, strict=True) if keep]
+    # Rooms inside an island of walls are found twice.
+    rooms.sort(key=lambda room: -room.area)
+    return [rooms[index] for index in without_overlaps(rooms, 0.5)]
 
 
 def _is_thin(face: shapely.Polygon, config: WallConfig) -> bool:

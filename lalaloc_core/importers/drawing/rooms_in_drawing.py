@@ -16,13 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import (
-    check_network,
-    check_overlaps,
-    point_xy,
-    polygons_from_geometry,
-    side_lengths,
-)
+from lalaloc_core.importers.common.geometry import check_network, check_overlaps, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
@@ -79,12 +73,8 @@ def choose_reading(
 ) -> Reading:
     """Return the reading that explains most of a drawing in metres, and report the others.
 
-    Args:
-        drawing: the drawing, without leaves of doors among its lines.
-        marked: rooms that the file marks, see `marked_rooms`.
-        leaves: leaves and swings of doors.
-        builder: the report.
-        budget: the budget.
+    The drawing has no leaves of doors among its lines; `leaves` are these and the swings of doors. `marked` are the
+    rooms that the file marks, see `marked_rooms`.
     """
     readings: list[Reading] = []
     bounds = budget.limits.rooms
@@ -238,11 +228,11 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     drawn = [(area.shape, area.order) for area in drawing.areas if area.is_dark and area.role is None]
     drawn = [(shape, order) for shape, order in drawn if not _is_stroke_of_letter(shape, bounds)]
     drawn += _drawn_thick(drawing, None, bounds)
-    painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
-    bodies = [shape for shape in painted.bodies if not _is_outline(Area(shape, "", is_dark=True), bounds)]
+    visible, painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
+    bodies = [shape for shape in visible if not _is_outline(Area(shape, "", is_dark=True), bounds)]
     if not bodies:
         return None
-    gaps = [*painted.gaps, *_panes(drawing, shapely.unary_union(bodies), 2, budget)]
+    gaps = [*painted, *_panes(drawing, shapely.unary_union(bodies), 2, budget)]
     painted_over = [gap.shape.buffer(bounds.seam_m, join_style="mitre") for gap in gaps]
     found = _enclose(bodies, [], [*_closers(drawing, bounds), *painted_over], budget)
     return replace(found, gaps=[*gaps, *found.gaps])
@@ -293,8 +283,8 @@ def _panes(drawing: Drawing, walls: BaseGeometry, least: int, budget: Budget) ->
     lines = [stroke.line for stroke in drawing.strokes if stroke.role is None and stroke.width < thick_m]
     lines += [area.shape.exterior for area in drawing.areas if area.role is None and not area.is_dark]
     found = drawn_panes(split_lines(lines), walls, least, budget.check_time)
-    ends = [(area, shapely.get_coordinates(line)) for area, line in found]
-    return [Gap(area, point_xy(a), point_xy(b), is_between_ends=True, is_pane=True) for area, (a, b) in ends]
+    ends = [(area, shapely.get_coordinates(line).ravel().tolist()) for area, line in found]
+    return [Gap(area, (x0, y0), (x1, y1), is_between_ends=True, is_pane=True) for area, (x0, y0, x1, y1) in ends]
 
 
 def _rings(shape: shapely.Polygon) -> list[shapely.LinearRing]:

@@ -109,10 +109,8 @@ def assume_scale(guess: ScaleGuess | None, builder: ReportBuilder) -> tuple[floa
 def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budget) -> ScaleGuess | None:
     """Return the scale that the sizes of parts agree on, None if they are too few or too different.
 
-    Args:
-        sketch: reads the drawing at a scale, in metres per unit, and returns the sizes of its parts.
-        start: first scale.
-        budget: time of the import; the guess takes at most a part of it.
+    `sketch` reads the drawing at a scale, in metres per unit, and returns the sizes of its parts; the first scale is
+    `start`. The guess takes at most a part of the import's time.
     """
     trace, budget.trace = budget.trace, None
     began_s, limit_s = budget.elapsed_s, _SHARE_OF_TIME * budget.limits.max_import_s

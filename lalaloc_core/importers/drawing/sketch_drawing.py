@@ -32,7 +32,7 @@ from lalaloc_core.importers.drawing.door_leaves import (
     with_half_open_doors,
     without_leaves,
 )
-from lalaloc_core.importers.drawing.drawing_scale import check_areas, written_dimensions
+from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
 from lalaloc_core.importers.drawing.rooms_in_drawing import (
     GapFinder,
@@ -75,15 +75,8 @@ def split_named_rooms(
 ) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Divide rooms with several names of rooms at gaps between ends of walls that leave a name on both sides.
 
-    Args:
-        rooms: the rooms.
-        walls: the walls around them.
-        closed: gaps that are closed already.
-        letterings: texts of the drawing.
-        check_time: called between steps; raises an exception to stop.
-
-    Returns:
-        The rooms in the order given, parts beside each other, and the gaps that divide them.
+    Returns the rooms in the order given, parts beside each other, and the gaps that divide them. `closed` are gaps that
+    are closed already; `check_time` is called between steps and raises an exception to stop.
     """
     places = [shapely.Point(text.position) for text in letterings if text.room_types]
     names = shapely.STRtree(places)
@@ -146,11 +139,10 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     bounds = budget.limits.rooms
     marked = marked_rooms(drawing, builder, bounds)
     lines = [stroke for stroke in drawing.strokes if stroke.role in (None, "wall")]
-    walls = take_leaves(lines, drawing.swings, drawing.areas)
+    walls, leaves = take_leaves(lines, drawing.swings, drawing.areas)
     others = [stroke for stroke in drawing.strokes if stroke.role not in (None, "wall")]
-    leaves = walls.swings
     areas = without_leaves(drawing.areas, [*drawing.swings, *leaves])
-    without = replace(drawing, strokes=[*walls.strokes, *others], areas=areas)
+    without = replace(drawing, strokes=[*walls, *others], areas=areas)
     reading = choose_reading(without, marked, [*drawing.swings, *leaves], builder, budget)
     gaps, shapes = reading.gaps, reading.rooms
     if reading.walls is None:
@@ -176,7 +168,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
     finder = GapFinder(gaps, bounds)
     closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if finder.closed_by(swing) is not None]
-    swings = [*drawing.swings, *closing]
+    swings = [swing for swing in (*drawing.swings, *closing) if LEAF_M[0] <= swing.radius <= LEAF_M[1]]
     sketch.openings = [*_symbols(drawing, closing, bounds.symbol_m), *_swings(swings, finder, shapes)]
     sketch.leaves_m = _leaf_widths(swings, finder)
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
@@ -251,23 +243,15 @@ def name_rooms(
 
     Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
     """
-    tree = shapely.STRtree([area.shape for area in shapes])
-    texts: dict[int, list[Lettering]] = {}
-    lost: list[Lettering] = []
-    for lettering in letterings:
-        inside = tree.query(shapely.Point(lettering.position), predicate="within")
-        if len(inside):
-            smallest = min(inside, key=lambda index: shapes[index].shape.area)
-            texts.setdefault(int(smallest), []).append(lettering)
-        elif drawn is not None and drawn.covers(shapely.Point(lettering.position)):
-            lost.append(lettering)
+    texts, outside = texts_of_rooms([area.shape for area in shapes], letterings)
+    lost = [found for found in outside if drawn is not None and drawn.covers(shapely.Point(found.position))]
     if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_types)):
         builder.warnings.append(
             f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
         )
     rooms = []
-    for index, area in enumerate(shapes):
-        words = _names(texts.get(index, []))
+    for area, inside in zip(shapes, texts, strict=True):
+        words = _names(inside)
         known = {found.text: types for found in words if (types := found.room_types)}
         name = area.name or next(iter([*known, *(found.text for found in words)]), None)
         written = [kind for types in known.values() for kind in types]
@@ -279,7 +263,7 @@ def name_rooms(
                 f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
                 "between them"
             )
-    check_areas(rooms, [[raw.text for raw in texts.get(index, [])] for index in range(len(rooms))], builder)
+    check_areas(rooms, [[raw.text for raw in inside] for inside in texts], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:
         builder.notes.append(f"{unnamed} rooms have no name in the file")
@@ -334,8 +318,6 @@ def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -
     found: list[SketchedOpening] = []
     closed: set[int] = set()
     for swing in swings:
-        if not LEAF_M[0] <= swing.radius <= LEAF_M[1]:
-            continue
         index = finder.closed_by(swing)
         if index is not None:
             if index not in closed:
@@ -347,10 +329,9 @@ def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -
 
 
 def _leaf_widths(swings: Sequence[Swing], finder: GapFinder) -> list[float]:
-    """Return the widths of leaves that close a gap, one for every gap; of all arcs of their size without gaps."""
-    leaves = [swing for swing in swings if LEAF_M[0] <= swing.radius <= LEAF_M[1]]
-    closing = {index: swing.radius for swing in leaves if (index := finder.closed_by(swing)) is not None}
-    return list(closing.values()) or [swing.radius for swing in leaves]
+    """Return the widths of leaves that close a gap, one for every gap; of all leaves without gaps."""
+    closing = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
+    return list(closing.values()) or [swing.radius for swing in swings]
 
 
 def _closed_leaf(swing: Swing, walls: BaseGeometry) -> SketchedOpening:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
 from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates
@@ -42,7 +41,7 @@ def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[Importe
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """Return a FeatureCollection in WGS84 if the plan has an anchor, else in metres with the member `units`."""
-    features = plan_features(document, Projector(anchor))
+    features = plan_features(document, anchor)
     collection: dict[str, Any] = {"type": "FeatureCollection", "name": document.get("name", "floor plan")}
     if anchor is None:
         collection["units"] = "m"
@@ -130,29 +129,18 @@ def _crs(document: Any) -> str | None:
     return f"EPSG:{digits}"
 
 
-class Projector:
-    """Conversion from plan metres to the coordinates of a file: WGS84 with an anchor, else metres."""
-
-    def __init__(self, anchor: Anchor | None) -> None:
-        self._frame = None if anchor is None else LocalFrame(anchor.longitude, anchor.latitude)
-        turn = math.radians(0.0 if anchor is None else anchor.north_deg)
-        self._east = np.array([math.cos(turn), -math.sin(turn)])
-        self._north = np.array([math.sin(turn), math.cos(turn)])
-
-    def points(self, points_m: Sequence[Sequence[float]]) -> list[list[float]]:
-        """Return points in file coordinates."""
-        array = np.asarray(points_m, dtype=float)
-        if self._frame is None:
-            return array.round(6).tolist()
-        local = np.column_stack([array @ self._east, array @ self._north])
-        return self._frame.to_earth(local).round(_DECIMALS).tolist()
-
-    def polygon(self, rings: Sequence[Sequence[Sequence[float]]]) -> list[list[list[float]]]:
-        """Return closed rings in file coordinates."""
-        return [self.points([*ring, ring[0]]) for ring in rings]
+def file_points(points_m: Sequence[Sequence[float]], anchor: Anchor | None) -> list[list[float]]:
+    """Return points of a plan in the coordinates of a file: WGS84 with an anchor, else metres."""
+    array = np.asarray(points_m, dtype=float)
+    return (array.round(6) if anchor is None else anchor.to_earth(array).round(_DECIMALS)).tolist()
 
 
-def plan_features(document: Mapping[str, Any], projector: Projector) -> list[dict[str, Any]]:
+def file_rings(rings: Sequence[Sequence[Sequence[float]]], anchor: Anchor | None) -> list[list[list[float]]]:
+    """Return closed rings in the coordinates of a file, see `file_points`."""
+    return [file_points([*ring, ring[0]], anchor) for ring in rings]
+
+
+def plan_features(document: Mapping[str, Any], anchor: Anchor | None) -> list[dict[str, Any]]:
     """Return the rooms, walls and openings of a plan as GeoJSON features with an IMDF `feature_type`."""
     found: list[dict[str, Any]] = []
     for number, room in enumerate(document["rooms"]):
@@ -161,18 +149,18 @@ def plan_features(document: Mapping[str, Any], projector: Projector) -> list[dic
         properties |= {key: room[key] for key in keys if key in room and room[key] != "unknown"}
         if (ceiling_m := document.get("ceiling_height_m")) is not None:
             properties.setdefault("ceiling_height_m", ceiling_m)
-        rings = projector.polygon([room["polygon"], *room.get("holes", ())])
+        rings = file_rings([room["polygon"], *room.get("holes", ())], anchor)
         feature = _to_feature("Polygon", rings, properties)
         if "id" in room:
             feature["id"] = room["id"]
         found.append(feature)
         for wall in room.get("walls", ()):
-            found.append(_to_feature("LineString", projector.points(wall), {"feature_type": "wall"}))
+            found.append(_to_feature("LineString", file_points(wall, anchor), {"feature_type": "wall"}))
     for opening in document.get("openings", ()):
         properties = {"feature_type": "opening"} | {
             key: opening[key] for key in ("kind", "name", "sill_m", "head_m") if key in opening
         }
-        found.append(_to_feature("LineString", projector.points(opening["line"]), properties))
+        found.append(_to_feature("LineString", file_points(opening["line"], anchor), properties))
     return found
 
 

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -69,7 +68,7 @@ def _read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Impor
             "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
     anchor = find_anchor(model, _unit(model))
-    elements = _elements(model, storeys, meshes)
+    elements, lost = _elements(model, storeys, meshes)
 
     def make(level: Level, content: tuple[str, list[Any]]) -> ImportedPlan:
         key, spaces = content
@@ -77,8 +76,8 @@ def _read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Impor
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
         floor_m = _add_spaces(spaces, sketch, builder, meshes)
-        _add_elements(elements.by_storey[key], floor_m, sketch, builder, meshes)
-        for name, count in (+elements.lost).items():
+        _add_elements(elements[key], floor_m, sketch, builder, meshes)
+        for name, count in (+lost).items():
             builder.use(name, "ignored (not in a storey with spaces)", count)
         if not sketch.rooms:
             raise NoRoomError(
@@ -181,16 +180,10 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, m
     return float(np.median(floors)) if floors else 0.0
 
 
-@dataclass(frozen=True)
-class _Elements:
-    """Doors, windows and columns by the id of their storey; `lost` counts elements and spaces of no storey by kind."""
-
-    by_storey: dict[str, list[Any]]
-    lost: Counter[str] = field(default_factory=Counter)
-
-
-def _elements(model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Meshes) -> _Elements:
-    """Return the doors, windows and columns of the storeys with spaces.
+def _elements(
+    model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Meshes
+) -> tuple[dict[str, list[Any]], Counter[str]]:
+    """Return the doors, windows and columns of the storeys with spaces, and counts of what has no such storey, by kind.
 
     An element belongs to the storey that contains it or its space. Parts of curtain walls, elements that only fill an
     opening, and elements of storeys without spaces belong to the storey at their height.
@@ -200,8 +193,9 @@ def _elements(model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Mes
         (_elevation_m(storey, unit), str(storey.id()) in storeys, str(storey.id()))
         for storey in _storey_entities(model)
     )
-    found = _Elements({key: [] for key in storeys})
-    found.lost["IfcSpace"] = len(model.by_type("IfcSpace")) - sum(len(spaces) for _, (_, spaces) in storeys.values())
+    found: dict[str, list[Any]] = {key: [] for key in storeys}
+    placed = sum(len(spaces) for _, (_, spaces) in storeys.values())
+    lost = Counter({"IfcSpace": len(model.by_type("IfcSpace")) - placed})
     for name in (*_KINDS, "IfcColumn", *FURNISHINGS):
         for element in model.by_type(name):
             if name in FURNISHINGS and (fixture_kind(element) is None or not meshes.has_time_for_fixtures):
@@ -210,10 +204,10 @@ def _elements(model: Any, storeys: Mapping[str, tuple[Level, Any]], meshes: _Mes
             if key not in storeys:
                 key = _storey_at(_shape(element, meshes), heights)
             if key is None:
-                found.lost[name] += 1
+                lost[name] += 1
             else:
-                found.by_storey[key].append(element)
-    return found
+                found[key].append(element)
+    return found, lost
 
 
 def _container(element: Any) -> str | None:
@@ -332,12 +326,8 @@ class _Meshes:
 
     def __init__(self, budget: Budget) -> None:
         self._budget = budget
+        self.check_time = budget.check_time
         self._sizes: dict[int, float] = {}
-
-    @property
-    def check_time(self) -> Callable[[], None]:
-        """Function that raises an exception if the time is over."""
-        return self._budget.check_time
 
     @property
     def has_time_for_fixtures(self) -> bool:

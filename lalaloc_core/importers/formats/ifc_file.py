@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,25 +65,23 @@ def _check_placements(model: Any) -> None:
     """Check that placements are relative to few others, and not to themselves, which the library follows forever."""
     depths: dict[int, int] = {}
     for placement in model.by_type("IfcLocalPlacement"):
-        chain: list[Any] = []
-        inside: set[int] = set()
+        chain: list[int] = []
         while placement is not None and placement.id() not in depths and placement.is_a("IfcLocalPlacement"):
-            if placement.id() in inside or len(chain) >= _MAX_PLACEMENTS:
+            if placement.id() in chain or len(chain) >= _MAX_PLACEMENTS:
                 break
-            inside.add(placement.id())
-            chain.append(placement)
+            chain.append(placement.id())
             placement = placement.PlacementRelTo
         depth = 0 if placement is None else depths.get(placement.id(), 0)
-        if placement is not None and placement.id() in inside:
+        if placement is not None and placement.id() in chain:
             raise InvalidFloorPlanError(
                 f"the IfcLocalPlacement #{placement.id()} is relative to itself; export the model again"
             )
         if depth + len(chain) >= _MAX_PLACEMENTS:
             raise InvalidFloorPlanError(
-                f"the IfcLocalPlacement #{chain[0].id()} is relative to more than {_MAX_PLACEMENTS} others in a chain, "
+                f"the IfcLocalPlacement #{chain[0]} is relative to more than {_MAX_PLACEMENTS} others in a chain, "
                 "the limit; export the model again"
             )
-        depths |= {link.id(): depth + len(chain) - index for index, link in enumerate(chain)}
+        depths |= {link: depth + len(chain) - index for index, link in enumerate(chain)}
 
 
 def fixture_kind(element: Any) -> str | None:
@@ -114,9 +113,8 @@ def find_anchor(model: Any, unit: float) -> Anchor | None:
         latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
         if abs(latitude) > 90.0 or abs(longitude) > 180.0:
             continue
-        latitude, longitude = _origin_from_site(site, latitude, longitude, north_deg, unit)
         altitude = None if site.RefElevation is None else float(site.RefElevation) * unit
-        return Anchor(latitude, longitude, altitude, north_deg)
+        return _at_origin(Anchor(latitude, longitude, altitude, north_deg), site, unit)
     return None
 
 
@@ -161,18 +159,12 @@ def _degrees(angle: Iterable[int]) -> float:
     return sum(part / size for part, size in zip(parts, (1.0, 60.0, 3600.0, 3600e6), strict=False))
 
 
-def _origin_from_site(
-    site: Any, latitude: float, longitude: float, north_deg: float, unit: float
-) -> tuple[float, float]:
-    """Return latitude and longitude of the model's origin if the site is placed elsewhere in the model."""
+def _at_origin(anchor: Anchor, site: Any, unit: float) -> Anchor:
+    """Return the anchor of the model's origin for that of a site, which can be placed elsewhere in the model."""
     from ifcopenshell.util.placement import get_local_placement
 
     if site.ObjectPlacement is None:
-        return latitude, longitude
-    offset = -np.asarray(get_local_placement(site.ObjectPlacement))[:2, 3] * unit
-    turn = math.radians(north_deg)
-    # North lies `north_deg` clockwise from +y of the plan.
-    north = offset @ np.array([math.sin(turn), math.cos(turn)])
-    east = offset @ np.array([math.cos(turn), -math.sin(turn)])
-    origin = LocalFrame(longitude, latitude).to_earth(np.array([[east, north]]))[0]
-    return float(origin[1]), float(origin[0])
+        return anchor
+    offset_m = -np.asarray(get_local_placement(site.ObjectPlacement))[:2, 3] * unit
+    ((longitude, latitude),) = anchor.to_earth(offset_m[None])
+    return replace(anchor, latitude=float(latitude), longitude=float(longitude))

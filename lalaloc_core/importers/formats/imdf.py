@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.common.tagged_features import import_features, in_english
-from lalaloc_core.importers.formats.geojson import Projector, parse_features, plan_features
+from lalaloc_core.importers.formats.geojson import file_rings, parse_features, plan_features
 
 _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
 _NAMESPACE = uuid.UUID("2f6c1d58-2d0e-5c7e-9a41-6b0f6f1e7c11")
@@ -56,11 +56,10 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     """
     if anchor is None:
         raise InvalidFloorPlanError("IMDF requires the place of the plan on Earth; set its anchor")
-    projector = Projector(anchor)
     name = str(document.get("name", "floor plan"))
     ids = {kind: str(uuid.uuid5(_NAMESPACE, f"{kind}/{name}")) for kind in ("venue", "building", "level", "footprint")}
     by_type: dict[str, list[dict[str, Any]]] = {"unit": [], "opening": []}
-    for number, feature in enumerate(plan_features(document, projector)):
+    for number, feature in enumerate(plan_features(document, anchor)):
         kind = feature["properties"].pop("feature_type")
         properties = feature["properties"] | {"level_id": ids["level"]}
         if kind == "unit":
@@ -72,16 +71,9 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
         else:
             continue  # IMDF has no feature type for free-standing walls.
         key = feature.get("id") or f"{kind}-{number}"
-        by_type[kind].append(
-            {
-                "id": str(uuid.uuid5(_NAMESPACE, f"{name}/{key}")),
-                "type": "Feature",
-                "feature_type": kind,
-                "geometry": feature["geometry"],
-                "properties": properties,
-            }
-        )
-    outline = projector.polygon([_bounding_box(document)])
+        own_id = str(uuid.uuid5(_NAMESPACE, f"{name}/{key}"))
+        by_type[kind].append(_feature(kind, own_id, feature["geometry"], properties))
+    outline = file_rings([_bounding_box(document)], anchor)
     context = {"venue": {"category": "unspecified", "name": {"en": name}, "address_id": None},
                "building": {"category": "unspecified", "name": {"en": name}, "address_id": None},
                "footprint": {"category": "ground", "name": None, "building_ids": [ids["building"]]},
@@ -89,10 +81,14 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
                          "name": {"en": name}, "building_ids": [ids["building"]]}}  # fmt: skip
     for kind, properties in context.items():
         geometry = None if kind == "building" else {"type": "Polygon", "coordinates": outline}
-        by_type[kind] = [
-            {"id": ids[kind], "type": "Feature", "feature_type": kind, "geometry": geometry, "properties": properties}
-        ]
-    return _write_archive(by_type)
+        by_type[kind] = [_feature(kind, ids[kind], geometry, properties)]
+    files: dict[str, Any] = {"manifest.json": {"version": "1.0.0", "language": "en", "generated_by": "lalaloc"}}
+    files |= {f"{kind}.geojson": {"type": "FeatureCollection", "features": found} for kind, found in by_type.items()}
+    return pack({name: json.dumps(content, ensure_ascii=False).encode() for name, content in files.items()})
+
+
+def _feature(kind: str, own_id: str, geometry: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
+    return {"id": own_id, "type": "Feature", "feature_type": kind, "geometry": geometry, "properties": properties}
 
 
 def _read_member(files: Mapping[str, bytes], name: str, budget: Budget) -> Any:
@@ -119,13 +115,6 @@ def _levels(document: Any) -> dict[str, Level]:
 def _text(value: Any) -> str | None:
     value = in_english(value)
     return value[:200] if isinstance(value, str) and value.strip() else None
-
-
-def _write_archive(by_type: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
-    files: dict[str, Any] = {"manifest.json": {"version": "1.0.0", "language": "en", "generated_by": "lalaloc"}}
-    for kind, features in by_type.items():
-        files[f"{kind}.geojson"] = {"type": "FeatureCollection", "features": list(features)}
-    return pack({name: json.dumps(content, ensure_ascii=False).encode() for name, content in files.items()})
 
 
 def _bounding_box(document: Mapping[str, Any]) -> list[list[float]]:

@@ -20,14 +20,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.geometry import (
-    Floor,
-    check_coordinates,
-    find_floor,
-    opening_line,
-    point_xy,
-    report_floor,
-)
+from lalaloc_core.importers.common.geometry import Floor, check_coordinates, find_floor, opening_line, report_floor
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
@@ -173,8 +166,7 @@ def _add_doors(doors: list[_Door], floor: float, sketch: Sketch, builder: Report
         else:
             crossed = outlines.geometries[outlines.query(door.shape, predicate="intersects")]
             points = shapely.get_coordinates(shapely.intersection(crossed, door.shape))
-            place = points.mean(axis=0) if len(points) else None
-            ends = None if place is None else walls.line_at(point_xy(place), _USUAL_DOOR_M)
+            ends = walls.line_at(shapely.Point(points.mean(axis=0)), _USUAL_DOOR_M) if len(points) else None
             assumed += ends is not None
         builder.use("doors", "door" if ends is not None else "ignored (no place on a wall)")
         if ends is not None:

@@ -24,6 +24,8 @@ _MAX_NUMBER = 1e12
 _MAX_LEVEL = 1000.0
 # Lengths of the format. The same key without "_m" holds a length in `units`.
 _LENGTHS = ("ceiling_height_m", "camera_height_m", "camera_height_std_m", "sill_m", "head_m")
+# Shapes of the parts of a plan.
+_SHAPES = {"rooms": ("polygon", "holes", "walls"), "openings": ("line",), "fixtures": ("outline",)}
 
 
 def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -114,25 +116,9 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 def _convert(document: dict[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
     """Convert a plan to metres; the validation refuses values of wrong types later."""
     plan = _lengths(document, factor)
-    rooms = plan.get("rooms")
-    if isinstance(rooms, list):
-        plan["rooms"] = [_room(room, factor, y_factor) if isinstance(room, Mapping) else room for room in rooms]
-    openings = plan.get("openings")
-    if isinstance(openings, list):
-        plan["openings"] = [
-            _lengths(opening, factor) | _scale_keys(opening, ("line",), factor, y_factor)
-            if isinstance(opening, Mapping)
-            else opening
-            for opening in openings
-        ]
-    fixtures = plan.get("fixtures")
-    if isinstance(fixtures, list):
-        plan["fixtures"] = [
-            {**fixture, **_scale_keys(fixture, ("outline",), factor, y_factor)}
-            if isinstance(fixture, Mapping)
-            else fixture
-            for fixture in fixtures
-        ]
+    for key, shapes in _SHAPES.items():
+        if isinstance(parts := plan.get(key), list):
+            plan[key] = [_part(part, shapes, factor, y_factor) if isinstance(part, Mapping) else part for part in parts]
     if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _MAX_NUMBER:
         # A flip of y mirrors angles and turns +y by half a turn.
         plan["north_deg"] = (180.0 - plan["north_deg"]) % 360.0
@@ -142,8 +128,10 @@ def _convert(document: dict[str, Any], factor: float, y_factor: float) -> dict[s
     return plan
 
 
-def _room(room: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
-    return _lengths(room, factor) | _scale_keys(room, ("polygon", "holes", "walls"), factor, y_factor)
+def _part(part: Mapping[str, Any], shapes: tuple[str, ...], factor: float, y_factor: float) -> dict[str, Any]:
+    """Convert a room, opening or fixture with some members that are shapes; fixtures have no lengths."""
+    lengths = dict(part) if "outline" in shapes else _lengths(part, factor)
+    return lengths | {key: _scale(part[key], factor, y_factor) for key in shapes if key in part}
 
 
 def _anchor(anchor: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
@@ -174,10 +162,6 @@ def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
         value = plan.pop(short)
         plan[key] = _to_metres(value, factor)
     return plan
-
-
-def _scale_keys(document: Mapping[str, Any], keys: tuple[str, ...], factor: float, y_factor: float) -> dict[str, Any]:
-    return {key: _scale(document[key], factor, y_factor) for key in keys if key in document}
 
 
 def _scale(value: Any, factor: float, y_factor: float) -> Any:

@@ -42,22 +42,19 @@ def read(source: bytes | Mapping[str, Any], options: ImportOptions, budget: Budg
 
 def _from_xml(content: bytes, budget: Budget) -> list[dict[str, Any]]:
     """Return the elements of OSM XML in the structure of Overpass JSON."""
-    elements = []
-    for child in read_xml(content, budget):
-        if child.tag not in _KINDS:
-            continue
-        elements.append(
-            {
-                "type": child.tag,
-                "id": child.get("id"),
-                "lat": _decimal(child, "lat"),
-                "lon": _decimal(child, "lon"),
-                "tags": {str(tag.get("k")): str(tag.get("v")) for tag in child.iter("tag")},
-                "nodes": [node.get("ref") for node in child.iter("nd")],
-                "members": [dict(member.attrib) for member in child.iter("member")],
-            }
-        )
-    return elements
+    return [
+        {
+            "type": child.tag,
+            "id": child.get("id"),
+            "lat": _decimal(child, "lat"),
+            "lon": _decimal(child, "lon"),
+            "tags": {str(tag.get("k")): str(tag.get("v")) for tag in child.iter("tag")},
+            "nodes": [node.get("ref") for node in child.iter("nd")],
+            "members": [dict(member.attrib) for member in child.iter("member")],
+        }
+        for child in read_xml(content, budget)
+        if child.tag in _KINDS
+    ]
 
 
 def _decimal(element: Element, key: str) -> float | None:

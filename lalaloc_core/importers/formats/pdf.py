@@ -55,21 +55,19 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         budget.begin(f"reading page {options.page} of {len(document)}")
         found = read_page(page, budget)
         if options.crop is not None:
-            found.drawing = found.drawing.cropped(options.crop)
+            found.crop, found.drawing = options.crop, found.drawing.cropped(options.crop)
         with naming_text(found.drawing.letterings, f"page {options.page} of the PDF"):
-            return _read_plan(page, found, options, budget)
+            return _read_plan(found, options, budget)
     finally:
         document.close()
 
 
-def _read_plan(
-    page: pypdfium2.PdfPage, found: PageContent, options: ImportOptions, budget: Budget
-) -> tuple[ImportedPlan, ...]:
+def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Read the plan on a page."""
     builder = ReportBuilder("pdf", is_draft=True)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
-    scan = _read_scan(page, found, options.crop, builder, budget)
+    scan = _read_scan(found, builder, budget)
     assumed = ReportBuilder()
     # A unit of a PDF is always a point.
     without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
@@ -80,7 +78,7 @@ def _read_plan(
         budget.check_time,
         paper_m_per_unit=_METRES_PER_POINT,
         paper_m=max(found.size_pt) * _METRES_PER_POINT,
-        guess=lambda: assume_scale(_guess(page, found, scan, options.crop, budget), assumed),
+        guess=lambda: assume_scale(_guess(found, scan, budget), assumed),
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
     _remove_letters(found)
@@ -91,7 +89,7 @@ def _read_plan(
         builder = ReportBuilder("pdf", is_draft=True, notes=notes)
         # Searchable scans contain text over the picture.
         letterings = found.drawing.scaled(factor, flip_y=False).letterings or scan.placed(factor)
-        sketch = _as_picture(page, found, factor, options.crop, builder, budget, letterings=letterings)
+        sketch = _as_picture(found, factor, builder, budget, letterings=letterings)
         rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
         sketch.rooms = name_rooms(rooms, letterings, builder, sketch.drawn)
 
@@ -106,9 +104,7 @@ def _read_plan(
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
-def _guess(
-    page: pypdfium2.PdfPage, found: PageContent, scan: PictureTexts, crop: Box | None, budget: Budget
-) -> ScaleGuess | None:
+def _guess(found: PageContent, scan: PictureTexts, budget: Budget) -> ScaleGuess | None:
     """Return the scale of a page by the usual sizes of its parts, None if they are too few."""
     if _is_drawing(found):
         _remove_letters(found)
@@ -117,7 +113,7 @@ def _guess(
 
     def measure(scale: float) -> Measures:
         # Symbols that are found by their size tell nothing about the scale.
-        sketch = _as_picture(page, found, scale, crop, ReportBuilder(), budget, has_symbols=False)
+        sketch = _as_picture(found, scale, ReportBuilder(), budget, has_symbols=False)
         letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
         return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
 
@@ -140,10 +136,8 @@ def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budge
 
 
 def _as_picture(
-    page: pypdfium2.PdfPage,
     found: PageContent,
     factor: float,
-    crop: Box | None,
     builder: ReportBuilder,
     budget: Budget,
     *,
@@ -159,7 +153,7 @@ def _as_picture(
             f"the page is {width * factor:.0f} m by {height * factor:.0f} m, {width * height * scale**2:.0f} pixels; "
             f"the limit is {budget.limits.max_plan_pixels} (max_plan_pixels); check the scale"
         )
-    gray = _cropped(_gray(page.render(scale=scale, grayscale=True)), crop, scale)  # type: ignore[arg-type]
+    gray = _cropped(_gray(found.page.render(scale=scale, grayscale=True)), found.crop, scale)  # type: ignore[arg-type]
     return sketch_picture(gray, factor / scale, builder, budget, has_symbols=has_symbols, letterings=letterings)
 
 
@@ -171,9 +165,7 @@ def _cropped(gray: UInt8[np.ndarray, "h w"], crop: Box | None, scale: float) -> 
     return blank_outside(gray, (x0, gray.shape[0] - y1, x1, gray.shape[0] - y0))
 
 
-def _read_scan(
-    page: pypdfium2.PdfPage, found: PageContent, crop: Box | None, builder: ReportBuilder, budget: Budget
-) -> PictureTexts:
+def _read_scan(found: PageContent, builder: ReportBuilder, budget: Budget) -> PictureTexts:
     """Return the texts of a scanned page, in points; letters that are drawn as lines join the texts of the page."""
     is_scan, own = found.picture_share > _MOSTLY, list(found.drawing.letterings)
     # A page can have a title block as text, and rooms with drawn letters.
@@ -181,12 +173,13 @@ def _read_scan(
         return PictureTexts()
     width, height = found.size_pt
     scale = min(READ_PX / max(width, height, 1.0), _COARSEST_PT)
-    bitmap = page.render(scale=scale, grayscale=True)  # type: ignore[arg-type]
+    bitmap = found.page.render(scale=scale, grayscale=True)  # type: ignore[arg-type]
     # Lines of a drawing are not turned, so its texts must not be.
-    scan = read_texts(_cropped(_gray(bitmap), crop, scale), builder, budget, straighten=is_scan).scaled(1.0 / scale)
+    gray = _cropped(_gray(bitmap), found.crop, scale)
+    scan = read_texts(gray, builder, budget, straighten=is_scan).scaled(1.0 / scale)
     if is_scan:
         return scan
-    convert = bitmap.get_posconv(page)
+    convert = bitmap.get_posconv(found.page)
 
     def on_page(x: float, y: float) -> tuple[float, float]:
         """Return a place on the page for one in points from the middle of the bitmap."""

@@ -28,6 +28,9 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     is_dark,
 )
 
+# Functions that count and return the objects of a page, and those of a form in it.
+_OF_PAGE: Any = pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject
+_OF_FORM: Any = pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject
 _MAX_FORM_DEPTH = 8
 # Pages' worth of areas that are painted; each takes some milliseconds.
 _MAX_PAINTED = 1000
@@ -44,9 +47,11 @@ class PageContent:
     """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts.
 
     `out_of_range` lines are left out, as their coordinates are out of range. `painted` is the area of all fills and
-    pictures, in pages.
+    pictures, in pages. `crop` is the part of the page that is read (points); None for all of it.
     """
 
+    page: pypdfium2.PdfPage
+    crop: tuple[float, float, float, float] | None = None
     drawing: Drawing = field(default_factory=Drawing)
     size_pt: tuple[float, float] = (0.0, 0.0)
     picture_share: float = 0.0
@@ -87,12 +92,9 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
 def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
     """Return the paths and texts of a page, and the share that pictures cover."""
     width, height = page.get_size()
-    shapes = _count_shapes(page.raw, pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject, budget, 0)
-    budget.check_copies(shapes, _BYTES_PER_SHAPE)
-    found = PageContent(size_pt=(float(width), float(height)))
-    for item, matrix in _objects(
-        page.raw, pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject, np.eye(3), budget, 0
-    ):
+    budget.check_copies(_count_shapes(page.raw, budget), _BYTES_PER_SHAPE)
+    found = PageContent(page, size_pt=(float(width), float(height)))
+    for item, matrix in _objects(page.raw, np.eye(3), budget):
         kind = pdfium.FPDFPageObj_GetType(item)
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
             found.out_of_range += _add_path(item, matrix, found, budget)
@@ -112,24 +114,22 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
     return found
 
 
-def _count_shapes(holder: Any, count: Any, get: Any, budget: Budget, depth: int) -> int:
+def _count_shapes(holder: Any, budget: Budget, depth: int = 0) -> int:
     """Return the number of objects after forms are expanded, or one more than may be expanded at all."""
+    count, get = _OF_FORM if depth else _OF_PAGE
     shapes = max(count(holder), 0)
     for index in range(shapes if depth < _MAX_FORM_DEPTH and shapes <= budget.limits.max_entities else 0):
         if shapes > budget.limits.max_entities:
             break
         item = get(holder, index)
         if item and pdfium.FPDFPageObj_GetType(item) == pdfium.FPDF_PAGEOBJ_FORM:
-            shapes += _count_shapes(
-                item, pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject, budget, depth + 1
-            )
+            shapes += _count_shapes(item, budget, depth + 1)
     return shapes
 
 
-def _objects(
-    holder: Any, count: Any, get: Any, matrix: Matrix, budget: Budget, depth: int
-) -> Iterator[tuple[Any, Matrix]]:
+def _objects(holder: Any, matrix: Matrix, budget: Budget, depth: int = 0) -> Iterator[tuple[Any, Matrix]]:
     """Yield objects with the matrix to page coordinates; forms are expanded."""
+    count, get = _OF_FORM if depth else _OF_PAGE
     for index in range(count(holder)):
         budget.spend()
         item = get(holder, index)
@@ -140,9 +140,7 @@ def _objects(
         if pdfium.FPDFPageObj_GetType(item) != pdfium.FPDF_PAGEOBJ_FORM:
             yield item, total
         elif depth < _MAX_FORM_DEPTH:
-            yield from _objects(
-                item, pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject, total, budget, depth + 1
-            )
+            yield from _objects(item, total, budget, depth + 1)
 
 
 def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> int:

@@ -54,10 +54,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "the picture is a photograph, not a floor plan: send it to be localised, or send a drawn or scanned plan"
         )
     if options.crop is not None:
-        gray, warmth = (
-            blank_outside(gray, options.crop),
-            None if warmth is None else blank_outside(warmth, options.crop),
-        )
+        gray = blank_outside(gray, options.crop)
+        warmth = None if warmth is None else blank_outside(warmth, options.crop)
     texts = read_texts(gray, builder, budget)
     with naming_text(texts.drawing.letterings, "the picture"):
         return _read_plan(gray, warmth, texts, paper_m_per_pixel, options, builder, budget)

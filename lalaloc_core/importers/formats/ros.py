@@ -43,10 +43,7 @@ _YES = ("1", "true", "yes", "on")
 def read(source: bytes | Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Read the plan in a map, as a draft.
 
-    Args:
-        source: files of an archive by name, or a picture in PGM without its YAML file.
-        options: options of the import.
-        budget: limits.
+    `source` has the files of an archive by name, or is a picture in PGM without its YAML file.
     """
     # Imported late: a map is written without the libraries of pictures.
     from lalaloc_core.importers.picture.occupancy import sketch_grid
@@ -86,9 +83,7 @@ def map_files(yaml_file: Path) -> dict[str, bytes]:
 def write(document: Mapping[str, Any], _anchor: Anchor | None, frame: MapFrame | None = None) -> bytes:
     """Return a map in a zip archive: rooms, doors and passages are free, walls and windows occupied.
 
-    Args:
-        document: the plan; its frame is the map frame.
-        frame: the grid; by default cells of 5 cm, or more for large plans, with a margin of 1 m.
+    The plan's frame is the map frame. The default grid has cells of 5 cm, or more for large plans, and a margin of 1 m.
     """
     rooms = [shapely.Polygon(room["polygon"], room.get("holes", ())) for room in document["rooms"]]
     frame = frame or _frame_of(rooms)

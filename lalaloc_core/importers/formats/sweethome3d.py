@@ -107,7 +107,7 @@ def _storeys(root: Element) -> dict[str, tuple[Level, _Storey]]:
 
 def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
     bodies = [body for wall in storey.walls for body in _wall(wall, builder, budget)]
-    enclosed: Enclosed | None = enclose(bodies, [], check_time=budget.check_time) if bodies else None
+    enclosed = enclose(bodies, [], check_time=budget.check_time) if bodies else Enclosed([], [], shapely.Polygon())
     walls = shapely.union_all(bodies)
     drawn: list[tuple[shapely.Polygon, str | None]] = []
     for room in storey.rooms:
@@ -117,8 +117,7 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
         builder.use("room", "rooms" if parts else "ignored (no area)")
         drawn += [(part, name) for part in parts]
     height_m = storey.height_m if ROOM_HEIGHT_M[0] <= storey.height_m <= ROOM_HEIGHT_M[1] else None
-    found = [] if enclosed is None else [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
-    for area in found:
+    for area in (room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2):
         names = [name for part, name in drawn if shapely.intersection(part, area).area > _SAME * part.area]
         if len(names) <= 1:
             sketch.rooms.append(SketchedRoom(area, names[0] if names else None, (), height_m))
@@ -128,9 +127,7 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
         if shapely.intersection(part, taken).area <= _SAME * part.area:
             free = polygons_from_geometry(part.difference(walls))
             sketch.rooms += [SketchedRoom(free_part, name, (), height_m) for free_part in free]
-    if enclosed is not None:
-        sketch.openings += [SketchedOpening("passage", gap.start, gap.end) for gap in enclosed.gaps]
-        sketch.drawn = enclosed.walls.envelope
+    sketch.openings += [SketchedOpening("passage", gap.start, gap.end) for gap in enclosed.gaps]
 
 
 def _wall(wall: Element, builder: ReportBuilder, budget: Budget) -> list[shapely.Polygon]:

@@ -21,6 +21,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.drawing.enclosed_rooms import without_overlaps
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
 from lalaloc_core.importers.picture.ink import Ink, read_ink
 
@@ -248,14 +249,9 @@ def _starts(length: int) -> list[int]:
 
 def _whole_texts(parts: Sequence[_Part]) -> list[_Part]:
     """Return the largest of parts that overlap, in the order of the picture."""
-    kept: list[int] = []
-    tree = shapely.STRtree([part[0] for part in parts])
-    for index in sorted(range(len(parts)), key=lambda k: -parts[k][0].area):
-        shape = parts[index][0]
-        near = [parts[k][0] for k in tree.query(shape, predicate="intersects") if k in kept]
-        if not any(shape.intersection(larger).area > 0.5 * shape.area for larger in near):
-            kept.append(index)
-    return [parts[index] for index in sorted(kept)]
+    order = sorted(range(len(parts)), key=lambda k: -parts[k][0].area)
+    kept = without_overlaps([parts[index][0] for index in order], 0.5)
+    return [parts[index] for index in sorted(order[place] for place in kept)]
 
 
 def _clean(text: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -62,7 +63,6 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
         # A piece of a wall between two doors can look like furniture.
         if _explained(cleared) >= _explained(sketch):
             cells, sketch, report = cells & ~furniture, cleared, cleared_report
-            named = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in places[:_MAX_NAMED])
             area_m2 = float(furniture.sum()) * grid.frame.resolution_m**2
             named = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in places[:_MAX_NAMED])
             builder.unsure.append(
@@ -73,16 +73,15 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     unseen = _without_specks(beside_free & ~grid.free & ~grid.occupied, grid.frame)
     if unseen.any():
         guess, guess_report = _read_walls(cells | unseen, grid, budget)
-        seen_m = _Distance(grid, cells > 0)
         known = shapely.union_all([room.shape for room in sketch.rooms])
         shared_m2 = [shapely.intersection(room.shape, known).area for room in guess.rooms]
         is_old = [area > _OLD * room.shape.area for room, area in zip(guess.rooms, shared_m2, strict=True)]
-        shares = [seen_m.share_near(room.shape) for room in guess.rooms]
-        judged = zip(guess.rooms, is_old, shares, strict=True)
+        shares = _seen_shares(guess.rooms, grid, cells > 0)
+        judged = list(zip(guess.rooms, is_old, shares, strict=True))
         kept = [room for room, old, share in judged if old or share >= _SEEN_SHARE]
         if len(kept) > sum(is_old) >= len(sketch.rooms):
             sketch, report = replace(guess, rooms=kept), guess_report
-            for room, old, share in zip(guess.rooms, is_old, shares, strict=True):
+            for room, old, share in judged:
                 if room in kept and not old:
                     place = room.shape.representative_point()
                     builder.unsure.append(
@@ -173,21 +172,16 @@ def _furniture(
     return found, places
 
 
-class _Distance:
-    """Distances from the cells of a grid to the nearest wall that was seen."""
-
-    def __init__(self, grid: OccupancyGrid, seen: Bool[np.ndarray, "h w"]) -> None:
-        self._frame = grid.frame
-        cells = cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)
-        self._distance_m = np.asarray(cells) * grid.frame.resolution_m
-
-    def share_near(self, room: shapely.Polygon) -> float:
-        """Return the share of a room's outline (map frame) that has a seen wall beside it."""
-        reach_m = _BESIDE_CELLS * self._frame.resolution_m
-        count = max(8, math.ceil(room.exterior.length / self._frame.resolution_m))
-        points = room.exterior.interpolate(np.linspace(0.0, 1.0, count), normalized=True)
-        row, column = self._frame.cells_at(shapely.get_coordinates(points))
-        return float((self._distance_m[row, column] <= reach_m).mean())
+def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Bool[np.ndarray, "h w"]) -> list[float]:
+    """Return the share of each room's outline (map frame) that has a wall beside it that was seen."""
+    cell_m, shares = grid.frame.resolution_m, []
+    distance_m = np.asarray(cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)) * cell_m
+    for outline in (room.shape.exterior for room in rooms):
+        count = max(8, math.ceil(outline.length / cell_m))
+        points = outline.interpolate(np.linspace(0.0, 1.0, count), normalized=True)
+        row, column = grid.frame.cells_at(shapely.get_coordinates(points))
+        shares.append(float((distance_m[row, column] <= _BESIDE_CELLS * cell_m).mean()))
+    return shares
 
 
 def _report_free_cells(sketch: Sketch, grid: OccupancyGrid, builder: ReportBuilder) -> None:

@@ -193,42 +193,31 @@ def _panes(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[tu
     """Return the corners (pixels) and direction (degrees) of every strip that could be a pane."""
     assert walls.cavities is not None
     # Cavities outside the walls are furniture.
-    labels = np.where(walls.mask, walls.cavities, 0).astype(np.int32)
-    compact = np.unique(labels, return_inverse=True)
-    names, index = compact[0], compact[1].reshape(labels.shape)
-    thickness = walls.thickness_m / ink.metres_per_pixel
+    rows, columns = np.nonzero(np.where(walls.mask, walls.cavities, 0))
+    labels = walls.cavities[rows, columns]
+    order = np.argsort(labels, kind="stable")
+    points, begins = np.column_stack([columns, rows])[order], np.flatnonzero(np.diff(labels[order], prepend=0))
+    sizes, pixel_m = np.diff(begins, append=len(points)), ink.metres_per_pixel
+    thickness = walls.thickness_m / pixel_m
     found = []
-    boxes = _boxes(index, len(names))
-    for label, (x0, y0, x1, y1) in enumerate(boxes):
-        if names[label] == 0 or max(x1 - x0, y1 - y0) * ink.metres_per_pixel < _MIN_LENGTH_M:
+    # Most cavities are tiny.
+    large = sizes * pixel_m >= _FULL * _MIN_LENGTH_M
+    for begin, size in zip(begins[large].tolist(), sizes[large].tolist(), strict=True):
+        part = points[begin : begin + size]
+        if (np.ptp(part, axis=0).max() + 1) * pixel_m < _MIN_LENGTH_M:
             continue
         check_time()
-        part = (index[y0:y1, x0:x1] == label).astype(np.uint8)
-        points = np.argwhere(part)[:, ::-1].astype(np.float32)
-        (cx, cy), (width, height), angle = cv2.minAreaRect(points)
+        x0, y0 = part.min(axis=0).tolist()
+        (cx, cy), (width, height), angle = cv2.minAreaRect((part - [x0, y0]).astype(np.float32))
         width, height = width + 1.0, height + 1.0
         long, short = max(width, height), min(width, height)
-        if long * ink.metres_per_pixel < _MIN_LENGTH_M or long < _LONG * short:
+        if long * pixel_m < _MIN_LENGTH_M or long < _LONG * short:
             continue
-        if not _OF_WALL[0] * thickness <= short <= _OF_WALL[1] * thickness or part.sum() < _FULL * long * short:
+        if not _OF_WALL[0] * thickness <= short <= _OF_WALL[1] * thickness or size < _FULL * long * short:
             continue
         corners = cv2.boxPoints(((cx + x0 + 0.5, cy + y0 + 0.5), (width, height), angle))
         found.append((corners, angle if width >= height else angle + 90.0))
     return found
-
-
-def _boxes(index: np.ndarray, count: int) -> list[tuple[int, int, int, int]]:
-    """Return the bounding boxes of all labels."""
-    rows, columns = index.shape
-    low_x, low_y = np.full(count, columns), np.full(count, rows)
-    high_x, high_y = np.zeros(count, int), np.zeros(count, int)
-    ys, xs = np.nonzero(index)
-    labels = index[ys, xs]
-    np.minimum.at(low_x, labels, xs)
-    np.minimum.at(low_y, labels, ys)
-    np.maximum.at(high_x, labels, xs + 1)
-    np.maximum.at(high_y, labels, ys + 1)
-    return [(int(a), int(b), int(c), int(d)) for a, b, c, d in zip(low_x, low_y, high_x, high_y, strict=True)]
 
 
 def _side_by_side(first: np.ndarray, second: np.ndarray, ink: Ink, walls: WallMask) -> bool:
