@@ -97,7 +97,7 @@ class MatchingWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class AlbumWeights:
-    """Weights of what counts in albums only, fitted on albums of pictures by others (`evaluate.calibrate.album_fit`).
+    """Weights of what counts in albums only; `evaluate.bench.album_weights` measures `misread` and `pairs`.
 
     Attributes:
         misread: share of photographs whose walls and openings are misread, before those of an album tell.

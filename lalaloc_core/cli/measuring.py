@@ -23,7 +23,7 @@ _DECIMALS = 4
 class Bench:
     """Measure the figures of the results page and print them as JSON."""
 
-    only: Annotated[tuple[str, ...], "groups of figures (default: all)"] = ()
+    only: Annotated[tuple[str, ...], "groups of figures (default: all but `album_weights`, which takes an hour)"] = ()
     bundle: BundleFolder = field(default_factory=default_bundle)
     textures: Textures = None
     homes: Annotated[int, "test homes per accuracy figure, 4 queries each"] = 250

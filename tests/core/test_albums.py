@@ -269,7 +269,7 @@ def test_an_id_is_added_once(
 
 def test_evidence_of_photographs_of_one_spot_counts_once() -> None:
     rng = np.random.default_rng(2)
-    logs = rng.normal(-3.0, 1.0, (3, 6))
+    logs = rng.normal(2.0, 1.0, (3, 6))
     pose, room = np.arange(6), np.array([0, 0, 0, 1, 1, 1])
     states = [
         States.of(
@@ -305,7 +305,8 @@ def test_figures_of_pins_count_rooms_and_elsewhere() -> None:
     share = RoomShare(plan_id="p", room_id="a", room="A", probability=0.9)
     pose = PinPose(plan_id="p", room_id="a", room="A", x_m=0.0, y_m=0.0, heading=None)
     pins = [replace(_pin(str(number), pose), rooms=(share,)) for number in range(3)]
-    pins.append(replace(_pin("4", None), state="set_aside"))
+    pins[2] = replace(pins[2], elsewhere=0.1)
+    pins.append(replace(_pin("4", None), state="set_aside", elsewhere=1.0))
     figures = pin_figures(pins, [("p", "a"), ("p", "b"), None, None])
     assert figures == {
         "n": 2, "right_room": 1, "set_aside": 0, "sure": 2, "sure_and_wrong": 1,

@@ -2,8 +2,8 @@
 
 The temperature of walls and openings, the weight of recognised objects, the share of misread photographs, and that of
 pairs replace each other in part, so all combinations are tried. The sources are a furnished house, annotated and
-path-traced rooms, and generated homes with and without furniture; they count alike, whatever the number of their
-albums. The score is the mean log probability of the right room.
+path-traced rooms, generated homes with and without furniture, and the house's photographs among others and in a foreign
+plan; they count alike, whatever the number of their albums. The score is the mean log probability of the right room.
 """
 
 from __future__ import annotations

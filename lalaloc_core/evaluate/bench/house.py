@@ -96,12 +96,12 @@ def house_albums(setting: Setting) -> dict[str, RoomAlbum]:
         for path in ([] if setting.annotated is None else sorted(setting.annotated.glob("*.jpg"))[:_ELSEWHERE])
     ]
     rooms: list[RoomKey] = [*plain.values(), *[None] * len(outside)]
-    return {
+    albums = {
         "album": RoomAlbum(own, list(plain), list(plain.values())),
         "album_walk": RoomAlbum(own, list(walk), list(walk.values())),
-        "album_with_elsewhere": RoomAlbum(own, [*plain, *outside], rooms),
         "album_in_foreign_plan": RoomAlbum(foreign, list(plain), [None] * len(plain)),
     }
+    return albums | ({"album_with_elsewhere": RoomAlbum(own, [*plain, *outside], rooms)} if outside else {})
 
 
 def _plans(folder: Path) -> dict[int, str]:

@@ -110,14 +110,14 @@ def pin_figures(pins: Sequence[Pin], truth: Sequence[RoomKey]) -> dict[str, floa
     right, logs = list[bool](), list[float]()
     for pin, room in zip(pins, truth, strict=True):
         shares = {(row.plan_id, row.room_id): row.probability for row in pin.rooms}
-        probability = 1.0 - sum(shares.values()) if room is None else shares.get(room, 0.0)
+        probability = pin.elsewhere if room is None else shares.get(room, 0.0)
         logs.append(math.log(max(probability, _LEAST)))
         right.append(pin.pose is not None and (pin.pose.plan_id, pin.pose.room_id) == room)
-    sure, aside = (np.array([pin.state == state for pin in pins]) for state in ("sure", "set_aside"))
-    own, is_right = np.array([room is not None for room in truth]), np.array(right)
+    sure, aside = (np.array([pin.state == state for pin in pins], bool) for state in ("sure", "set_aside"))
+    own, is_right = np.array([room is not None for room in truth], bool), np.array(right, bool)
     return {
         "n": int(own.sum()),
-        "mean_log_probability": float(np.mean(logs)),
+        "mean_log_probability": float(np.mean(logs)) if logs else 0.0,
         "right_room": int(is_right.sum()),
         "set_aside": int((aside & own).sum()),
         "sure": int((sure & own).sum()),

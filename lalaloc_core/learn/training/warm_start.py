@@ -134,6 +134,10 @@ def mean_with(checkpoint: Checkpoint, earlier: Checkpoint, share: float) -> Chec
     weights = {module: dict(state) for module, state in checkpoint.inference_weights.items()}
     for module, state in weights.items():
         for name, before in earlier.inference_weights[module].items():
+            if name in state and before.shape != state[name].shape:
+                raise CheckpointError(
+                    f"'{name}' has the shape {tuple(state[name].shape)}, before {tuple(before.shape)}"
+                )
             if name in state and before.is_floating_point():
                 state[name] = torch.lerp(before.float(), state[name].float(), share)
     return dataclasses.replace(checkpoint, weights=weights, averaged={}, optimiser={})

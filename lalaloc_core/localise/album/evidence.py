@@ -41,8 +41,8 @@ _OFFSETS = np.linspace(-0.36, 0.36, 9)
 _USUAL_HEIGHT_M, _USUAL_LOG_SD, _USUAL_CEILING_M = 1.5, 0.15, 2.5
 # States that are kept: of every room, at least so many, and of all.
 _PER_ROOM, _MAX_STATES = 96, 8192
-# Every so many of the poses of other homes are compared; version of the evidence in stored memories.
-_EVERY, _VERSION = 4, 2
+# Every so many of the poses of other homes are compared; poses at a time; version of the evidence in stored memories.
+_EVERY, _PART, _VERSION = 4, 4096, 2
 _CONFIG = MatchingConfig()
 # Arrays of one photograph by name.
 Arrays = dict[str, np.ndarray]
@@ -172,12 +172,18 @@ def single_evidence(searched: SearchedPlan, encoder: PhotographEncoder, photogra
         best[part] = log.max(axis=2)
     trust = int(trusts[best.max(axis=1).argmax()])
     others = _height_costs(np.array([_USUAL_CEILING_M]), query, weights)
-    best -= _of_other_homes(encoder, compared, others, trust, best)
+    usual = _of_other_homes(encoder, compared, others, trust, best)
     places = PlaceCost.of(plan, query, NO_HINTS, 1.0, poses.position_m, poses.room_index)
     if places is not None:
-        # How probable it is that the lines and fixtures that are seen are there, over the mean of the plan.
-        log_share = np.broadcast_to(-places.of_poses(np.arange(len(poses))), best.shape)
-        best += log_share - (_log_sum(log_share) - math.log(log_share.size))
+        # How probable it is that the lines and fixtures that are seen are there, over the mean of the plan; by parts,
+        # to bound the memory of large plans.
+        total = -math.inf
+        for first in range(0, len(best), _PART):
+            cost = places.of_poses(np.arange(first, min(first + _PART, len(best))))
+            best[first : first + _PART] -= cost
+            total = np.logaddexp(total, _log_sum(-cost) + math.log(best.shape[1] / cost.shape[1]))
+        usual += total - math.log(best.size)
+    best -= usual
     kept = _kept(best, poses.room_index, len(plan.rooms))
     pose, hypothesis = np.divmod(kept, best.shape[1])
     return {
@@ -211,10 +217,19 @@ def _of_other_homes(
 
 def _room_means(log: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Float[np.ndarray, "r"]:
     """Return the log mean likelihood of every room; of the least likely one for rooms without poses."""
-    highest = float(log.max())
-    total = np.bincount(room_index, np.exp(log - highest).mean(axis=1), minlength=rooms)
-    mean = total / np.maximum(np.bincount(room_index, minlength=rooms), 1)
-    return highest + np.log(np.where(mean > 0.0, mean, mean[mean > 0.0].min()))
+    highest = log.max(axis=1)
+    by_pose = highest + np.log(np.exp(log - highest[:, None]).mean(axis=1))
+    total, count = log_sums(by_pose, room_index, rooms), np.bincount(room_index, minlength=rooms)
+    mean = total - np.log(np.maximum(count, 1))
+    return np.where(count > 0, mean, mean[count > 0].min())
+
+
+def log_sums(log: Float[np.ndarray, "m"], room: Int[np.ndarray, "m"], rooms: int) -> Float[np.ndarray, "r"]:
+    """Return the log of the summed likelihood of each room, however unlikely it is; -inf for rooms without any."""
+    highest = np.full(rooms, -np.inf)
+    np.maximum.at(highest, room, log)
+    total = np.bincount(room, np.exp(log - highest[room]), minlength=rooms)
+    return np.where(total > 0.0, highest + np.log(np.maximum(total, 1.0)), -np.inf)
 
 
 def _kept(best: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Int[np.ndarray, "m"]:

@@ -60,11 +60,13 @@ class Pin:
 
     Attributes:
         photograph_id: the photograph.
-        state: "sure": the room is probably right (`confidence` at least `solve.SURE`); "uncertain": less so;
+        state: "sure": the room is probably right (`confidence` at least `solve.SURE`), and the album fits its plan;
+            "uncertain": less so;
             "set_aside": of none of the rooms, or not usable, for `reason`; "corrected": a person stated it.
         pose: the place; None if it is set aside.
         confidence: probability that the room is right; 1 if it was stated.
         within_1m: probability that the pose is right within 1 m.
+        elsewhere: probability that it is of none of the rooms.
         reason: a sentence on why it is set aside or uncertain; empty otherwise.
         rooms: the probable rooms, most probable first.
         suggestions: up to five distinct poses, most probable first; the first is `pose`, if the pin has one.
@@ -76,6 +78,7 @@ class Pin:
     pose: PinPose | None
     confidence: float
     within_1m: float
+    elsewhere: float = 0.0
     reason: str = ""
     rooms: tuple[RoomShare, ...] = ()
     suggestions: tuple[Suggestion, ...] = ()

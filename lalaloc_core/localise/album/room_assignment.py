@@ -16,6 +16,7 @@ rooms, or two storeys: these moves leave the pairs alone, between whose optima s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
@@ -25,7 +26,6 @@ import shapely
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import betaln
 
 from lalaloc_core.localise.album.ground import AlbumGround
 
@@ -122,8 +122,10 @@ class _Chains:
         self._expected = np.zeros(self._rooms - 1) if evidence.expected is None else evidence.expected
         self._crowding = 0.0 if evidence.expected is None else 0.5 * evidence.crowding
         # Log probability of the photographs that are of none of the rooms, by their number.
-        away, count = np.arange(len(evidence.alone) + 1), len(evidence.alone)
-        self._away = betaln(_AWAY[0] + away, _AWAY[1] + count - away) - betaln(*_AWAY)
+        count = len(evidence.alone)
+        self._away = np.array(
+            [math.lgamma(_AWAY[0] + away) + math.lgamma(_AWAY[1] + count - away) for away in range(count + 1)]
+        )
         self._each = np.arange(_CHAINS)
         # Temperature of each chain, and the number of each chain by ladder and temperature.
         self._heat = np.tile(np.geomspace(1.0, _HOTTEST, _LEVELS), _LADDERS)
@@ -161,6 +163,10 @@ class _Chains:
     def _prior_with(self, counts: Float[np.ndarray, "c r"], more: Float[np.ndarray, "#c"]) -> Float[np.ndarray, "c r"]:
         """Return the log prior with more photographs in each of the rooms."""
         inside, away = counts[:, :-1], counts[:, -1].astype(int)
+        if not self._crowding:
+            found = np.broadcast_to(self._away[away][:, None], counts.shape).copy()
+            found[:, -1] = self._away[away + more.astype(int)]
+            return found
         expected = (inside.sum(axis=1) + more)[:, None] * self._expected
         weight, off = self._crowding / (expected + 1.0), inside - expected
         found = np.empty(counts.shape)

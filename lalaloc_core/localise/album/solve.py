@@ -92,7 +92,13 @@ def solve_album(
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
     usual = encoder.manifest.album.misread
-    misread = misread_share([state.rooms / state.photographs for state in states], usual)
+    # What a person stated, and what is taken outside, does not tell how well the plan is read.
+    telling = [
+        state.rooms / state.photographs
+        for each, state in zip(ordered, states, strict=True)
+        if each.id not in constraints and _outside(each) <= 0.0
+    ]
+    misread = misread_share(telling, usual)
     share = _room_shares(ground, encoder, ordered, memory, states, links, constraints, walk, misread, pause)
     misfit = () if misread <= _MISFIT else (_MISFIT_WARNING.format(100.0 * misread),)
     pins = {
@@ -107,10 +113,7 @@ def solve_album(
         camera_height_m=height_m,
         scale=scale,
         compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
-        warnings=(
-            *(() if fits else (_MISFIT_WARNING.format(100.0 * misread),)),
-            *(() if walk is None else walk.warnings),
-        ),
+        warnings=(*misfit, *(() if walk is None else walk.warnings)),
     )
 
 
@@ -262,6 +265,7 @@ def _pin(
         pose=None,
         confidence=0.0,
         within_1m=0.0,
+        elsewhere=float(share[rooms]),
         rooms=listed,
         suggestions=suggestions,
         warnings=photograph.photograph.warnings,
@@ -276,13 +280,14 @@ def _pin(
     confidence = float(share[order[0]])
     is_sure = fits and confidence >= SURE
     also = ", ".join(f"{row.room} {100.0 * row.probability:.0f} %" for row in listed[1:3])
+    reason = f"it also fits: {also}" if also else "the photographs fit this plan badly" if not fits else ""
     return replace(
         base,
         state="sure" if is_sure else "uncertain",
         pose=suggestions[0].pose,
         confidence=confidence,
         within_1m=suggestions[0].probability,
-        reason="" if is_sure or not also else f"it also fits: {also}",
+        reason="" if is_sure else reason,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.localise.album.evidence import Arrays
+from lalaloc_core.localise.album.evidence import Arrays, log_sums
 from lalaloc_core.localise.belief import suppress
 
 # Deviation (radians) of a turn by overlap, and probability that it is wrong.
@@ -67,11 +67,10 @@ class States:
 
     def changed(self, log: Float[np.ndarray, "m"], photographs: int | None = None) -> States:
         """Return the states with another log likelihood; that of rooms changes with that of the states kept of each."""
-        rooms, count = self.rooms.copy(), len(self.rooms)
-        highest = max(self.log.max(initial=0.0), log.max(initial=0.0))
-        before, after = (np.bincount(self.room, np.exp(each - highest), minlength=count) for each in (self.log, log))
-        known = (before > 0.0) & (after > 0.0)
-        rooms[known] += np.log(after[known] / before[known])
+        before, after = (log_sums(each, self.room, len(self.rooms)) for each in (self.log, log))
+        known = np.isfinite(before)
+        rooms = self.rooms.copy()
+        rooms[known] += after[known] - before[known]
         return replace(self, log=log, rooms=rooms, photographs=photographs or self.photographs)
 
     def modes(self, room: int) -> tuple[Int[np.ndarray, "k"], Float[np.ndarray, "k"]]:
