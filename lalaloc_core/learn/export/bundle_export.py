@@ -151,7 +151,9 @@ def add_objects(folder: Path) -> Bundle:
     with _new_files(bundle.folder) as work:
         _export(work / OBJECTS_ONNX, network, {"image": image}, ["probability", "by_column"], sides)
     names, shares = [name for name, _, _ in OBJECTS], shares_by_type().round(3).tolist()
-    objects = dataclasses.replace(bundle.manifest.objects or ObjectsManifest([], []), names=names, shares=shares)
+    objects = dataclasses.replace(
+        bundle.manifest.objects or ObjectsManifest(names=[], shares=[]), names=names, shares=shares
+    )
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, objects=objects))
 
 
