@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from functools import partial, wraps
 from time import monotonic
@@ -43,28 +43,9 @@ class Success(Generic[T]):
 
 @dataclass(frozen=True)
 class Failure:
-    """Error for the caller.
+    """Error for the caller."""
 
-    Exceptions are not sent themselves: unpickling calls their constructors with the message, which most of them do not
-    accept.
-    """
-
-    kind: type[LaLaLocError]
-    text: tuple[Any, ...]
-    attributes: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, error: LaLaLocError) -> Failure:
-        """Return the failure for an error."""
-        return cls(type(error), error.args, dict(error.__dict__))
-
-    @property
-    def error(self) -> LaLaLocError:
-        """The original error."""
-        error = self.kind.__new__(self.kind)
-        error.args = self.text
-        error.__dict__.update(self.attributes)
-        return error
+    error: LaLaLocError
 
 
 def returning_failures(
@@ -77,7 +58,7 @@ def returning_failures(
         try:
             return Success(await method(self, *args, **kwargs))
         except LaLaLocError as error:
-            return Failure.of(error)
+            return Failure(error)
 
     return wrapper
 

@@ -110,7 +110,7 @@ class Converter:
             result = self._run(ParseJob(document), _PARSE_S)
         except JobLostError:
             return document.plan()
-        except DamagedDataError:
+        except (DamagedDataError, InvalidFloorPlanError):
             return None
         assert isinstance(result, PackedPlan)
         return result.plan()

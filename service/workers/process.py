@@ -17,7 +17,8 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
-from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.errors import InvalidInputError
+from service.errors import DamagedDataError
 
 _PR_SET_PDEATHSIG = 1
 
@@ -36,7 +37,7 @@ class JobNews:
 
 @dataclass(frozen=True)
 class JobResult:
-    """Message with the result of a job, or the error that it raised on purpose, and the CPU time (s) that it took."""
+    """Message with the result of a job, or its error about what it was given, and the CPU time (s) that it took."""
 
     value: Any
     cpu_s: float
@@ -57,8 +58,8 @@ def serve_jobs(
 
     Args:
         connection: the worker's end of the pipe.
-        load: slow; returns the function from job to result. Errors of either are reported to the parent, those of
-            this project as results, and a worker whose function raised an error continues with the next job.
+        load: slow; returns the function from job to result. Errors of either are reported to the parent, those about
+            what a job was given as results, and a worker whose function raised one continues with the next job.
         is_fit: called after each job; the worker ends, and is replaced, when it returns False.
     """
     # Ctrl-C and a service manager's signal reach the whole process group, but the parent decides when its workers end.
@@ -80,7 +81,7 @@ def serve_jobs(
         begin = process_time()
         try:
             message = JobResult(work(job), process_time() - begin)
-        except LaLaLocError as error:
+        except (InvalidInputError, DamagedDataError) as error:
             message = JobResult(error, process_time() - begin)
         except Exception as error:
             message = WorkerFailure(f"{type(error).__name__}: {error}", process_time() - begin)

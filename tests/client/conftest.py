@@ -100,9 +100,8 @@ class _BlockingAdapter:
         method = getattr(self._client, name)
 
         async def call(*args: Any, **kwargs: Any) -> Any:
-            if inspect.isasyncgenfunction(inspect.unwrap(method)):
-                return [item async for item in method(*args, **kwargs)]
-            return await method(*args, **kwargs)
+            answer = method(*args, **kwargs)
+            return [item async for item in answer] if inspect.isasyncgen(answer) else await answer
 
         return lambda *args, **kwargs: self._runner.run(call(*args, **kwargs))
 

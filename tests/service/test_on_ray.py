@@ -185,7 +185,7 @@ def test_invalid_replica_numbers_are_refused(
     ],
 )
 def test_errors_keep_their_attributes(error: Any) -> None:
-    arrived = pickle.loads(pickle.dumps(Failure.of(error))).error
+    arrived = pickle.loads(pickle.dumps(Failure(error))).error
     assert type(arrived) is type(error)
     assert str(arrived) == str(error)
     assert vars(arrived) == vars(error)

@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lalaloc_core.evaluate.bench.measured import Found, Setting, evaluate, summary
 from lalaloc_core.evaluate.bench.turns import found_in_film, found_in_turns
 from lalaloc_core.evaluate.calibrate.measured_errors import Spot
