@@ -11,15 +11,7 @@ from random import random
 from time import monotonic
 from typing import Any, Unpack
 
-from lalaloc_client.albums import (
-    FORMAT_MEDIA,
-    AddedPhotograph,
-    Album,
-    AlbumFormat,
-    AlbumPage,
-    AlbumPhotograph,
-    AlbumPhotographPage,
-)
+from lalaloc_client.albums import FORMAT_MEDIA, AddedPhotograph, Album, AlbumFormat, AlbumPhotograph
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import AlbumFailedError, NotReadyError
@@ -65,8 +57,7 @@ class Albums(Transport):
 
     def albums(self, name: str | None = None, *, page_size: int = 100) -> Iterator[Album]:
         """Yield the albums, newest first, page by page; with `name`, those with this text in their name."""
-        for page in self._pages(AlbumPage, "/albums", name=name, limit=page_size):
-            yield from page.albums
+        return self._listed(Album, "/albums", name=name, limit=page_size)
 
     def delete_album(self, album_id: str, *, if_match: str | None = None) -> None:
         """Delete an album with its photographs."""
@@ -119,8 +110,7 @@ class Albums(Transport):
     def album_photographs(self, album_id: str, *, page_size: int = 100) -> Iterator[AlbumPhotograph]:
         """Yield the photographs of an album with their pins, in the order in which they were added."""
         path = f"{resource_path('albums', album_id)}/photographs"
-        for page in self._pages(AlbumPhotographPage, path, limit=page_size):
-            yield from page.photographs
+        return self._listed(AlbumPhotograph, path, limit=page_size)
 
     def album_photograph(self, album_id: str, photograph_id: str) -> AlbumPhotograph:
         """Return a photograph of an album."""

@@ -18,7 +18,6 @@ from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
 from lalaloc_client.model import (
     FloorPlan,
-    FloorPlanPage,
     FloorPlanSummary,
     ImportStep,
     Layout,
@@ -26,9 +25,7 @@ from lalaloc_client.model import (
     PlanEvent,
     Venue,
     VenueAnchor,
-    VenuePage,
     VenuePlan,
-    VenuePlanPage,
 )
 from lalaloc_client.parsing import parse
 from lalaloc_client.requests import (
@@ -104,8 +101,7 @@ class Plans(Albums):
 
     def floorplans(self, name: str | None = None, *, page_size: int = 100) -> Iterator[FloorPlanSummary]:
         """Yield the stored plans, newest first, page by page; with `name`, those with this text in their name."""
-        for page in self._pages(FloorPlanPage, "/floorplans", name=name, limit=page_size):
-            yield from page.floorplans
+        return self._listed(FloorPlanSummary, "/floorplans", name=name, limit=page_size)
 
     def delete_floorplan(self, floorplan_id: str) -> None:
         """Delete a plan and everything that was derived from it."""
@@ -335,14 +331,12 @@ class Plans(Albums):
 
     def venues(self, name: str | None = None, *, page_size: int = 100) -> Iterator[Venue]:
         """Yield the stored venues, newest first, page by page; with `name`, those with this text in their name."""
-        for page in self._pages(VenuePage, "/venues", name=name, limit=page_size):
-            yield from page.venues
+        return self._listed(Venue, "/venues", name=name, limit=page_size)
 
     def venue_plans(self, venue_id: str, *, level: float | None = None, page_size: int = 100) -> Iterator[VenuePlan]:
         """Yield the plans of a venue, or of one of its levels, from the lowest level up, page by page."""
         path = f"{resource_path('venues', venue_id)}/plans"
-        for page in self._pages(VenuePlanPage, path, level=level, limit=page_size):
-            yield from page.plans
+        return self._listed(VenuePlan, path, level=level, limit=page_size)
 
     def delete_venue(self, venue_id: str) -> None:
         """Delete a venue; its plans stay stored."""
@@ -350,9 +344,6 @@ class Plans(Albums):
 
 
 def _venue_document(plans: Iterable[VenuePlan], name: str | None, anchor: VenueAnchor | None) -> dict[str, Any]:
-    document: dict[str, Any] = {"plans": [plan.to_dict() for plan in plans]}
-    if name is not None:
-        document["name"] = name
-    if anchor is not None:
-        document["anchor"] = anchor.to_dict()
-    return document
+    given = {"name": name, "anchor": None if anchor is None else anchor.to_dict()}
+    stated = {key: value for key, value in given.items() if value is not None}
+    return {"plans": [plan.to_dict() for plan in plans], **stated}

@@ -14,23 +14,23 @@ from typing import Any, ParamSpec, TypeVar
 
 import httpx
 
-from lalaloc_client.albums import AddedPhotograph, Album, AlbumPage, AlbumPhotograph, AlbumPhotographPage
+from lalaloc_client.albums import AddedPhotograph, Album, AlbumPhotograph
 from lalaloc_client.answers import BatchAnswer
 from lalaloc_client.blocking.backend import run_blocking, sleep
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from lalaloc_client.blocking.device import Device
 from lalaloc_client.errors import ConflictError, ConnectionFailedError, ProblemError, problem_of
-from lalaloc_client.model import FloorPlan, FloorPlanPage, ImportStep, Venue, VenuePage, VenuePlanPage
+from lalaloc_client.model import FloorPlan, ImportStep, Venue
 from lalaloc_client.on_device import Film, TurnFeatures, split_options
 from lalaloc_client.options import Options
-from lalaloc_client.parsing import parse
+from lalaloc_client.parsing import page_of, parse
 from lalaloc_client.requests import JSON, NDJSON, Photograph, Request, http_options, query_request, text_values
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 P = ParamSpec("P")
 StoredT = TypeVar("StoredT", FloorPlan, Venue, Album, AlbumPhotograph)
 LineT = TypeVar("LineT", BatchAnswer, AddedPhotograph)
-PageT = TypeVar("PageT", FloorPlanPage, VenuePage, VenuePlanPage, AlbumPage, AlbumPhotographPage)
+RowT = TypeVar("RowT")
 
 # Used when the service does not state its limit; every service allows this many.
 _DEFAULT_MAX_QUERIES = 3
@@ -151,12 +151,13 @@ class Transport:
         response = self._send(request, retry)
         return replace(parse(kind, response.content), etag=response.headers.get("etag"))
 
-    def _pages(self, kind: type[PageT], path: str, **params: object) -> Iterator[PageT]:
-        """Request a listing page by page."""
-        cursor = None
+    def _listed(self, kind: type[RowT], path: str, **params: object) -> Iterator[RowT]:
+        """Yield what a listing has, page by page; the field of a page is called as the end of the path."""
+        rows, cursor = path.rpartition("/")[2], None
         while True:
-            page = parse(kind, self.content(Request("GET", path, text_values({**params, "cursor": cursor}))))
-            yield page
+            request = Request("GET", path, text_values({**params, "cursor": cursor}))
+            page = parse(page_of(kind, rows), self.content(request))
+            yield from getattr(page, rows)
             cursor = page.next_cursor
             if cursor is None:
                 return
