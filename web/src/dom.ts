@@ -5,19 +5,19 @@ type Attributes = Record<string, string | number | boolean | null | undefined | 
 
 const SVG = "http://www.w3.org/2000/svg";
 
-function fill(element: Element, attributes: Attributes, children: Child[]): void {
+function fill<E extends Element>(element: E, attributes: Attributes, children: Child[]): E {
   for (const [name, value] of Object.entries(attributes)) {
     if (value === null || value === undefined || value === false) continue;
     if (typeof value === "function") element.addEventListener(name.slice(2), value);
     else element.setAttribute(name, value === true ? "" : String(value));
   }
   element.append(...present(children));
+  return element;
 }
 
+// The DOM turns numbers into text.
 function present(children: Child[]): (Node | string)[] {
-  return children
-    .filter((child): child is Node | string | number => child !== null && child !== undefined && child !== false)
-    .map((child) => (typeof child === "number" ? String(child) : child));
+  return children.filter((child) => child !== null && child !== undefined && child !== false) as (Node | string)[];
 }
 
 /** Create an HTML element; attributes that begin with "on" are listeners. */
@@ -26,9 +26,7 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   attributes: Attributes = {},
   ...children: Child[]
 ): HTMLElementTagNameMap[K] {
-  const element = document.createElement(tag);
-  fill(element, attributes, children);
-  return element;
+  return fill(document.createElement(tag), attributes, children);
 }
 
 /** Create an SVG element. */
@@ -37,9 +35,7 @@ export function s<K extends keyof SVGElementTagNameMap>(
   attributes: Attributes = {},
   ...children: Child[]
 ): SVGElementTagNameMap[K] {
-  const element = document.createElementNS(SVG, tag) as SVGElementTagNameMap[K];
-  fill(element, attributes, children);
-  return element;
+  return fill(document.createElementNS(SVG, tag) as SVGElementTagNameMap[K], attributes, children);
 }
 
 /** Return an element of the page by its id. */
