@@ -1,7 +1,7 @@
 /** Photographs with their settings and answers. */
 
 import { Compass } from "./compass";
-import { byId, h, show } from "./dom";
+import { button, byId, h, show } from "./dom";
 import { acceptDrops, isPicture } from "./drops";
 import { NO_HINTS } from "./hints";
 import { clearErrors, InputError, showError } from "./notices";
@@ -246,11 +246,7 @@ export class Photos {
           h("img", { src: photo.url, alt: "" }),
           h("span", {}, photo.answer === null ? name : `✓ ${photo.answer.room}`),
         );
-        const remove = h(
-          "button",
-          { type: "button", class: "remove", "aria-label": `Remove ${name}`, onclick: () => this.remove(photo) },
-          "×",
-        );
+        const remove = button("×", () => this.remove(photo), { class: "remove", "aria-label": `Remove ${name}` });
         return h("li", {}, choose, remove);
       }),
     );

@@ -331,11 +331,7 @@ export class Plans {
         h("span", { class: "name" }, plan.name),
         h("span", { class: "facts" }, facts.filter(Boolean).join(", ")),
       );
-      const remove = h(
-        "button",
-        { type: "button", class: "remove", "aria-label": `Delete ${plan.name}`, onclick: () => void this.remove(plan) },
-        "×",
-      );
+      const remove = button("×", () => void this.remove(plan), { class: "remove", "aria-label": `Delete ${plan.name}` });
       return h("li", {}, choose, remove);
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));

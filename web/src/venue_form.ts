@@ -102,11 +102,7 @@ export class VenueForm {
           h("span", { class: "name" }, plan.name),
           h("span", { "aria-hidden": "true" }, "level"),
           level,
-          h(
-            "button",
-            { type: "button", class: "remove", "aria-label": `Remove ${plan.name}`, onclick: () => this.remove(index) },
-            "×",
-          ),
+          button("×", () => this.remove(index), { class: "remove", "aria-label": `Remove ${plan.name}` }),
         ),
       ),
     );
