@@ -88,7 +88,14 @@ export function download(content: Blob, name: string): void {
   setTimeout(() => URL.revokeObjectURL(url), 10_000);
 }
 
-/** Create a button. */
-export function button(label: string, act: () => void, attributes: Attributes = {}): HTMLButtonElement {
-  return h("button", { type: "button", ...attributes, onclick: () => act() }, label);
+/** Create a button with a text, or with several children. */
+export function button(label: string | Child[], act: () => void, attributes: Attributes = {}): HTMLButtonElement {
+  const children = typeof label === "string" ? [label] : label;
+  return h("button", { type: "button", ...attributes, onclick: () => act() }, ...children);
+}
+
+/** Create a button of the list of plans, or of venues. */
+export function planButton(name: string, facts: string, isChosen: boolean, choose: () => void): HTMLButtonElement {
+  const parts = [h("span", { class: "name" }, name), h("span", { class: "facts" }, facts)];
+  return button(parts, choose, { class: "plan", "aria-pressed": String(isChosen) });
 }

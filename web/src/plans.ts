@@ -2,7 +2,7 @@
 
 import type { ImportStep } from "../../clients/typescript/src/index";
 import { api, ServiceError } from "./api";
-import { button, byId, h, show } from "./dom";
+import { button, byId, h, planButton, show } from "./dom";
 import { acceptDrops } from "./drops";
 import { followPlan } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
@@ -320,18 +320,12 @@ export class Plans {
             ? "failed"
             : "";
       const facts = [`${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}`, `${plan.area_m2.toFixed(0)} m²`, state];
-      const choose = h(
-        "button",
-        {
-          type: "button",
-          class: "plan",
-          "aria-pressed": String(plan.id === this.current?.id),
-          onclick: () => this.pick(plan.id),
-        },
-        h("span", { class: "name" }, plan.name),
-        h("span", { class: "facts" }, facts.filter(Boolean).join(", ")),
-      );
-      const remove = button("×", () => void this.remove(plan), { class: "remove", "aria-label": `Delete ${plan.name}` });
+      const isChosen = plan.id === this.current?.id;
+      const choose = planButton(plan.name, facts.filter(Boolean).join(", "), isChosen, () => this.pick(plan.id));
+      const remove = button("×", () => void this.remove(plan), {
+        class: "remove",
+        "aria-label": `Delete ${plan.name}`,
+      });
       return h("li", {}, choose, remove);
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));

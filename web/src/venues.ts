@@ -1,7 +1,7 @@
 /** Venues: groups of plans that are searched together. */
 
 import { api } from "./api";
-import { byId, h, show } from "./dom";
+import { byId, h, planButton, show } from "./dom";
 import { clearError, showError } from "./notices";
 import type { ChosenVenue, PlanSummary, Venue } from "./types";
 import { VenueForm } from "./venue_form";
@@ -110,26 +110,11 @@ export class Venues {
   }
 
   private draw(): void {
-    show(
-      this.list,
-      ...this.found.map((venue) =>
-        h(
-          "li",
-          {},
-          h(
-            "button",
-            {
-              type: "button",
-              class: "plan",
-              "aria-pressed": String(venue.id === this.venue?.id),
-              onclick: () => this.pick(venue.id),
-            },
-            h("span", { class: "name" }, venue.name),
-            h("span", { class: "facts" }, `venue, ${venue.plans} plans`),
-          ),
-        ),
-      ),
-    );
+    const entries = this.found.map(({ id, name, plans }) => {
+      const choose = planButton(name, `venue, ${plans} plans`, id === this.venue?.id, () => this.pick(id));
+      return h("li", {}, choose);
+    });
+    show(this.list, ...entries);
     byId("venues").hidden = this.found.length === 0;
   }
 }
