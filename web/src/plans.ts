@@ -4,7 +4,7 @@ import type { ImportStep } from "../../clients/typescript/src/index";
 import { api, ServiceError } from "./api";
 import { button, byId, h, planButton, show } from "./dom";
 import { acceptDrops } from "./drops";
-import { followPlan } from "./events";
+import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
 import { checkPixels, hasOptions, ImportForm } from "./import_form";
 import { clearError, say, showError } from "./notices";
@@ -246,20 +246,16 @@ export class Plans {
   }
 
   private async follow(plan: Plan): Promise<void> {
-    const own = (this.following = new AbortController());
+    const { signal } = (this.following = new AbortController());
     try {
-      await followPlan(
-        plan.id,
-        (event) => {
-          if (this.current?.id !== plan.id) return;
-          if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
-          else if (event.status === "deleted") this.showNone();
-          else void this.renew(plan.id);
-        },
-        own.signal,
-      );
+      for await (const event of eventsOf(plan.id, signal)) {
+        if (this.current?.id !== plan.id) continue;
+        if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
+        else if (event.status === "deleted") this.showNone();
+        else void this.renew(plan.id);
+      }
     } catch (error) {
-      if (!own.signal.aborted) showError(this.error, error);
+      if (!signal.aborted) showError(this.error, error);
     }
   }
 
