@@ -7,12 +7,8 @@ import { placesOf } from "./places";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Answer } from "./types";
 
-// 95 % of a normal distribution in two dimensions, and in one, lie within this many standard deviations.
-const WITHIN_95 = Math.sqrt(5.991),
-  NORMAL_95 = 1.96;
-
-/** Return half the width of the 95 % interval of a value. */
-export const normal95 = (deviation: number): number => NORMAL_95 * deviation;
+// 95 % of a normal distribution in two dimensions lie within this many standard deviations.
+const WITHIN_95 = Math.sqrt(5.991);
 
 /** Return the radii (m) of the ellipse that contains a position with a probability of 95 %, the longer one first. */
 export function within95([[xx, xy], [, yy]]: NonNullable<Answer["covariance_m2"]>): [number, number] {

@@ -2,13 +2,13 @@
 
 import { linkTo } from "./answer_link";
 import {
-  accuracyWords,
   adviceWords,
   confidenceWords,
   HEADING_SOURCES,
   headingWords,
   milliseconds,
   percent,
+  placeWords,
   roomWords,
   seenWords,
   stepWords,
@@ -64,20 +64,14 @@ export function markSelected(index: number | null): void {
 }
 
 function summary(answer: Answer): HTMLElement {
-  const { x_m, y_m } = answer.position,
-    share = answer.confidence ?? 0;
-  const accuracy = accuracyWords(answer);
+  const share = answer.confidence ?? 0;
   return h(
     "div",
     { class: "verdict" },
     h("p", { class: "words" }, confidenceWords(answer.confidence)),
     h("p", { class: "room" }, answer.room),
     answer.venue_id != null && h("p", { class: "plan-of" }, planOf(answer, answer)),
-    h(
-      "p",
-      { class: "where" },
-      `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`,
-    ),
+    h("p", { class: "where" }, placeWords(answer)),
     h(
       "p",
       { class: "hint" },
