@@ -10,7 +10,7 @@ import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
 import { LookAround } from "./look/look_around";
 import { PhoneLink } from "./look/phone_link";
-import { clearError, clearErrors, InputError, showError } from "./notices";
+import { attempt, clearErrors, InputError, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";
@@ -111,12 +111,9 @@ class Page {
   }
 
   private async showPhoneLink(): Promise<void> {
-    clearError(byId("plan-error"));
-    try {
+    await attempt(byId("plan-error"), async () => {
       this.phone.open((this.scene.plan ?? (await this.storeExample())).id);
-    } catch (error) {
-      showError(byId("plan-error"), error);
-    }
+    });
   }
 
   /** Show the plan, the answer or the session that the address names, if any. */
@@ -130,17 +127,14 @@ class Page {
       packed = named("answer-data");
     if (id === null && packed === null) return this.session.follow(named("session"));
     this.answers.cancelQuery();
-    clearError(byId("plan-error"));
-    try {
+    await attempt(byId("plan-error"), async () => {
       const answer = packed === null ? await api.answer(id!) : await linkedAnswer(packed);
       if (answer.venue_id != null) await this.venues.choose(answer.venue_id, null);
       else this.venues.leave();
       await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
       this.answers.photos.choose(null);
       this.answers.show(answer);
-    } catch (error) {
-      showError(byId("plan-error"), error);
-    }
+    });
     return true;
   }
 

@@ -7,8 +7,20 @@ import { labelOf, plainWords } from "./plain_words";
 
 export { InputError };
 
+type Fields = Record<string, HTMLElement>;
+
+/** Do some work; show its error in an element, and mark the fields that cause it. */
+export async function attempt(place: HTMLElement, work: () => Promise<unknown>, fields: Fields = {}): Promise<void> {
+  clearError(place, fields);
+  try {
+    await work();
+  } catch (error) {
+    showError(place, error, fields);
+  }
+}
+
 /** Show an error in an element with the role alert and mark the fields that cause it. */
-export function showError(place: HTMLElement, error: unknown, fields: Record<string, HTMLElement> = {}): void {
+export function showError(place: HTMLElement, error: unknown, fields: Fields = {}): void {
   clearError(place, fields);
   const failure = error instanceof ServiceError ? error : null;
   const text = error instanceof Error ? error.message : String(error);
@@ -51,7 +63,7 @@ export function showFieldError(place: HTMLElement, field: HTMLElement, text: str
 }
 
 /** Remove an error and its marks. */
-export function clearError(place: HTMLElement, fields: Record<string, HTMLElement> = {}): void {
+export function clearError(place: HTMLElement, fields: Fields = {}): void {
   place.hidden = true;
   show(place);
   for (const field of Object.values(fields)) {

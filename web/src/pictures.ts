@@ -1,7 +1,7 @@
 /** Pictures to save: the map as it is shown, and an answer with its photograph. */
 
 import { byId, download } from "./dom";
-import { clearError, InputError, showError } from "./notices";
+import { attempt, InputError } from "./notices";
 
 // Pixels of the longer side, and properties that style sheets set.
 const PIXELS = 2400;
@@ -27,10 +27,7 @@ const STYLES = [
 
 /** Save the map with a click on its button; `name` returns the name of the plan. */
 export function connectSaveMap(map: SVGSVGElement, name: () => string): void {
-  byId("save-map").addEventListener("click", () => {
-    clearError(byId("plan-error"));
-    saveMap(map, name()).catch((error: unknown) => showError(byId("plan-error"), error));
-  });
+  byId("save-map").addEventListener("click", () => void attempt(byId("plan-error"), () => saveMap(map, name())));
 }
 
 /** Save an answer as the page shows it: the photograph with the layout, null without one, the map, and a caption. */

@@ -4,7 +4,7 @@ import { api } from "./api";
 import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
-import { clearError, InputError, say, showError } from "./notices";
+import { attempt, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { choicesOf, Floors, type Row } from "./pin_floors";
@@ -101,14 +101,7 @@ class PinPage {
     });
   }
 
-  private async guarded(work: () => Promise<void>): Promise<void> {
-    clearError(this.error);
-    try {
-      await work();
-    } catch (failure) {
-      showError(this.error, failure);
-    }
-  }
+  private readonly guarded = (work: () => Promise<void>): Promise<void> => attempt(this.error, work);
 
   /** Begin a choice; the returned function says whether it is still the last one: answers can overtake each other. */
   private request(): () => boolean {

@@ -7,7 +7,7 @@ import { acceptDrops } from "./drops";
 import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
 import { checkPixels, hasOptions, ImportForm } from "./import_form";
-import { clearError, say, showError } from "./notices";
+import { attempt, clearError, say, showError } from "./notices";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 /** True if the import guessed nothing that the user may want to correct. */
@@ -280,15 +280,12 @@ export class Plans {
 
   private async remove(plan: PlanSummary): Promise<void> {
     if (!(await this.confirm(plan))) return;
-    clearError(this.error);
-    try {
+    await attempt(this.error, async () => {
       await api.deletePlan(plan.id);
       say(`“${plan.name}” is deleted.`);
       if (this.current?.id === plan.id) this.showNone();
       await this.load();
-    } catch (error) {
-      showError(this.error, error);
-    }
+    });
   }
 
   private confirm(plan: PlanSummary): Promise<boolean> {

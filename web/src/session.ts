@@ -4,7 +4,7 @@ import { ellipse } from "./answer_overlay";
 import { api, ServiceError } from "./api";
 import { device } from "./device/device";
 import { button, byId, h, s, show } from "./dom";
-import { clearError, showError } from "./notices";
+import { attempt } from "./notices";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Plan, Session, Venue } from "./types";
 
@@ -73,12 +73,13 @@ export class LiveSession {
 
   /** Follow a session that another client feeds; return false without an id. */
   async follow(id: string | null): Promise<boolean> {
-    if (id !== null && id !== this.session?.id) await this.attempt(async () => this.open(await api.session(id), false));
+    if (id !== null && id !== this.session?.id)
+      await attempt(this.error, async () => this.open(await api.session(id), false));
     return id !== null;
   }
 
   private async start(): Promise<void> {
-    await this.attempt(async () => {
+    await attempt(this.error, async () => {
       const place = await this.actions.place();
       this.open(await api.createSession("plans" in place ? { venue_id: place.id } : { floorplan_id: place.id }), true);
       history.replaceState(null, "", `#session=${this.session!.id}`);
@@ -114,7 +115,7 @@ export class LiveSession {
     const id = this.session?.id;
     this.sending = true;
     this.next.setAttribute("aria-busy", "true");
-    await this.attempt(async () => {
+    await attempt(this.error, async () => {
       for (const file of files) {
         if (this.session?.id !== id) return;
         const session = await this.sent(file);
@@ -142,7 +143,7 @@ export class LiveSession {
   private async end(): Promise<void> {
     const { session, isOwn } = this;
     this.close();
-    if (session !== null && isOwn) await this.attempt(async () => api.deleteSession(session.id));
+    if (session !== null && isOwn) await attempt(this.error, () => api.deleteSession(session.id));
   }
 
   private close(): void {
@@ -150,15 +151,6 @@ export class LiveSession {
     history.replaceState(null, "", location.pathname);
     show(this.state);
     this.draw();
-  }
-
-  private async attempt(work: () => Promise<void>): Promise<void> {
-    clearError(this.error);
-    try {
-      await work();
-    } catch (error) {
-      showError(this.error, error);
-    }
   }
 
   private take(session: Session): void {

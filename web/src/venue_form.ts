@@ -2,7 +2,7 @@
 
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
-import { clearError, InputError, say, showError } from "./notices";
+import { attempt, InputError, say } from "./notices";
 import type { PlanSummary, Venue } from "./types";
 
 interface Row {
@@ -70,8 +70,7 @@ export class VenueForm {
       ["name", this.name] as const,
       ...this.chosen.map(({ level }, index) => [`plans.${index}.level`, level] as const),
     ]);
-    clearError(this.error, fields);
-    try {
+    const create = async (): Promise<void> => {
       const missing = this.chosen.find(({ level }) => Number.isNaN(level.valueAsNumber));
       if (this.name.value.trim() === "") throw new InputError("Enter a name for the venue.");
       if (this.chosen.length === 0) throw new InputError("Add at least one plan.");
@@ -84,9 +83,8 @@ export class VenueForm {
       this.draw();
       say(`“${venue.name}” is stored.`);
       this.made(venue);
-    } catch (error) {
-      showError(this.error, error, fields);
-    }
+    };
+    await attempt(this.error, create, fields);
   }
 
   private draw(): void {

@@ -2,7 +2,7 @@
 
 import { api } from "./api";
 import { byId, h, planButton, show } from "./dom";
-import { clearError, showError } from "./notices";
+import { attempt, showError } from "./notices";
 import type { ChosenVenue, PlanSummary, Venue } from "./types";
 import { VenueForm } from "./venue_form";
 
@@ -68,8 +68,7 @@ export class Venues {
 
   /** Choose a venue by its id and show one of its plans: `planId`, by default the first; null shows none. */
   async choose(id: string, planId?: string | null): Promise<void> {
-    clearError(this.error);
-    try {
+    await attempt(this.error, async () => {
       const [venue, { plans, next_cursor: more }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
       this.venue = { ...venue, listed: plans };
       byId("venue-name").textContent = venue.name;
@@ -90,9 +89,7 @@ export class Venues {
       this.actions.chosen(this.venue);
       const first = planId === undefined ? plans[0]?.floorplan_id : planId;
       if (first) this.actions.showPlan(first);
-    } catch (error) {
-      showError(this.error, error);
-    }
+    });
   }
 
   /** Search a single plan again. */
