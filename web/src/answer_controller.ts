@@ -11,7 +11,7 @@ import { HintForm } from "./hints";
 import { layoutLines, roomAt } from "./layout";
 import type { LiveAnswer } from "./look/live_lines";
 import type { FoundPlace } from "./look/look_around";
-import { clearError, clearErrors, showError } from "./notices";
+import { attempt, clearError, clearErrors, showError } from "./notices";
 import { PhotoView } from "./photo_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
@@ -142,13 +142,11 @@ export class AnswerController {
     this.photoView.setView(photo === null ? null : (answer?.view ?? null));
     showAnswer(answer, photo, {
       select: (index) => this.select(index),
-      save: async (shown, answered) => {
-        clearError(this.error, this.fields);
+      save: (shown, answered) => {
         // An answer that a link opened has no photograph until one is added.
         const name = answered?.file.name ?? "answer";
-        await savePicture(name, this.photoView.toCanvas(), this.scene.svg, captionWords(shown)).catch(
-          (error: unknown) => showError(this.error, error),
-        );
+        const save = () => savePicture(name, this.photoView.toCanvas(), this.scene.svg, captionWords(shown));
+        return attempt(this.error, save, this.fields);
       },
     });
     showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));

@@ -2,7 +2,7 @@
 
 import { api, ServiceError } from "../api";
 import { button, byId, h, show } from "../dom";
-import { clearError, InputError, say, showError } from "../notices";
+import { attempt, clearError, InputError, say, showError } from "../notices";
 import { type Box, boxOf, lostAreas, unitOf } from "../plan_drawing";
 import type { Plan, PlanDocument, Point } from "../types";
 import * as change from "./changes";
@@ -250,17 +250,14 @@ export class Editor {
   }
 
   private async lay(file: File): Promise<void> {
-    clearError(this.error);
-    try {
+    await attempt(this.error, async () => {
       await this.underlay.lay({ file, name: file.name });
       const { width, height } = this.underlay.box!;
       this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
       say("Set the scale next: click two points with a known distance.");
       this.tools.choose("scale");
       this.drawBar();
-    } catch (error) {
-      showError(this.error, error);
-    }
+    });
   }
 
   private onMeasured(distance: number): void {
