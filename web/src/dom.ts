@@ -79,6 +79,19 @@ export function scrollTo(element: HTMLElement): void {
   element.scrollIntoView({ block: element.offsetHeight > innerHeight ? "start" : "nearest" });
 }
 
+/** Show a dialog of the page; return whether it is closed by the button with a value. */
+export function confirmed(id: string, value: string): Promise<boolean> {
+  const dialog = byId<HTMLDialogElement>(id);
+  dialog.showModal();
+  return new Promise((resolve) => {
+    const onClose = (): void => {
+      resolve(dialog.returnValue === value);
+      dialog.returnValue = "";
+    };
+    dialog.addEventListener("close", onClose, { once: true });
+  });
+}
+
 /** Offer a file for download. */
 export function download(content: Blob, name: string): void {
   const url = URL.createObjectURL(content);

@@ -2,7 +2,7 @@
 
 import type { ImportStep } from "../../clients/typescript/src/index";
 import { api, ServiceError } from "./api";
-import { button, byId, h, planButton, show } from "./dom";
+import { button, byId, confirmed, h, planButton, show } from "./dom";
 import { acceptDrops } from "./drops";
 import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
@@ -279,29 +279,14 @@ export class Plans {
   }
 
   private async remove(plan: PlanSummary): Promise<void> {
-    if (!(await this.confirm(plan))) return;
+    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions? This cannot be undone.`;
+    if (!(await confirmed("delete-dialog", "delete"))) return;
     await attempt(this.error, async () => {
       await api.deletePlan(plan.id);
       say(`“${plan.name}” is deleted.`);
       if (this.current?.id === plan.id) this.showNone();
       await this.load();
     });
-  }
-
-  private confirm(plan: PlanSummary): Promise<boolean> {
-    const dialog = byId<HTMLDialogElement>("delete-dialog");
-    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions? This cannot be undone.`;
-    dialog.showModal();
-    return new Promise((resolve) =>
-      dialog.addEventListener(
-        "close",
-        () => {
-          resolve(dialog.returnValue === "delete");
-          dialog.returnValue = "";
-        },
-        { once: true },
-      ),
-    );
   }
 
   private draw(): void {

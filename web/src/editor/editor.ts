@@ -1,7 +1,7 @@
 /** Plan editor: changes a copy, with undo and redo, and stores it as a new revision or a new plan. */
 
 import { api, ServiceError } from "../api";
-import { button, byId, h, show } from "../dom";
+import { button, byId, confirmed, h, show } from "../dom";
 import { attempt, clearError, InputError, say, showError } from "../notices";
 import { type Box, boxOf, lostAreas, unitOf } from "../plan_drawing";
 import type { Plan, PlanDocument, Point } from "../types";
@@ -205,7 +205,7 @@ export class Editor {
           id: "save",
         }),
         this.base !== null && button("Save as a new plan", () => void this.saveNew(), { id: "save-new" }),
-        button("Stop editing", () => this.leave(), { id: "stop" }),
+        button("Stop editing", () => void this.leave(), { id: "stop" }),
       ),
     );
     this.drawUndo();
@@ -351,21 +351,8 @@ export class Editor {
     });
   }
 
-  private leave(): void {
-    const dialog = byId<HTMLDialogElement>("leave-dialog");
-    if (!this.isChanged) {
-      this.close(null);
-      return;
-    }
-    dialog.showModal();
-    dialog.addEventListener(
-      "close",
-      () => {
-        if (dialog.returnValue === "leave") this.close(null);
-        dialog.returnValue = "";
-      },
-      { once: true },
-    );
+  private async leave(): Promise<void> {
+    if (!this.isChanged || (await confirmed("leave-dialog", "leave"))) this.close(null);
   }
 
   /** Show the form of the whole plan after a click beside the rooms; a drag there moves the drawing. */
