@@ -2,7 +2,7 @@
 
 import { Compass } from "./compass";
 import { button, byId, h, show } from "./dom";
-import { acceptDrops, isPicture } from "./drops";
+import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { NO_HINTS } from "./hints";
 import { clearErrors, InputError, showError } from "./notices";
 import type { Answer, Hints, Together } from "./types";
@@ -62,11 +62,7 @@ export class Photos {
     byId("compass-place").append(this.compass.element);
     for (const field of Object.values(this.inputs)) field.addEventListener("input", () => this.read());
     this.choice.addEventListener("change", () => this.onMotion());
-    const input = byId<HTMLInputElement>("photo-file");
-    input.addEventListener("change", () => {
-      this.add([...(input.files ?? [])]);
-      input.value = "";
-    });
+    acceptChoice(byId("photo-file"), (files) => this.add(files));
     acceptDrops(byId("photo-panel"), (files) => this.add(files));
   }
 

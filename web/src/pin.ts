@@ -2,7 +2,7 @@
 
 import { api } from "./api";
 import { button, byId, download, h, named, s, show } from "./dom";
-import { acceptDrops, isPicture } from "./drops";
+import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
 import { attempt, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
@@ -58,8 +58,9 @@ class PinPage {
     this.svg.append(this.base, this.names, this.pins);
     this.choice.addEventListener("change", () => void this.guarded(() => this.choose(this.choice.value)));
     this.levels.addEventListener("change", () => void this.guarded(() => this.showPlan(this.levels.value)));
-    this.onFiles("plan-file", ([file]) => this.upload(file!));
-    for (const id of ["photo-files", "photo-folder"]) this.onFiles(id, (files) => this.add(files));
+    acceptChoice(byId("plan-file"), ([file]) => void this.guarded(() => this.upload(file!)));
+    for (const id of ["photo-files", "photo-folder"])
+      acceptChoice(byId(id), (files) => void this.guarded(() => this.add(files)));
     acceptDrops(byId("folder"), (files) => void this.guarded(() => this.addAny(files)));
     acceptDrops(byId("place"), (files) => void this.guarded(() => this.addAny(files, files.length === 1)));
     this.filter.addEventListener("change", () => this.draw());
@@ -90,15 +91,6 @@ class PinPage {
       this.album = album;
       await this.follow();
     } else if (floorplans.length > 0) await this.choose(`plan:${floorplans[0]!.id}`);
-  }
-
-  private onFiles(id: string, act: (files: File[]) => Promise<void>): void {
-    const input = byId<HTMLInputElement>(id);
-    input.addEventListener("change", () => {
-      const files = [...(input.files ?? [])];
-      input.value = "";
-      if (files.length > 0) void this.guarded(() => act(files));
-    });
   }
 
   private readonly guarded = (work: () => Promise<void>): Promise<void> => attempt(this.error, work);

@@ -3,7 +3,7 @@
 import type { ImportStep } from "../../clients/typescript/src/index";
 import { api, ServiceError } from "./api";
 import { button, byId, confirmed, h, planButton, show } from "./dom";
-import { acceptDrops } from "./drops";
+import { acceptChoice, acceptDrops } from "./drops";
 import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
 import { checkPixels, hasOptions, ImportForm } from "./import_form";
@@ -74,14 +74,9 @@ export class Plans {
     this.connectMenu();
     byId("example-flat").addEventListener("click", () => (this.pending = this.pickExample(FLAT)));
     byId("example-rooms").addEventListener("click", () => (this.pending = this.pickExample(ROOMS)));
-    const input = byId<HTMLInputElement>("plan-file");
-    input.addEventListener("change", () => {
-      const file = input.files?.[0];
-      input.value = "";
+    acceptChoice(byId("plan-file"), ([file]) => void this.begin(file!));
+    acceptDrops(byId("plan-panel"), ([file]) => {
       if (file !== undefined) void this.begin(file);
-    });
-    acceptDrops(byId("plan-panel"), (files) => {
-      if (files[0] !== undefined) void this.begin(files[0]);
     });
   }
 

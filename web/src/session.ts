@@ -4,6 +4,7 @@ import { ellipse } from "./answer_overlay";
 import { api, ServiceError } from "./api";
 import { device } from "./device/device";
 import { button, byId, h, s, show } from "./dom";
+import { acceptChoice } from "./drops";
 import { attempt } from "./notices";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Plan, Session, Venue } from "./types";
@@ -52,11 +53,7 @@ export class LiveSession {
   private plan: { id: string | undefined; box: Box } = { id: undefined, box: { x: 0, y: 0, width: 1, height: 1 } };
 
   constructor(private readonly actions: SessionActions) {
-    this.input.addEventListener("change", () => {
-      const files = [...(this.input.files ?? [])];
-      this.input.value = "";
-      void this.add(files);
-    });
+    acceptChoice(this.input, (files) => void this.add(files));
     byId("session").append(
       h("div", { class: "session-bar" }, this.begin, this.next, this.stop),
       this.error,

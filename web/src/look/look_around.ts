@@ -1,6 +1,7 @@
 /** “Look around”: the rear camera takes the photographs of a turn by itself, and shows the plan's lines afterwards. */
 
 import { button, h } from "../dom";
+import { acceptChoice } from "../drops";
 import { clearError, showError } from "../notices";
 import { FrameJudge, takeFrame } from "./frames";
 import { drawLive, type LiveAnswer } from "./live_lines";
@@ -81,7 +82,7 @@ export class LookAround {
   constructor(private readonly actions: LookActions) {
     document.body.append(this.dialog);
     this.dialog.addEventListener("close", () => this.stop());
-    this.film.addEventListener("change", () => void this.localiseFilm());
+    acceptChoice(this.film, ([film]) => void this.localiseFilm(film!));
     // The camera's light goes out when the page is left, too.
     addEventListener("pagehide", () => this.dialog.close());
     document.addEventListener("visibilitychange", () => {
@@ -223,10 +224,7 @@ export class LookAround {
     }
   }
 
-  private async localiseFilm(): Promise<void> {
-    const film = this.film.files?.[0];
-    this.film.value = "";
-    if (film === undefined) return;
+  private async localiseFilm(film: File): Promise<void> {
     clearError(this.error);
     this.hint.textContent = `Reading “${film.name}”…`;
     const { signal } = (this.query = new AbortController());
