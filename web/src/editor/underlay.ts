@@ -1,7 +1,7 @@
 /** Picture that shows through the rooms, to draw over and to check them, from the plan's origin to the right and up. */
 
 import { h, s, show } from "../dom";
-import { InputError } from "../notices";
+import { loadPicture } from "../pictures";
 
 const FIRST_WIDTH_M = 12;
 const FIRST_SHARE = 0.6;
@@ -42,17 +42,9 @@ export class Underlay {
   /** Lay a picture under the plan. Rejects if the file is not a picture. */
   async lay(traced: Traced): Promise<void> {
     const { file, name, metresPerPixel } = traced;
-    const url = URL.createObjectURL(file);
-    const picture = new Image();
-    picture.src = url;
-    try {
-      await picture.decode();
-    } catch {
-      URL.revokeObjectURL(url);
-      throw new InputError(`The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
-    }
+    const picture = await loadPicture(file, `The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
     this.remove();
-    this.url = url;
+    this.url = picture.src;
     this.laid = traced;
     this.size = { width: picture.naturalWidth, height: picture.naturalHeight };
     this.metresPerPixel = metresPerPixel ?? FIRST_WIDTH_M / picture.naturalWidth;
