@@ -61,12 +61,13 @@ export const ARROWS: Record<string, [number, number]> = {
   ArrowDown: [0, -1],
 };
 
-/** Call `move` for every movement of the pointer until it is released. */
-export function followPointer(move: (event: PointerEvent) => void): void {
+/** Call `move` for every movement of the pointer until it is released, and then `done`. */
+export function followPointer(move: (event: PointerEvent) => void, done?: () => void): void {
   const end = (): void => {
     removeEventListener("pointermove", move);
     removeEventListener("pointerup", end);
     removeEventListener("pointercancel", end);
+    done?.();
   };
   addEventListener("pointermove", move);
   addEventListener("pointerup", end);
