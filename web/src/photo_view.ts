@@ -209,8 +209,8 @@ export class PhotoView {
 
   private projected(line: LayoutLine, shape: Shape, size: Size): Point[][] {
     const relative = line.points.map(([azimuth, elevation]): Point => [azimuth - this.heading, elevation]);
-    if (shape === "flat") return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
-    return shape === "around" ? perspective([relative], this.gaze(), size) : equirectangular([relative], size);
+    if (shape === "flat") return this.view === null ? [] : throughCamera(relative, this.view, this.flatSize(size));
+    return shape === "around" ? perspective(relative, this.gaze(), size) : equirectangular(relative, size);
   }
 
   /** Return the size of a flat photograph, which the stage contains. */

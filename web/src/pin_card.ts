@@ -65,7 +65,9 @@ export function shotOf(
       points.map(([azimuth, elevation]): Point => [radians(((degrees(azimuth - turn) + 540) % 360) - 180), elevation]),
     );
     const isSphere = row.view.projection === "equirectangular";
-    const drawn = isSphere ? equirectangular(lines, size) : throughCamera(lines, row.view, size);
+    const drawn = lines.flatMap((line) =>
+      isSphere ? equirectangular(line, size) : throughCamera(line, row.view, size),
+    );
     const d = drawn.map((line) => `M${line.map((point) => point.join(" ")).join("L")}`).join("");
     over.replaceChildren(s("path", { class: "dark", d }), s("path", { d }));
   };
