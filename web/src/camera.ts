@@ -14,6 +14,13 @@ const LARGEST_STEP = radians(1);
 // Perspective cameras are drawn up to this angle from the optical axis.
 const WIDEST = Math.tan(radians(80));
 
+/** Return the direction of an azimuth and an elevation. */
+export const rayOf = (azimuth: number, elevation: number): Ray => [
+  Math.cos(elevation) * Math.sin(azimuth),
+  Math.cos(elevation) * Math.cos(azimuth),
+  Math.sin(elevation),
+];
+
 /**
  * Project a line of (azimuth from the photograph's centre, elevation) to a photograph that fills `size`; parts that it
  * does not show are cut off.
@@ -23,12 +30,7 @@ export function throughCamera(line: Point[], view: CameraView, size: Size): Poin
     tilt = tiltOf(view),
     pieces: Point[][] = [[]];
   for (const [azimuth, elevation] of dense(line)) {
-    const level: Ray = [
-      Math.cos(elevation) * Math.sin(azimuth),
-      Math.cos(elevation) * Math.cos(azimuth),
-      Math.sin(elevation),
-    ];
-    const point = place(tilt(level));
+    const point = place(tilt(rayOf(azimuth, elevation)));
     if (point !== null && inside(point, size)) pieces.at(-1)!.push(point);
     else if (pieces.at(-1)!.length > 0) pieces.push([]);
   }

@@ -2,6 +2,7 @@
 
 import type { CameraView } from "../camera";
 import { InputError } from "../input_error";
+import { degrees } from "../layout";
 import { type Attitude, estimateAttitude, estimateCalibration, MAX_ESTIMATED_SD } from "./attitude";
 import { type Header, featuresFile } from "./features_file";
 import { findLens, type Lens, poseAngle, type Stated } from "./lens";
@@ -216,8 +217,6 @@ const common = (
   projection_source: lens.projectionSource,
   warnings: lens.warnings,
 });
-
-const degrees = (angle: number): number => (angle * 180) / Math.PI;
 
 const statedPitch = ({ pitch_deg }: Stated): Angle | null => givenAngle("Tilted up by", pitch_deg, MAX_PITCH_DEG);
 const statedRoll = ({ roll_deg }: Stated): Angle | null => givenAngle("Leaning right by", roll_deg, MAX_ROLL_DEG);
