@@ -3,8 +3,8 @@
  * place of the answer is as wide as its covariance, which is finer than the pose grid.
  */
 
-import { s } from "./dom";
-import { inside } from "./layout";
+import { h, s } from "./dom";
+import { isIn } from "./layout";
 import { type Box, boxOf, path } from "./plan_drawing";
 import type { Answer, PlanDocument, Point, Posterior, RoomDocument } from "./types";
 
@@ -72,28 +72,15 @@ export function roomPictures(name: string, fields: Field[], opacity: (shade: num
     "g",
     { class: `heat ${name}`, "aria-hidden": "true" },
     ...fields.map((field, index) => {
-      const {
-          room,
-          box: { x, y, width, height },
-        } = field,
-        id = `${name}-${index}`;
+      const { room, box } = field,
+        id = `${name}-${index}`,
+        floor = path(room.polygon) + (room.holes ?? []).map(path).join(""),
+        href = pictureOf(field, ramp, opacity);
       return s(
         "g",
         {},
-        s(
-          "clipPath",
-          { id },
-          s("path", { d: path(room.polygon) + (room.holes ?? []).map(path).join(""), "clip-rule": "evenodd" }),
-        ),
-        s("image", {
-          href: pictureOf(field, ramp, opacity),
-          x,
-          y,
-          width,
-          height,
-          preserveAspectRatio: "none",
-          "clip-path": `url(#${id})`,
-        }),
+        s("clipPath", { id }, s("path", { d: floor, "clip-rule": "evenodd" })),
+        s("image", { href, ...box, preserveAspectRatio: "none", "clip-path": `url(#${id})` }),
       );
     }),
   );
@@ -128,9 +115,6 @@ function fieldOf(posterior: Posterior, room: RoomDocument, cell: number, answer:
   if (own > 0) addNormal(values, cells, answer, own * kernel[0]! ** 2);
   return { ...cells, values };
 }
-
-const isIn = (room: RoomDocument, x: number, y: number): boolean =>
-  inside(room.polygon, x, y) && !(room.holes ?? []).some((hole) => inside(hole, x, y));
 
 /** Add a normal distribution about the place of an answer, with its covariance but no narrower than a cell. */
 function addNormal(values: Float64Array, cells: Cells, { position, covariance_m2 }: Refined, peak: number): void {
@@ -198,9 +182,7 @@ function rampOf(list: string): Colour[] {
 }
 
 function pictureOf({ columns, rows, values }: Field, ramp: Colour[], opacity: (shade: number) => number): string {
-  const canvas = document.createElement("canvas");
-  canvas.width = columns;
-  canvas.height = rows;
+  const canvas = h("canvas", { width: columns, height: rows });
   const context = canvas.getContext("2d")!;
   const picture = context.createImageData(columns, rows);
   values.forEach((shade, index) => {

@@ -199,8 +199,14 @@ function unwrapped(angle: number, near: number): number {
 
 /** Return the room that contains a point, null in walls and outside. */
 export function roomAt(rooms: RoomLayout[], x: number, y: number): RoomLayout | null {
-  return rooms.find((room) => inside(room.polygon, x, y) && !room.holes.some((hole) => inside(hole, x, y))) ?? null;
+  return rooms.find((room) => isIn(room, x, y)) ?? null;
 }
+
+type Floor = { polygon: Point[]; holes?: Point[][] | null };
+
+/** Test whether a room contains a point. */
+export const isIn = ({ polygon, holes }: Floor, x: number, y: number): boolean =>
+  inside(polygon, x, y) && !(holes ?? []).some((hole) => inside(hole, x, y));
 
 /** Test whether a polygon contains a point, by the parity of crossings. */
 export function inside(polygon: Point[], x: number, y: number): boolean {
