@@ -183,12 +183,9 @@ export class AnswerController {
       void this.actions.showPlan(candidate.floorplan_id);
       return;
     }
-    const {
-      position: { x_m, y_m },
-      heading_deg,
-    } = candidate;
-    this.scene.marker.place({ x_m, y_m, heading_deg }, this.scene.box);
-    this.drawLines({ x_m, y_m, heading_deg });
+    const pose: Pose = { ...candidate.position, heading_deg: candidate.heading_deg };
+    this.scene.marker.place(pose, this.scene.box);
+    this.drawLines(pose);
   }
 
   /** Show the layout from the pose that the user gave the marker. */

@@ -70,10 +70,7 @@ export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box, lost
   show(
     group,
     ...[...named, ...lost.map((area): [Point[], string] => [area, "no room"])].flatMap(([polygon, name]) => {
-      const {
-        place: [x, y],
-        clearance,
-      } = labelPlace(polygon);
+      const [[x, y], clearance] = labelPlace(polygon);
       const size = Math.min(2.2 * unit, (3.4 * clearance) / Math.max(name.length, 4));
       return size < 0.8 * unit
         ? []
@@ -99,14 +96,14 @@ function openingShape(opening: OpeningDocument): SVGGElement {
 const RASTER = 24;
 
 /** Return the raster point farthest from the walls of a room, and its distance to them. */
-export function labelPlace(polygon: Point[]): { place: Point; clearance: number } {
+function labelPlace(polygon: Point[]): [Point, number] {
   const xs = polygon.map(([x]) => x),
     ys = polygon.map(([, y]) => y);
   const left = Math.min(...xs),
     low = Math.min(...ys);
   const width = Math.max(...xs) - left,
     height = Math.max(...ys) - low;
-  let best: { place: Point; clearance: number } = { place: polygon[0]!, clearance: -1 };
+  let best: [Point, number] = [polygon[0]!, -1];
   for (let row = 1; row < RASTER; row++) {
     for (let column = 1; column < RASTER; column++) {
       const place: Point = [left + (width * column) / RASTER, low + (height * row) / RASTER];
@@ -116,7 +113,7 @@ export function labelPlace(polygon: Point[]): { place: Point; clearance: number 
       );
       // Prefer the centre among equally good points.
       const aside = Math.hypot(column / RASTER - 0.5, row / RASTER - 0.5);
-      if (clearance * (1 - 0.1 * aside) > best.clearance) best = { place, clearance };
+      if (clearance * (1 - 0.1 * aside) > best[1]) best = [place, clearance];
     }
   }
   return best;
