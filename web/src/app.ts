@@ -55,12 +55,7 @@ class Page {
     place: (signal) => this.place(signal),
     showPlan: (planId, revision) => this.plans.choose(planId, revision),
   });
-  private readonly editor = new Editor(this.scene.svg, {
-    draw: (plan) => this.scene.drawRooms(plan),
-    visible: () => this.scene.viewport.current,
-    fit: (box) => this.scene.viewport.fit(box),
-    ended: (stored) => this.onEdited(stored),
-  });
+  private readonly editor = new Editor(this.scene, (stored) => this.onEdited(stored));
   private readonly session = new LiveSession({
     place: () => this.place(),
     showPlan: (planId) => void this.plans.choose(planId),

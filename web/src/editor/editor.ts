@@ -3,7 +3,8 @@
 import { api, ServiceError } from "../api";
 import { button, byId, confirmed, h, show } from "../dom";
 import { attempt, clearError, InputError, say, showError } from "../notices";
-import { type Box, boxOf, lostAreas, unitOf } from "../plan_drawing";
+import { boxOf, lostAreas, unitOf } from "../plan_drawing";
+import type { PlanScene } from "../plan_scene";
 import type { Plan, PlanDocument, Point } from "../types";
 import * as change from "./changes";
 import { setFormPlan, showForm } from "./forms";
@@ -12,16 +13,6 @@ import { History } from "./history";
 import { type Tool, Tools } from "./tools";
 import { TracedPictures } from "./traced_pictures";
 import { Underlay } from "./underlay";
-
-export interface EditorHost {
-  /** Draw the edited plan. */
-  draw: (plan: PlanDocument) => void;
-  /** Return the visible part in metres. */
-  visible: () => Box;
-  fit: (box: Box) => void;
-  /** Editing ended; null if nothing was stored. */
-  ended: (stored: Plan | null) => void;
-}
 
 const EMPTY: PlanDocument = { name: "New plan", rooms: [], openings: [] };
 const NEW_ROOM_M: Point = [4, 3];
@@ -52,10 +43,12 @@ export class Editor {
   private measured = 0;
   private readonly traced = new TracedPictures();
 
+  /** `ended` is called when editing ends, with null if nothing was stored. */
   constructor(
-    svg: SVGSVGElement,
-    private readonly host: EditorHost,
+    private readonly scene: PlanScene,
+    private readonly ended: (stored: Plan | null) => void,
   ) {
+    const { svg } = scene;
     this.underlay = new Underlay(svg);
     this.handles = new Handles(svg, {
       edit: (plan, goesOn) => this.edit(plan, goesOn),
@@ -104,7 +97,7 @@ export class Editor {
     this.underlay.remove();
     clearError(this.error);
     this.tools.choose(plan === null ? "room" : "select");
-    this.host.fit(boxOf(this.saved, lostAreas(plan)));
+    this.scene.viewport.fit(boxOf(this.saved, lostAreas(plan)));
     this.drawBar();
     this.redraw();
     if (plan !== null) void this.layOriginal(plan);
@@ -126,9 +119,9 @@ export class Editor {
   redraw(): void {
     if (this.history === null) return;
     const plan = this.history.now,
-      unit = unitOf(this.host.visible());
+      unit = unitOf(this.scene.viewport.current);
     setFormPlan(plan);
-    this.host.draw(plan);
+    this.scene.drawRooms(plan);
     this.tools.update(plan, unit);
     this.handles.draw(plan, this.selection, unit);
     showForm(this.form, plan, this.selection, {
@@ -158,7 +151,7 @@ export class Editor {
     show(this.form);
     show(this.handles.element);
     this.measure.hidden = true;
-    this.host.ended(stored);
+    this.ended(stored);
   }
 
   private drawBar(): void {
@@ -246,14 +239,14 @@ export class Editor {
       ]),
       false,
     );
-    this.host.fit(boxOf(this.history.now));
+    this.scene.viewport.fit(boxOf(this.history.now));
   }
 
   private async lay(file: File): Promise<void> {
     await attempt(this.error, async () => {
       await this.underlay.lay({ file, name: file.name });
       const { width, height } = this.underlay.box!;
-      this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
+      this.scene.viewport.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
       say("Set the scale next: click two points with a known distance.");
       this.tools.choose("scale");
       this.drawBar();
@@ -290,12 +283,13 @@ export class Editor {
     }
     clearError(this.error);
     const factor = distance / this.measured,
-      seen = this.host.visible();
+      { viewport } = this.scene,
+      seen = viewport.current;
     this.measure.hidden = true;
     this.underlay.scale(factor);
     this.tools.choose("select");
     this.edit(change.scaled(this.history.now, factor), false);
-    this.host.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
+    viewport.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
     say(`The plan was scaled by ${factor.toFixed(3)}.`);
   }
 
