@@ -8,7 +8,7 @@ import type { PlanScene } from "../plan_scene";
 import type { Plan, PlanDocument, Point } from "../types";
 import * as change from "./changes";
 import { setFormPlan, showForm } from "./forms";
-import { Handles, type Selection } from "./handles";
+import { type EditActions, Handles, type Selection } from "./handles";
 import { History } from "./history";
 import { type Tool, Tools } from "./tools";
 import { TracedPictures } from "./traced_pictures";
@@ -42,6 +42,10 @@ export class Editor {
   private selection: Selection = { kind: "none" };
   private measured = 0;
   private readonly traced = new TracedPictures();
+  private readonly actions: EditActions = {
+    edit: (plan, goesOn) => this.edit(plan, goesOn),
+    select: (selection) => this.select(selection),
+  };
 
   /** `ended` is called when editing ends, with null if nothing was stored. */
   constructor(
@@ -50,17 +54,14 @@ export class Editor {
   ) {
     const { svg } = scene;
     this.underlay = new Underlay(svg);
-    this.handles = new Handles(svg, {
-      edit: (plan, goesOn) => this.edit(plan, goesOn),
-      select: (selection) => this.select(selection),
-    });
+    this.handles = new Handles(svg, this.actions);
     this.tools = new Tools(svg, {
       edit: (plan) => {
         const isRoom = plan.rooms.length > (this.history?.now.rooms.length ?? 0);
         this.selection = isRoom
           ? { kind: "room", index: plan.rooms.length - 1 }
           : { kind: "opening", index: (plan.openings ?? []).length - 1 };
-        this.edit(plan, false);
+        this.edit(plan);
       },
       done: () => this.drawBar(),
       measured: (distance) => this.onMeasured(distance),
@@ -124,13 +125,10 @@ export class Editor {
     this.scene.drawRooms(plan);
     this.tools.update(plan, unit);
     this.handles.draw(plan, this.selection, unit);
-    showForm(this.form, plan, this.selection, {
-      edit: (next) => this.edit(next, false),
-      select: (selection) => this.select(selection),
-    });
+    showForm(this.form, plan, this.selection, this.actions);
   }
 
-  private edit(plan: PlanDocument, goesOn: boolean): void {
+  private edit(plan: PlanDocument, goesOn = false): void {
     this.history?.push(plan, goesOn);
     this.redraw();
     this.drawUndo();
@@ -237,7 +235,6 @@ export class Editor {
         [right + width, depth],
         [right, depth],
       ]),
-      false,
     );
     this.scene.viewport.fit(boxOf(this.history.now));
   }
@@ -288,7 +285,7 @@ export class Editor {
     this.measure.hidden = true;
     this.underlay.scale(factor);
     this.tools.choose("select");
-    this.edit(change.scaled(this.history.now, factor), false);
+    this.edit(change.scaled(this.history.now, factor));
     viewport.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
     say(`The plan was scaled by ${factor.toFixed(3)}.`);
   }
@@ -340,7 +337,7 @@ export class Editor {
       }
       // One more step of the history, so that undo returns to the user's version.
       this.selection = { kind: "none" };
-      this.edit(this.base.plan, false);
+      this.edit(this.base.plan);
       this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” returns to your version; saving makes it the latest.`;
     });
   }

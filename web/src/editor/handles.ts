@@ -8,9 +8,9 @@ import * as change from "./changes";
 
 export type Selection = { kind: "none" } | { kind: "room"; index: number } | { kind: "opening"; index: number };
 
-export interface HandleActions {
+export interface EditActions {
   /** Another plan; `goesOn` while the user drags. */
-  edit: (plan: PlanDocument, goesOn: boolean) => void;
+  edit: (plan: PlanDocument, goesOn?: boolean) => void;
   select: (selection: Selection) => void;
 }
 
@@ -26,7 +26,7 @@ export class Handles {
 
   constructor(
     private readonly svg: SVGSVGElement,
-    private readonly actions: HandleActions,
+    private readonly actions: EditActions,
   ) {}
 
   /** Draw the handles of the selection and keep the focus. */
