@@ -64,10 +64,7 @@ class Page {
       this.answers.photos.choose(null);
     },
   });
-  private readonly look = new LookAround({
-    find: (frames, directions, signal) => this.answers.findTurn(frames, directions, signal),
-    findFilm: (film, signal) => this.answers.findFilm(film, signal),
-  });
+  private readonly look = new LookAround(this.answers);
   private readonly phone = new PhoneLink();
   /** True once the user has chosen a plan, which the example must not replace. */
   private hasStarted = false;

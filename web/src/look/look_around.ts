@@ -15,11 +15,11 @@ const TICK_MS = 120,
 const REFUSED =
   "The motion sensors are not allowed, so the photographs tell the angles by overlap. Safari asks once only: load the page again to be asked.";
 
-export interface LookActions {
+export interface Finder {
   /** Find the place of frames, with their directions (degrees) if a gyroscope told them; null if it was stopped. */
-  find: (frames: File[], directions: number[] | null, signal: AbortSignal) => Promise<FoundPlace | null>;
+  findTurn(frames: File[], directions: number[] | null, signal: AbortSignal): Promise<FoundPlace | null>;
   /** Find the place of a film. */
-  findFilm: (film: File, signal: AbortSignal) => Promise<boolean>;
+  findFilm(film: File, signal: AbortSignal): Promise<boolean>;
 }
 
 /** Answer in words, and for the live picture; null until the walls of its plan are loaded. */
@@ -79,7 +79,7 @@ export class LookAround {
   private said: Hint | null = null;
   private isTaking = false;
 
-  constructor(private readonly actions: LookActions) {
+  constructor(private readonly finder: Finder) {
     document.body.append(this.dialog);
     this.dialog.addEventListener("close", () => this.stop());
     acceptChoice(this.film, ([film]) => void this.localiseFilm(film!));
@@ -207,7 +207,7 @@ export class LookAround {
     const { signal } = (this.query = new AbortController());
     try {
       const directions = this.turn.hasGyroscope ? this.turn.taken.map((yaw) => yaw - this.turn.taken[0]!) : null;
-      const found = await this.actions.find(this.frames, directions, signal);
+      const found = await this.finder.findTurn(this.frames, directions, signal);
       if (found === null || signal.aborted) return;
       this.state = "found";
       this.found = found;
@@ -229,7 +229,7 @@ export class LookAround {
     this.hint.textContent = `Reading “${film.name}”…`;
     const { signal } = (this.query = new AbortController());
     try {
-      if (await this.actions.findFilm(film, signal)) this.dialog.close();
+      if (await this.finder.findFilm(film, signal)) this.dialog.close();
     } catch (error) {
       if (signal.aborted) return;
       this.hint.textContent = "";
