@@ -255,7 +255,7 @@ export class AnswerController {
     this.cancelQuery();
     const { signal } = (this.query = new AbortController());
     const { group } = this.photos;
-    for (const asked of group?.photos ?? [photo]) asked.answer = null;
+    for (const asked of group ?? [photo]) asked.answer = null;
     this.show(null);
     clearError(this.error, this.fields);
     this.find.setAttribute("aria-busy", "true");

@@ -79,7 +79,7 @@ export function adviceWords(answer: Answer): string | null {
   const { view, together } = answer;
   if (view === null || view === undefined || view.advice === null) return null;
   const seen = `${seenDeg(view).toFixed(0)}° of the surroundings are too little to tell the place`;
-  return together?.motion === "turn"
+  return together !== undefined
     ? `Turn further: ${seen}. Add more photographs from the same spot.`
     : `Turn around: ${seen}. Add photographs from the same spot, each turned by at most half the field of view, and choose “Taken from one spot, turning”.`;
 }

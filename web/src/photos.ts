@@ -5,7 +5,7 @@ import { button, byId, h, show } from "./dom";
 import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { NO_HINTS } from "./hints";
 import { clearErrors, InputError, showError } from "./notices";
-import type { Answer, Hints, Together } from "./types";
+import type { Answer, Hints } from "./types";
 
 export interface Photo {
   file: File;
@@ -20,12 +20,6 @@ export interface Photo {
   direction: number | null;
   /** Fields and photographs of the latest query, for code snippets. */
   asked: { fields: Record<string, string>; files: File[]; onDevice: boolean };
-}
-
-/** Photographs of one visit that are localised together. */
-export interface Group {
-  motion: Together["motion"];
-  photos: readonly Photo[];
 }
 
 // Fields of the form by their names in the request.
@@ -50,6 +44,7 @@ export class Photos {
     NAMES.map((name) => [name, byId<HTMLInputElement | HTMLSelectElement>(SETTINGS[name])]),
   ) as Record<Setting, HTMLInputElement | HTMLSelectElement>;
   private readonly choice = byId<HTMLFieldSetElement>("together");
+  private readonly isTurn = this.choice.querySelector<HTMLInputElement>("input[value=turn]")!;
   private readonly all: Photo[] = [];
   private chosen: Photo | null = null;
 
@@ -78,12 +73,9 @@ export class Photos {
     return { ...this.inputs, headings_deg: this.inputs.heading_deg };
   }
 
-  /** All photographs, if they are to be localised together; null if each is localised by itself. */
-  get group(): Group | null {
-    const motion = this.choice.hidden
-      ? ""
-      : (this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "");
-    return motion === "turn" ? { motion, photos: this.all } : null;
+  /** All photographs, if they are to be localised together as a turn; null if each is localised by itself. */
+  get group(): readonly Photo[] | null {
+    return !this.choice.hidden && this.isTurn.checked ? this.all : null;
   }
 
   /** Add pictures and choose the first of them; those of examples give way to the user's own. */
@@ -115,7 +107,7 @@ export class Photos {
   takeTurn(frames: File[], directions: readonly number[] | null): void {
     this.discard(this.all);
     this.add(frames, false, directions);
-    this.choice.querySelector<HTMLInputElement>("input[value=turn]")!.checked = true;
+    this.isTurn.checked = true;
     this.onMotion();
   }
 

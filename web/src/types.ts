@@ -38,9 +38,8 @@ export interface Pose {
   heading_deg: number;
 }
 
-/** Photographs that were localised together, and the probability that all of their places are right. */
+/** Photographs of a turn that were localised together, and the probability that all of their places are right. */
 export interface Together {
-  motion: "turn";
   photographs: number;
   confidence: number | null;
 }
