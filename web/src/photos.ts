@@ -46,7 +46,8 @@ export class Photos {
   private readonly choice = byId<HTMLFieldSetElement>("together");
   private readonly isTurn = this.choice.querySelector<HTMLInputElement>("input[value=turn]")!;
   private readonly all: Photo[] = [];
-  private chosen: Photo | null = null;
+  /** The chosen photograph. */
+  current: Photo | null = null;
 
   /** `changed` is called when another photograph is chosen or its settings change. */
   constructor(private readonly changed: (photo: Photo | null, isOther: boolean) => void) {
@@ -59,10 +60,6 @@ export class Photos {
     this.choice.addEventListener("change", () => this.onMotion());
     acceptChoice(byId("photo-file"), (files) => this.add(files));
     acceptDrops(byId("photo-panel"), (files) => this.add(files));
-  }
-
-  get current(): Photo | null {
-    return this.chosen;
   }
 
   get list(): readonly Photo[] {
@@ -124,7 +121,7 @@ export class Photos {
 
   /** Choose a photograph, or none. */
   choose(photo: Photo | null): void {
-    this.chosen = photo;
+    this.current = photo;
     for (const name of NAMES) this.inputs[name].value = photo?.settings[name] ?? "";
     this.showHeading();
     byId("photo-settings").toggleAttribute("disabled", photo === null);
@@ -145,9 +142,9 @@ export class Photos {
 
   /** Set the hints of the chosen photograph. */
   setHints(hints: Hints): void {
-    if (this.chosen === null) return;
-    this.chosen.hints = hints;
-    this.onChanged(this.chosen);
+    if (this.current === null) return;
+    this.current.hints = hints;
+    this.onChanged(this.current);
   }
 
   private remove(photo: Photo): void {
@@ -155,35 +152,35 @@ export class Photos {
     this.all.splice(index, 1);
     URL.revokeObjectURL(photo.url);
     this.forgetGroup();
-    if (photo === this.chosen) this.choose(this.all[Math.min(index, this.all.length - 1)] ?? null);
+    if (photo === this.current) this.choose(this.all[Math.min(index, this.all.length - 1)] ?? null);
     else {
       this.drawStrip();
-      this.changed(this.chosen, false);
+      this.changed(this.current, false);
     }
   }
 
   /** Show the heading in the form on the compass. */
   private showHeading(): void {
-    const heading = this.chosen?.settings.heading_deg;
+    const heading = this.current?.settings.heading_deg;
     this.compass.set(heading === undefined ? null : Number(heading));
   }
 
   /** Settings that all photographs of a group share: those of the camera. */
   private get shared(): Photo["settings"] {
-    if (this.group === null || this.chosen === null) return {};
-    const { heading_deg: _, ...shared } = this.chosen.settings;
+    if (this.group === null || this.current === null) return {};
+    const { heading_deg: _, ...shared } = this.current.settings;
     return shared;
   }
 
   private read(): void {
-    if (this.chosen === null) return;
+    if (this.current === null) return;
     const given = NAMES.map((name) => [name, this.inputs[name].value.trim()] as const).filter(
       ([, value]) => value !== "",
     );
-    this.chosen.settings = Object.fromEntries(given);
+    this.current.settings = Object.fromEntries(given);
     this.share();
     this.showHeading();
-    this.onChanged(this.chosen);
+    this.onChanged(this.current);
   }
 
   private share(): void {
@@ -199,7 +196,7 @@ export class Photos {
     this.share();
     this.forgetGroup();
     this.drawStrip();
-    if (this.chosen !== null) this.onChanged(this.chosen);
+    if (this.current !== null) this.onChanged(this.current);
   }
 
   private onChanged(photo: Photo): void {
@@ -227,7 +224,7 @@ export class Photos {
           {
             type: "button",
             class: "thumb",
-            "aria-pressed": String(photo === this.chosen),
+            "aria-pressed": String(photo === this.current),
             "aria-label": `Photograph ${name}${photo.answer === null ? "" : `, found in ${photo.answer.room}`}`,
             onclick: () => this.choose(photo),
           },

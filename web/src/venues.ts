@@ -28,15 +28,12 @@ export class Venues {
   private readonly error = byId("plan-error");
   private readonly form = new VenueForm((venue) => void this.take(venue));
   private found: Venue[] = [];
-  private venue: ChosenVenue | null = null;
+  /** The venue that is searched. */
+  current: ChosenVenue | null = null;
 
   constructor(private readonly actions: VenueActions) {
     this.choice.addEventListener("change", () => actions.showPlan(this.choice.value));
     byId("venue-leave").addEventListener("click", () => this.leave());
-  }
-
-  get current(): ChosenVenue | null {
-    return this.venue;
   }
 
   /** Offer the listed plans for a new venue. */
@@ -70,7 +67,7 @@ export class Venues {
   async choose(id: string, planId?: string | null): Promise<void> {
     await attempt(this.error, async () => {
       const [venue, { plans, next_cursor: more }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
-      this.venue = { ...venue, listed: plans };
+      this.current = { ...venue, listed: plans };
       byId("venue-name").textContent = venue.name;
       byId("venue-facts").textContent =
         `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}` +
@@ -86,7 +83,7 @@ export class Venues {
       );
       this.bar.hidden = false;
       this.draw();
-      this.actions.chosen(this.venue);
+      this.actions.chosen(this.current);
       const first = planId === undefined ? plans[0]?.floorplan_id : planId;
       if (first) this.actions.showPlan(first);
     });
@@ -94,8 +91,8 @@ export class Venues {
 
   /** Search a single plan again. */
   leave(): void {
-    if (this.venue === null) return;
-    this.venue = null;
+    if (this.current === null) return;
+    this.current = null;
     this.bar.hidden = true;
     this.draw();
     this.actions.chosen(null);
@@ -108,7 +105,7 @@ export class Venues {
 
   private draw(): void {
     const entries = this.found.map(({ id, name, plans }) => {
-      const choose = planButton(name, `venue, ${plans} plans`, id === this.venue?.id, () => this.pick(id));
+      const choose = planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id));
       return h("li", {}, choose);
     });
     show(this.list, ...entries);
