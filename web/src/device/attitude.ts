@@ -220,11 +220,7 @@ function total(lines: Line[], angles: Angles, least: number): number {
 function refined(lines: Line[], start: Angles): Mode {
   const prior = [1 / PRIOR[0] ** 2, 1 / PRIOR[1] ** 2, 0];
   let angles = start,
-    information = [
-      [1, 0, 0],
-      [0, 1, 0],
-      [0, 0, 1],
-    ],
+    information: number[][] = [],
     least = SIGMA;
   for (let step = 0; step < STEPS; step++) {
     least = Math.max(SIGMA, COARSE_SIGMA * 0.7 ** step);

@@ -208,10 +208,7 @@ function linedBy({ pitch, roll, yaw, pitchSd, rollSd, yawSd }: Attitude): Lined 
   return { pitch: angle(pitch, pitchSd), roll: angle(roll, rollSd), wall_direction: yawSd < Math.PI ? walls : null };
 }
 
-const common = (
-  lens: Lens,
-  { digest }: Model,
-): Pick<Header, "model" | "projection" | "projection_source" | "warnings"> => ({
+const common = (lens: Lens, { digest }: Model) => ({
   model: digest,
   projection: lens.projection,
   projection_source: lens.projectionSource,
