@@ -38,7 +38,6 @@ export class AnswerController {
   private venue: ChosenVenue | null = null;
   private answer: Answer | null = null;
   private answeredPhoto: Photo | null = null;
-  /** Index of the selected candidate. */
   private selected = 0;
   /** The marker's pose after the user moved it away from the candidate. */
   private moved: Pose | null = null;

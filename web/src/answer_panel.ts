@@ -54,7 +54,6 @@ export function showAnswer(answer: Answer | null, photo: Photo | null, actions: 
   );
 }
 
-/** Mark the selected candidate. */
 export function markSelected(index: number | null): void {
   byId("answer-body")
     .querySelectorAll("[data-rank]")

@@ -30,7 +30,6 @@ export interface Cells {
   rows: number;
 }
 
-/** Cells with a value each. */
 type Field = Cells & { values: Float64Array };
 
 /** Draw a picture for each room with any probability, clipped to its floor. */
@@ -48,7 +47,6 @@ export function heatMap(posterior: Posterior, plan: PlanDocument, answer: Refine
 /** Place of an answer with its uncertainty. */
 type Refined = Pick<Answer, "position" | "covariance_m2">;
 
-/** Return the size of the cells of a plan's maps. */
 export function cellSize(plan: PlanDocument): number {
   const whole = boxOf(plan);
   return Math.max(Math.max(whole.width, whole.height) / CELLS, MIN_CELL_M);

@@ -19,7 +19,6 @@ const SOFT_M2 = 1;
 const OPACITY = 0.92;
 
 export class LocalisabilityLayer {
-  /** The layer on the map. */
   readonly element = s("g");
   private readonly panel = byId("localisability");
   private readonly open = button("Will it work here?", () => void this.toggle(), {

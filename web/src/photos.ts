@@ -119,7 +119,6 @@ export class Photos {
     }
   }
 
-  /** Choose a photograph, or none. */
   choose(photo: Photo | null): void {
     this.current = photo;
     for (const name of NAMES) this.inputs[name].value = photo?.settings[name] ?? "";
@@ -135,12 +134,10 @@ export class Photos {
     this.drawStrip();
   }
 
-  /** Remove all hints. */
   forgetHints(): void {
     for (const photo of this.all) photo.hints = NO_HINTS;
   }
 
-  /** Set the hints of the chosen photograph. */
   setHints(hints: Hints): void {
     if (this.current === null) return;
     this.current.hints = hints;

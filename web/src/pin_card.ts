@@ -76,7 +76,6 @@ export function shotOf(
   return Object.assign(element, { draw });
 }
 
-/** Return the card of a photograph. */
 export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, height: number | null, act: CardActions) {
   const { pin } = row,
     place = pin?.place ?? null;

@@ -119,7 +119,6 @@ function labelPlace(polygon: Point[]): [Point, number] {
   return best;
 }
 
-/** Return the distance of a point to a segment. */
 export function distanceTo([x, y]: Point, [ax, ay]: Point, [bx, by]: Point): number {
   const ex = bx - ax,
     ey = by - ay,

@@ -107,7 +107,6 @@ export class Plans {
     return this.found;
   }
 
-  /** Choose a plan by its id. */
   choose(id: string, revision?: string): Promise<Plan | null> {
     const chosen = this.open(id, revision);
     this.pending = chosen;
@@ -159,7 +158,6 @@ export class Plans {
     this.take(null);
   }
 
-  /** Show a plan. */
   take(plan: Plan | null): void {
     this.current = plan;
     this.actions.chosen(plan);
@@ -191,7 +189,6 @@ export class Plans {
     this.importing.close();
   }
 
-  /** Upload a file as a new plan. */
   async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
     clearError(this.error, this.importing.fields);
     // The form of the previous file does not apply to this one.

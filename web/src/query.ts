@@ -7,7 +7,6 @@ import { InputError } from "./notices";
 import type { Photo } from "./photos";
 import type { Answer, ChosenVenue, Plan, SequenceAnswer } from "./types";
 
-/** Plan or venue to search. */
 export type Place = Plan | ChosenVenue;
 
 const isVenue = (place: Place): place is ChosenVenue => "listed" in place;

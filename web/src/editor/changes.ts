@@ -22,7 +22,6 @@ export interface WallRef {
   edge: number;
 }
 
-/** Return both ends of a wall. */
 export function wallOf(plan: PlanDocument, { room, edge }: WallRef): [Point, Point] {
   const polygon = plan.rooms[room]!.polygon;
   return [polygon[edge]!, polygon[(edge + 1) % polygon.length]!];

@@ -31,7 +31,6 @@ const ASSUMED = "2.5 assumed";
 const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
-/** Show the form of the selection. */
 export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: EditActions): void {
   if (place.contains(document.activeElement) && document.activeElement instanceof HTMLInputElement) {
     // The form already shows the typed text.

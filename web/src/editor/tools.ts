@@ -10,11 +10,9 @@ export type Tool = "select" | "room" | OpeningKind | "scale";
 
 export interface ToolActions {
   edit: (plan: PlanDocument) => void;
-  /** The tool has finished. */
   done: () => void;
   /** Two points were clicked; their distance as drawn. */
   measured: (distance: number) => void;
-  /** Show an instruction. */
   instruct: (text: string) => void;
 }
 

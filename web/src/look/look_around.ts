@@ -18,7 +18,6 @@ const REFUSED =
 export interface Finder {
   /** Find the place of frames, with their directions (degrees) if a gyroscope told them; null if it was stopped. */
   findTurn(frames: File[], directions: number[] | null, signal: AbortSignal): Promise<FoundPlace | null>;
-  /** Find the place of a film. */
   findFilm(film: File, signal: AbortSignal): Promise<boolean>;
 }
 
@@ -90,7 +89,6 @@ export class LookAround {
     });
   }
 
-  /** Open the dialog and begin. */
   async open(): Promise<void> {
     this.begin();
     this.found = this.live = null;
@@ -181,7 +179,6 @@ export class LookAround {
     else if (this.turn.wants(hint)) await this.takeNow();
   }
 
-  /** Take the current frame. */
   private async takeNow(): Promise<void> {
     if (this.isTaking || this.state !== "looking" || this.video.videoWidth === 0) return;
     this.isTaking = true;

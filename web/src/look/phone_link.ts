@@ -29,7 +29,6 @@ export class PhoneLink {
     document.body.append(this.dialog);
   }
 
-  /** Show the code of a plan. */
   open(planId: string): void {
     const address = planLink(planId),
       { data, size } = encode(address, { border: 2 });
