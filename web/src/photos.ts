@@ -92,7 +92,7 @@ export class Photos {
         asked: { fields: {}, files: [file], onDevice: false },
       }));
     if (added.length > 0) this.forgetGroup();
-    if (added.length > 0 && !isExample) this.discardExamples();
+    if (added.length > 0 && !isExample) this.discard(this.all.filter((photo) => photo.isExample));
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
     if (rejected.length === 0) return;
@@ -106,10 +106,6 @@ export class Photos {
     this.add(frames, false, directions);
     this.isTurn.checked = true;
     this.onMotion();
-  }
-
-  private discardExamples(): void {
-    this.discard(this.all.filter(({ isExample }) => isExample));
   }
 
   private discard(photos: readonly Photo[]): void {
@@ -146,8 +142,7 @@ export class Photos {
 
   private remove(photo: Photo): void {
     const index = this.all.indexOf(photo);
-    this.all.splice(index, 1);
-    URL.revokeObjectURL(photo.url);
+    this.discard([photo]);
     this.forgetGroup();
     if (photo === this.current) this.choose(this.all[Math.min(index, this.all.length - 1)] ?? null);
     else {

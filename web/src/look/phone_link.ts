@@ -4,9 +4,6 @@ import { encode } from "uqr";
 
 import { button, h, s, show } from "../dom";
 
-/** Return the address of a plan on this page. */
-export const planLink = (planId: string): string => `${location.origin}${location.pathname}#plan=${planId}`;
-
 export class PhoneLink {
   private readonly code = h("div", { class: "qr" });
   private readonly link = h("a", {});
@@ -30,7 +27,7 @@ export class PhoneLink {
   }
 
   open(planId: string): void {
-    const address = planLink(planId),
+    const address = `${location.origin}${location.pathname}#plan=${planId}`,
       { data, size } = encode(address, { border: 2 });
     const dark = data.flatMap((row, y) => row.flatMap((isDark, x) => (isDark ? [`M${x} ${y}h1v1h-1z`] : [])));
     show(
