@@ -5,7 +5,7 @@
 
 import { h, s } from "./dom";
 import { isIn } from "./layout";
-import { type Box, boxOf, path } from "./plan_drawing";
+import { type Box, boxOf, extentOf, path } from "./plan_drawing";
 import type { Answer, PlanDocument, Point, Posterior, RoomDocument } from "./types";
 
 // Places less probable than the best one by this factor are not coloured.
@@ -54,13 +54,10 @@ export function cellSize(plan: PlanDocument): number {
 
 /** Cover a room with cells. */
 export function cellsOf(room: RoomDocument, cell: number): Cells {
-  const xs = room.polygon.map(([x]) => x),
-    ys = room.polygon.map(([, y]) => y);
-  const left = Math.min(...xs),
-    top = Math.max(...ys);
-  const columns = Math.ceil((Math.max(...xs) - left) / cell),
-    rows = Math.ceil((top - Math.min(...ys)) / cell);
-  return { room, box: { x: left, y: -top, width: columns * cell, height: rows * cell }, columns, rows };
+  const { left, right, low, high } = extentOf(room.polygon);
+  const columns = Math.ceil((right - left) / cell),
+    rows = Math.ceil((high - low) / cell);
+  return { room, box: { x: left, y: -high, width: columns * cell, height: rows * cell }, columns, rows };
 }
 
 /** Draw shades from 0 to 1 as a picture for each room, clipped to its floor; `name` is unique on the page. */

@@ -18,18 +18,20 @@ const WALL_M = 0.12;
 /** Return the areas of the plan's file that became no room. */
 export const lostAreas = (plan: Plan | null): Point[][] => plan?.import_report?.no_room ?? [];
 
+/** Return the smallest and the largest coordinates of points. */
+export function extentOf(points: Point[]) {
+  const xs = points.map(([x]) => x),
+    ys = points.map(([, y]) => y);
+  return { left: Math.min(...xs), right: Math.max(...xs), low: Math.min(...ys), high: Math.max(...ys) };
+}
+
 /** Return the box around a plan and areas that became no room, with a margin. */
 export function boxOf(plan: PlanDocument, lost: Point[][] = []): Box {
   const points = [...plan.rooms.map((room) => room.polygon), ...lost].flat();
   if (points.length === 0) return { x: -1, y: -9, width: 12, height: 10 };
-  const xs = points.map(([x]) => x),
-    ys = points.map(([, y]) => -y);
-  const x = Math.min(...xs),
-    y = Math.min(...ys);
-  const width = Math.max(...xs) - x,
-    height = Math.max(...ys) - y;
-  const margin = MARGIN * Math.max(width, height, 1);
-  return { x: x - margin, y: y - margin, width: width + 2 * margin, height: height + 2 * margin };
+  const { left, right, low, high } = extentOf(points),
+    margin = MARGIN * Math.max(right - left, high - low, 1);
+  return { x: left - margin, y: -high - margin, width: right - left + 2 * margin, height: high - low + 2 * margin };
 }
 
 export const path = (polygon: Point[]): string =>
@@ -97,16 +99,11 @@ const RASTER = 24;
 
 /** Return the raster point farthest from the walls of a room, and its distance to them. */
 function labelPlace(polygon: Point[]): [Point, number] {
-  const xs = polygon.map(([x]) => x),
-    ys = polygon.map(([, y]) => y);
-  const left = Math.min(...xs),
-    low = Math.min(...ys);
-  const width = Math.max(...xs) - left,
-    height = Math.max(...ys) - low;
+  const { left, right, low, high } = extentOf(polygon);
   let best: [Point, number] = [polygon[0]!, -1];
   for (let row = 1; row < RASTER; row++) {
     for (let column = 1; column < RASTER; column++) {
-      const place: Point = [left + (width * column) / RASTER, low + (height * row) / RASTER];
+      const place: Point = [left + ((right - left) * column) / RASTER, low + ((high - low) * row) / RASTER];
       if (!inside(polygon, ...place)) continue;
       const clearance = Math.min(
         ...polygon.map((from, index) => distanceTo(place, from, polygon[(index + 1) % polygon.length]!)),
