@@ -37,11 +37,8 @@ export function heatMap(posterior: Posterior, plan: PlanDocument, answer: Refine
   const cell = cellSize(plan);
   const fields = plan.rooms.map((room) => fieldOf(posterior, room, cell, answer)).filter((field) => field !== null);
   const best = fields.reduce((most, { values }) => values.reduce((a, b) => Math.max(a, b), most), Number.MIN_VALUE);
-  for (const { values } of fields)
-    values.forEach((value, index) => {
-      values[index] = shadeOf(value, best);
-    });
-  return roomPictures("posterior", fields, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
+  const shaded = fields.map((field) => ({ ...field, values: field.values.map((value) => shadeOf(value, best)) }));
+  return roomPictures("posterior", shaded, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
 }
 
 /** Place of an answer with its uncertainty. */
@@ -82,7 +79,7 @@ export function roomPictures(name: string, fields: Field[], opacity: (shade: num
 }
 
 /** Return the shade of a density on a logarithmic scale: 1 for the best place, 0 for negligible ones. */
-export function shadeOf(density: number, best: number): number {
+function shadeOf(density: number, best: number): number {
   return Math.max(0, 1 - Math.log(Math.max(density / best, MIN_RATIO)) / Math.log(MIN_RATIO));
 }
 
@@ -133,15 +130,12 @@ function splat(field: Float64Array, columns: number, rows: number, [x, y]: Point
     row = Math.floor(y),
     right = x - column,
     down = y - row;
-  for (const [i, j, share] of [
-    [0, 0, (1 - right) * (1 - down)],
-    [1, 0, right * (1 - down)],
-    [0, 1, (1 - right) * down],
-    [1, 1, right * down],
-  ] as const) {
-    const cell = Math.max(0, Math.min(rows - 1, row + j)) * columns + Math.max(0, Math.min(columns - 1, column + i));
-    field[cell] = field[cell]! + share * value;
-  }
+  for (const j of [0, 1])
+    for (const i of [0, 1]) {
+      const share = (i === 0 ? 1 - right : right) * (j === 0 ? 1 - down : down);
+      const cell = Math.max(0, Math.min(rows - 1, row + j)) * columns + Math.max(0, Math.min(columns - 1, column + i));
+      field[cell] = field[cell]! + share * value;
+    }
 }
 
 /** Return half of a normal distribution's weights, from its mean. */
