@@ -1,7 +1,7 @@
 /** Scale of a picture: two points and the distance between them. */
 
 import { ARROWS, followPointer, h, s, show } from "./dom";
-import { unitOf } from "./plan_drawing";
+import { ends, unitOf } from "./plan_drawing";
 import { clearError, showFieldError } from "./notices";
 import { loadPicture } from "./pictures";
 import { placeOf } from "./pose_marker";
@@ -115,13 +115,12 @@ export class PictureScale {
 
   private draw(): void {
     if (this.url === null) return;
-    const size = unitOf(this.viewport.current),
-      [[ax, ay], [bx, by]] = this.ends;
+    const size = unitOf(this.viewport.current);
     const focused = [...this.overlay.children].indexOf(document.activeElement as Element);
     show(
       this.overlay,
       this.frame !== null && this.frameBox(this.frame),
-      s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }),
+      s("line", ends(this.ends)),
       ...this.ends.map((end, index) => this.handle(end, index, size)),
     );
     if (focused > 0) (this.overlay.children[focused] as SVGElement).focus();

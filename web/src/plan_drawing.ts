@@ -37,6 +37,9 @@ export function boxOf(plan: PlanDocument, lost: Point[][] = []): Box {
 export const path = (polygon: Point[]): string =>
   polygon.map(([x, y], index) => `${index === 0 ? "M" : "L"}${x} ${-y}`).join("") + "Z";
 
+/** Return the attributes of a line. */
+export const ends = ([[ax, ay], [bx, by]]: [Point, Point]) => ({ x1: ax, y1: -ay, x2: bx, y2: -by });
+
 /** Return the unit for texts and handles, which have the same size on every plan. */
 export const unitOf = (box: Box): number => Math.max(box.width, box.height) / 100;
 
@@ -46,9 +49,9 @@ export function drawPlan(group: SVGGElement, plan: PlanDocument, lost: Point[][]
     const whole = path(room.polygon) + (room.holes ?? []).map(path).join("");
     return s("path", { class: `room ${room.type ?? "unknown"}`, d: whole, "fill-rule": "evenodd" });
   });
-  const walls = plan.rooms.flatMap((room) =>
-    (room.walls ?? []).map(([a, b]) => s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })),
-  );
+  const walls = plan.rooms
+    .flatMap((room) => room.walls ?? [])
+    .map((wall) => s("line", { class: "wall", ...ends(wall) }));
   // Walls are strokes around floors; the strokes of adjacent rooms meet.
   const solid = s("path", {
     class: "solid",
@@ -84,8 +87,7 @@ export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box, lost
 }
 
 function openingShape(opening: OpeningDocument): SVGGElement {
-  const [[ax, ay], [bx, by]] = opening.line;
-  const line = { x1: ax, y1: -ay, x2: bx, y2: -by };
+  const line = ends(opening.line);
   // A wall-wide stroke in the colour of the floor interrupts the wall.
   return s(
     "g",
