@@ -11,8 +11,7 @@ import { setFormPlan, showForm } from "./forms";
 import { type EditActions, Handles, type Selection } from "./handles";
 import { History } from "./history";
 import { type Tool, Tools } from "./tools";
-import { TracedPictures } from "./traced_pictures";
-import { Underlay } from "./underlay";
+import { TracedPictures, Underlay } from "./underlay";
 
 const EMPTY: PlanDocument = { name: "New plan", rooms: [], openings: [] };
 const NEW_ROOM_M: Point = [4, 3];
