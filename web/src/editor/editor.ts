@@ -35,6 +35,8 @@ export class Editor {
   private readonly error = byId("plan-error");
   private readonly hint = h("p", { class: "hint", role: "status", id: "edit-hint" });
   private readonly measure = h("div", { class: "measure", hidden: true });
+  private readonly undo = button("Undo", () => this.step("undo"), { id: "undo" });
+  private readonly redo = button("Redo", () => this.step("redo"), { id: "redo" });
   private history: History<PlanDocument> | null = null;
   private saved: PlanDocument = EMPTY;
   private base: Plan | null = null;
@@ -64,9 +66,7 @@ export class Editor {
       },
       done: () => this.drawBar(),
       measured: (distance) => this.onMeasured(distance),
-      instruct: (text) => {
-        this.hint.textContent = text;
-      },
+      instruct: (text) => show(this.hint, text),
     });
     svg.addEventListener("pointerdown", (event) => this.onGround(event));
     addEventListener("keydown", (event) => this.onKey(event));
@@ -175,8 +175,8 @@ export class Editor {
         ...TOOLS.map(tool),
         button("Add 4 × 3 m room", () => this.addRoom(), { id: "add-room" }),
         h("label", { class: "file" }, picture, h("span", {}, "Picture to trace")),
-        button("Undo", () => this.step("undo"), { id: "undo" }),
-        button("Redo", () => this.step("redo"), { id: "redo" }),
+        this.undo,
+        this.redo,
       ),
       this.underlay.box !== null &&
         h(
@@ -202,13 +202,8 @@ export class Editor {
   }
 
   private drawUndo(): void {
-    for (const [id, can] of [
-      ["undo", this.history?.canUndo],
-      ["redo", this.history?.canRedo],
-    ] as const) {
-      const control = document.getElementById(id) as HTMLButtonElement | null;
-      if (control !== null) control.disabled = !can;
-    }
+    this.undo.disabled = !this.history?.canUndo;
+    this.redo.disabled = !this.history?.canRedo;
   }
 
   private step(way: "undo" | "redo"): void {
