@@ -102,15 +102,8 @@ export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight
     lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![1]]) });
     const next = pieces[(index + 1) % pieces.length]!;
     const near = Math.min(distanceAt(piece.wall, piece.to), distanceAt(next.wall, piece.to));
-    const [floor, ceiling] = wallElevations(near, cameraHeight, room.ceiling_height_m);
-    if (pieces.length > 1)
-      lines.push({
-        kind: "edge",
-        points: [
-          [piece.to, floor],
-          [piece.to, ceiling],
-        ],
-      });
+    const corner = wallElevations(near, cameraHeight, room.ceiling_height_m);
+    if (pieces.length > 1) lines.push({ kind: "edge", points: corner.map((elevation) => [piece.to, elevation]) });
     lines.push(...openingLines(x, y, piece, room, cameraHeight));
   });
   return lines;
