@@ -189,12 +189,7 @@ export class LocalisabilityLayer {
 }
 
 /** Return the probability of every cell, as in lalaloc_core/draw/heat.py: the mean of its room's places by distance. */
-function shadesOf(
-  { box, columns, rows }: Cells,
-  found: Localisability,
-  room: string,
-  condition: Condition,
-): Float64Array {
+function shadesOf({ box, columns, rows }: Cells, found: Localisability, room: string, condition: Condition) {
   const shades = new Float64Array(columns * rows).fill(found.probability[condition]);
   const places = found.places.filter((place) => place.room === room);
   if (places.length === 0) return shades;

@@ -265,11 +265,7 @@ class PinPage {
     });
   }
 
-  private async correct(
-    row: Pick<Row, "id" | "correction">,
-    correction: Correction | null,
-    isUndo = false,
-  ): Promise<void> {
+  private async correct(row: Row, correction: Correction | null, isUndo = false): Promise<void> {
     if (this.album === null) return;
     await api.correctPhotograph(this.album.id, row.id, correction as Schemas["CorrectionDocument"] | null);
     if (!isUndo) this.done.push({ id: row.id, before: row.correction });

@@ -42,14 +42,8 @@ export function movedOf({ number, name, pin }: Row): string | null {
   return `${number} ${name ?? ""}: ${[rooms, way].filter(Boolean).join(", ")}`;
 }
 
-/** Return a photograph with the walls seen from a place over it. */
-export function shotOf(
-  row: Row,
-  picture: Thumbnail | null,
-  place: PinnedAt | null,
-  floors: Floors,
-  height: number | null,
-) {
+/** Return a photograph with the walls over it that are seen from its pin, or from another place by `draw`. */
+export function shotOf(row: Row, picture: Thumbnail | null, floors: Floors, height: number | null) {
   if (picture === null)
     return Object.assign(h("div", { class: "shot none" }, "No preview"), {
       draw: (_: PinnedAt | null): void => undefined,
@@ -71,7 +65,7 @@ export function shotOf(
     const d = drawn.map((line) => `M${line.map((point) => point.join(" ")).join("L")}`).join("");
     over.replaceChildren(s("path", { class: "dark", d }), s("path", { d }));
   };
-  draw(place);
+  draw(row.pin?.place ?? null);
   const element = h("div", { class: "shot" }, h("img", { src: picture.url, alt: "", loading: "lazy" }), over);
   return Object.assign(element, { draw });
 }
@@ -79,7 +73,7 @@ export function shotOf(
 export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, height: number | null, act: CardActions) {
   const { pin } = row,
     place = pin?.place ?? null;
-  const shot = shotOf(row, picture, place, floors, height);
+  const shot = shotOf(row, picture, floors, height);
   const isOpen = pin !== null && pin.state !== "corrected" && row.correction === null;
   const choices = isOpen ? pin.suggestions : [];
   const preview = (at: PinnedAt | null) => (): void => shot.draw(at);

@@ -16,10 +16,11 @@ import { findSegments } from "./segments";
 /** Messages to the worker: a photograph, or a file of the model that it needs. */
 export type Task =
   { kind: "encode"; file: File; stated: Stated; manifest: Manifest } | { kind: "file"; content: ArrayBuffer };
+type Features = Uint8Array<ArrayBuffer>;
 /** Messages from the worker. */
 export type Result =
   | { kind: "need"; name: string }
-  | { kind: "done"; features: Uint8Array<ArrayBuffer> }
+  | { kind: "done"; features: Features }
   | { kind: "failed"; message: string; isInput: boolean };
 
 type Angle = Header["pitch"];
@@ -72,7 +73,7 @@ scope.onmessage = ({ data }) => {
   }
 };
 
-async function encode(file: File, stated: Stated, encoder: Model): Promise<Uint8Array<ArrayBuffer>> {
+async function encode(file: File, stated: Stated, encoder: Model): Promise<Features> {
   const metadata = readMetadata(await file.arrayBuffer()),
     bitmap = await decoded(file, file.name);
   try {
@@ -96,10 +97,7 @@ interface Photograph {
   metadata: Metadata;
 }
 
-async function sphere(
-  { bitmap, lens, stated, metadata }: Photograph,
-  encoder: Model,
-): Promise<Uint8Array<ArrayBuffer>> {
+async function sphere({ bitmap, lens, stated, metadata }: Photograph, encoder: Model): Promise<Features> {
   const tilt = (entered: Angle | null, name: string, most: number): Angle => {
     const value_deg = poseAngle(metadata, name, -most, most) ?? 0;
     return entered ?? { value_deg, std_deg: GIVEN_SD_DEG, source: value_deg === 0 ? "assumed" : "gpano" };
@@ -125,7 +123,7 @@ async function sphere(
   return featuresFile(header, await encoder.sphere(pixels.rgb));
 }
 
-async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Model): Promise<Uint8Array<ArrayBuffer>> {
+async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Model): Promise<Features> {
   const { width, height } = bitmap,
     size = encoder.patchSize,
     entered = [statedPitch(stated), statedRoll(stated)] as const;
