@@ -110,15 +110,9 @@ function grow(seed: number, tolerance: number, width: number, { angle }: Edges, 
     for (const down of [-width, 0, width]) {
       for (const across of [-1, 0, 1]) {
         const index = region[next]! + down + across;
-        // Pixels of the last row and column have no direction, so that only the left border can be crossed.
-        if (
-          index < 0 ||
-          (column === 0 && across < 0) ||
-          index >= used.length ||
-          used[index] === 1 ||
-          angle[index] === NONE
-        )
-          continue;
+        // Pixels of the last row and column have no direction, so that only the left border can be crossed; above and below
+        // the picture, `used` is undefined.
+        if ((column === 0 && across < 0) || used[index] !== 0 || angle[index] === NONE) continue;
         if (Math.abs(turn(angle[index]! - direction)) > tolerance) continue;
         used[index] = 1;
         region.push(index);
