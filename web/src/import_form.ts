@@ -86,11 +86,7 @@ export class ImportForm {
       void this.picture.open(file).catch((error: unknown) => showError(byId("plan-error"), error));
     }
     this.file = file;
-    const labels: [string, string][] = [
-      ["units", "Unit"],
-      ...FIELDS.map(([name, label]): [string, string] => [name, label]),
-    ];
-    const shown = labels
+    const shown = [["units", "Unit"] as const, ...FIELDS]
       .filter(([name]) => !isPicture || OF_PICTURES.includes(name))
       .map(([name, label]) => {
         const input = this.inputs.get(name)!;
