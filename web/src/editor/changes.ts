@@ -31,8 +31,9 @@ function withRoom(plan: PlanDocument, index: number, change: (room: RoomDocument
   return { ...plan, rooms: plan.rooms.map((room, position) => (position === index ? change(room) : room)) };
 }
 
-function withOutline(plan: PlanDocument, index: number, polygon: Point[]): PlanDocument {
-  const before = plan.rooms[index]!.polygon;
+function withOutline(plan: PlanDocument, index: number, change: (polygon: Point[]) => Point[]): PlanDocument {
+  const before = plan.rooms[index]!.polygon,
+    polygon = change(before);
   const moved = withRoom(plan, index, (room) => ({ ...room, polygon }));
   if (before.length !== polygon.length) return moved;
   return { ...moved, openings: (plan.openings ?? []).map((opening) => carried(opening, before, polygon)) };
@@ -85,42 +86,25 @@ function frame(from: Point, to: Point) {
   };
 }
 
-export function moveCorner(plan: PlanDocument, room: number, corner: number, to: Point): PlanDocument {
-  return withOutline(
-    plan,
-    room,
-    plan.rooms[room]!.polygon.map((point, position) => (position === corner ? rounded(to) : point)),
-  );
-}
+export const moveCorner = (plan: PlanDocument, room: number, corner: number, to: Point): PlanDocument =>
+  withOutline(plan, room, (polygon) => polygon.map((point, index) => (index === corner ? rounded(to) : point)));
 
 /** Move both ends of a wall. */
-export function moveWall(plan: PlanDocument, { room, edge }: WallRef, by: Point): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon,
-    next = (edge + 1) % polygon.length;
-  return withOutline(
-    plan,
-    room,
-    polygon.map((point, position) => (position === edge || position === next ? plus(point, by) : point)),
-  );
-}
+export const moveWall = (plan: PlanDocument, { room, edge }: WallRef, by: Point): PlanDocument =>
+  withOutline(plan, room, (polygon) => {
+    const next = (edge + 1) % polygon.length;
+    return polygon.map((point, index) => (index === edge || index === next ? plus(point, by) : point));
+  });
 
 /** Add a corner on a wall. */
-export function splitWall(plan: PlanDocument, { room, edge }: WallRef, corner: Point): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon;
-  return withOutline(plan, room, [...polygon.slice(0, edge + 1), rounded(corner), ...polygon.slice(edge + 1)]);
-}
+export const splitWall = (plan: PlanDocument, { room, edge }: WallRef, corner: Point): PlanDocument =>
+  withOutline(plan, room, (polygon) => [...polygon.slice(0, edge + 1), rounded(corner), ...polygon.slice(edge + 1)]);
 
 /** Remove a corner; triangles stay as they are. */
-export function removeCorner(plan: PlanDocument, room: number, corner: number): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon;
-  return polygon.length <= 3
+export const removeCorner = (plan: PlanDocument, room: number, corner: number): PlanDocument =>
+  plan.rooms[room]!.polygon.length <= 3
     ? plan
-    : withOutline(
-        plan,
-        room,
-        polygon.filter((_, position) => position !== corner),
-      );
-}
+    : withOutline(plan, room, (polygon) => polygon.filter((_, index) => index !== corner));
 
 export function addRoom(plan: PlanDocument, polygon: Point[]): PlanDocument {
   const room: RoomDocument = { name: `room ${plan.rooms.length + 1}`, type: "unknown", polygon: polygon.map(rounded) };
