@@ -121,12 +121,8 @@ export class ImportForm {
       button("Cancel", () => this.cancelled()),
     );
     const fields = h("div", { class: "fields" }, ...shown);
-    const level = (name: string): HTMLElement =>
-      h(
-        "li",
-        {},
-        button(name, () => this.sendLevel(name)),
-      );
+    const choices = levels.map((name) => button(name, () => this.sendLevel(name)));
+    const items = choices.map((choice) => h("li", {}, choice));
     show(
       byId("import-form"),
       h(
@@ -134,7 +130,7 @@ export class ImportForm {
         { open: isNeeded || factor !== null },
         h("summary", {}, heading),
         ...(levels.length > 0
-          ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...levels.map(level)), ask]
+          ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...items), ask]
           : isPicture
             ? [this.picture.element, ask, h("details", {}, h("summary", {}, "Other ways to state the scale"), fields)]
             : [fields, ask]),

@@ -181,10 +181,8 @@ export class LocalisabilityLayer {
       const cells = cellsOf(room, cell);
       return { ...cells, values: shadesOf(cells, found, found.rooms[index]!.id, condition) };
     });
-    show(
-      this.element,
-      roomPictures("localisability", fields, () => OPACITY),
-    );
+    const pictures = roomPictures("localisability", fields, () => OPACITY);
+    show(this.element, pictures);
   }
 }
 

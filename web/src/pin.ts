@@ -292,13 +292,12 @@ class PinPage {
       this.pins,
       this.shown === null ? [] : this.pinsOf(shown, this.shown, { move: this.move, show: this.actions.show }),
     );
-    const groups = GROUPS.map(([title, states]) => {
+    const groups = GROUPS.flatMap(([title, states]) => {
       const own = shown.filter(({ pin }) => (states as readonly string[]).includes(pin?.state ?? "waiting"));
-      return (
-        own.length > 0 && [h("h3", {}, `${title} (${own.length})`), h("ul", {}, ...own.map((row) => this.card(row)))]
-      );
+      if (own.length === 0) return [];
+      return [h("h3", {}, `${title} (${own.length})`), h("ul", {}, ...own.map((row) => this.card(row)))];
     });
-    show(byId("photographs"), ...groups.flatMap((group) => group || []));
+    show(byId("photographs"), ...groups);
     if (focused && document.activeElement?.id !== focused)
       document.getElementById(focused)?.focus({ preventScroll: true });
     const moved = this.rows.map(movedOf).filter((text) => text !== null);
@@ -320,11 +319,8 @@ class PinPage {
     const kinds = Object.entries(FILES).map(([name, media]) =>
       button(name, () => void this.guarded(() => save(name, media))),
     );
-    show(
-      place,
-      ...kinds,
-      button("Print", () => print()),
-    );
+    const paper = button("Print", () => print());
+    show(place, ...kinds, paper);
   }
 
   /** Return the pins in a plan; without actions, for paper. */

@@ -8,6 +8,7 @@ export class PhoneLink {
   private readonly code = h("div", { class: "qr" });
   private readonly link = h("a", {});
   private readonly warning = h("p", { class: "hint" });
+  private readonly close = button("Close", () => this.dialog.close());
   private readonly dialog = h(
     "dialog",
     { id: "phone-dialog", "aria-labelledby": "phone-title" },
@@ -15,11 +16,7 @@ export class PhoneLink {
     this.code,
     h("p", {}, this.link),
     this.warning,
-    h(
-      "div",
-      { class: "ask" },
-      button("Close", () => this.dialog.close()),
-    ),
+    h("div", { class: "ask" }, this.close),
   );
 
   constructor() {
