@@ -7,6 +7,16 @@ import { labelOf, plainWords } from "./plain_words";
 
 export { InputError };
 
+// Plain words by the slugs of frequent errors; the service's own messages are written for developers.
+const PLAIN_TEXTS: Record<string, string> = {
+  "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
+  "foreign-features": "The service has another model than this page has loaded. Load the page again.",
+  "features-required":
+    "This service takes no photographs. Load the page again: it then computes features in the browser.",
+  overloaded: "The service is overloaded.",
+  "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
+};
+
 type Fields = Record<string, HTMLElement>;
 
 /** Do some work; show its error in an element, and mark the fields that cause it. */
@@ -26,10 +36,11 @@ export function showError(place: HTMLElement, error: unknown, fields: Fields = {
   const text = error instanceof Error ? error.message : String(error);
   const faults = failure?.faults ?? [];
   const title = failure?.title ?? (error instanceof InputError ? null : "Something went wrong");
+  const plain = PLAIN_TEXTS[failure?.slug ?? ""];
   show(
     place,
     title !== null && h("strong", {}, title),
-    h("p", {}, plainText(failure) ?? plainWords(failure?.detail ?? text)),
+    h("p", {}, plain ? `${plain} (${failure!.detail})` : plainWords(failure?.detail ?? text)),
     faults.length > 0 &&
       h(
         "ul",
@@ -78,21 +89,6 @@ export function clearErrors(): void {
     const marked = document.querySelectorAll<HTMLElement>(`[aria-describedby="${place.id}"]`);
     clearError(place, Object.fromEntries([...marked].entries()));
   }
-}
-
-/** Return plain words for frequent errors; the service's own messages are written for developers. */
-function plainText(failure: ServiceError | null): string | null {
-  if (failure === null) return null;
-  const words: Record<string, string> = {
-    "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
-    "foreign-features": "The service has another model than this page has loaded. Load the page again.",
-    "features-required":
-      "This service takes no photographs. Load the page again: it then computes features in the browser.",
-    overloaded: "The service is overloaded.",
-    "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
-  };
-  const text = words[failure.slug];
-  return text === undefined ? null : `${text} (${failure.detail})`;
 }
 
 let hide: number | undefined;
