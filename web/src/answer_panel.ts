@@ -63,7 +63,8 @@ export function markSelected(index: number | null): void {
 }
 
 function summary(answer: Answer): HTMLElement {
-  const share = answer.confidence ?? 0;
+  const share = answer.confidence ?? 0,
+    heading = headingWords(answer.heading_deg, answer.heading_std_deg);
   return h(
     "div",
     { class: "verdict" },
@@ -71,11 +72,7 @@ function summary(answer: Answer): HTMLElement {
     h("p", { class: "room" }, answer.room),
     answer.venue_id != null && h("p", { class: "plan-of" }, planOf(answer, answer)),
     h("p", { class: "where" }, placeWords(answer)),
-    h(
-      "p",
-      { class: "hint" },
-      `Heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}. ± is a 95 % interval.`,
-    ),
+    h("p", { class: "hint" }, `Heading ${heading}. ± is a 95 % interval.`),
     answer.confidence !== null &&
       h(
         "div",
@@ -131,7 +128,8 @@ function remarks(answer: Answer): (HTMLElement | false)[] {
 function places(answer: Answer, { select }: AnswerActions): HTMLElement {
   const listed = placesOf(answer),
     left = remainder(answer, listed),
-    elsewhere = answer.probability_elsewhere ?? 0;
+    elsewhere = answer.probability_elsewhere ?? 0,
+    nowhere = answer.venue_id == null ? "not in this plan" : "in none of the plans";
   const row = ({ index, candidate, probability, others }: Place, rank: number): HTMLElement => {
     const plan = answer.venue_id != null && h("small", {}, planOf(answer, candidate));
     const name = h("span", { class: "name" }, candidate.room, plan);
@@ -151,12 +149,7 @@ function places(answer: Answer, { select }: AnswerActions): HTMLElement {
       "ul",
       {},
       left !== null && h("li", { class: "rest" }, ...cells("", "other places of the plan", left)),
-      elsewhere >= 0.005 &&
-        h(
-          "li",
-          { class: "rest" },
-          ...cells("", answer.venue_id == null ? "not in this plan" : "in none of the plans", elsewhere),
-        ),
+      elsewhere >= 0.005 && h("li", { class: "rest" }, ...cells("", nowhere, elsewhere)),
     ),
   );
 }

@@ -162,6 +162,7 @@ export class LiveSession {
     const others = (pose?.candidates ?? []).slice(1).filter(({ probability }) => probability >= MIN_SHARE);
     const level = (at: { level?: number | null }): string =>
       at.level === null || at.level === undefined ? "" : `, level ${at.level}`;
+    const possible = others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`);
     show(
       this.state,
       h("p", { id: "session-mode", class: `mode ${mode}` }, pose === null ? "Add the first photograph." : MODES[mode]),
@@ -172,12 +173,7 @@ export class LiveSession {
           h("strong", {}, `${pose.room}${level(pose)}`),
           ` ${percent(pose.probability)} probable, after ${photographs} ${photographs === 1 ? "photograph" : "photographs"}`,
         ),
-      others.length > 0 &&
-        h(
-          "p",
-          { class: "hint" },
-          `Also possible: ${others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`).join(", ")}`,
-        ),
+      possible.length > 0 && h("p", { class: "hint" }, `Also possible: ${possible.join(", ")}`),
       ...(pose?.warnings ?? []).map((warning) => h("p", { class: "hint" }, warning)),
       h("p", { class: "hint" }, "Others can watch at ", h("a", { href: `#session=${id}` }, "this address"), "."),
     );

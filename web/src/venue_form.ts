@@ -28,17 +28,12 @@ export class VenueForm {
 
   /** `made` is called with the stored venue. */
   constructor(private readonly made: (venue: Venue) => void) {
+    const label = h("label", { class: "sr", for: this.choice.id }, "Plan to add");
     show(
       byId("venue-form"),
       this.error,
       h("div", {}, h("label", { for: this.name.id }, "Name of the venue"), this.name),
-      h(
-        "div",
-        { class: "row" },
-        h("label", { class: "sr", for: this.choice.id }, "Plan to add"),
-        this.choice,
-        this.add,
-      ),
+      h("div", { class: "row" }, label, this.choice, this.add),
       this.rows,
       button("Create the venue", () => void this.send(), { class: "primary", id: "venue-form-make" }),
     );

@@ -153,6 +153,7 @@ export class Editor {
 
   private drawBar(): void {
     if (this.history === null) return;
+    const { slider, box } = this.underlay;
     const tool = ([name, label]: [Tool, string]): HTMLElement =>
       button(
         label,
@@ -178,13 +179,7 @@ export class Editor {
         this.undo,
         this.redo,
       ),
-      this.underlay.box !== null &&
-        h(
-          "label",
-          { class: "inline", for: this.underlay.slider.id },
-          "Picture through the rooms",
-          this.underlay.slider,
-        ),
+      box !== null && h("label", { class: "inline", for: slider.id }, "Picture through the rooms", slider),
       this.measure,
       this.hint,
       h(
