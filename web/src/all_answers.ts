@@ -20,57 +20,32 @@ export function showAll(photos: readonly Photo[], choose: (photo: Photo) => void
     show(panel);
     return;
   }
-  const heads = ["Photograph", "Room", "x, m", "y, m", "Heading", "Confidence"];
+  const heads = ["Photograph", "Room", "x, m", "y, m", "Heading", "Confidence"].map((head) =>
+    h("th", { scope: "col" }, head),
+  );
+  const rows = found.map(({ photo, answer: { room, position, heading_deg, confidence } }) => {
+    const name = button(nameOf(photo), () => choose(photo)),
+      place = [position.x_m.toFixed(2), position.y_m.toFixed(2)];
+    const words = [room, ...place, headingWords(heading_deg, null), confidence === null ? "–" : percent(confidence)];
+    return h("tr", {}, h("th", { scope: "row" }, name), ...words.map((text) => h("td", {}, text)));
+  });
   const features = found.map(featureOf).filter((feature) => feature !== null);
+  const save = (kind: string, type: string, content: string): HTMLElement => {
+    const ending = kind.toLowerCase();
+    const act = (): void => download(new Blob([content], { type }), `lalaloc.${ending}`);
+    return button(`Save ${kind}`, act, { id: `save-${ending}` });
+  };
   show(
     panel,
     h("h3", {}, "All photographs"),
-    h(
-      "div",
-      { class: "table" },
-      h(
-        "table",
-        {},
-        h("thead", {}, h("tr", {}, ...heads.map((head) => h("th", { scope: "col" }, head)))),
-        h(
-          "tbody",
-          {},
-          ...found.map(({ photo, answer }) =>
-            h(
-              "tr",
-              {},
-              h(
-                "th",
-                { scope: "row" },
-                button(nameOf(photo), () => choose(photo)),
-              ),
-              h("td", {}, answer.room),
-              h("td", {}, answer.position.x_m.toFixed(2)),
-              h("td", {}, answer.position.y_m.toFixed(2)),
-              h("td", {}, headingWords(answer.heading_deg, null)),
-              h("td", {}, answer.confidence === null ? "–" : percent(answer.confidence)),
-            ),
-          ),
-        ),
-      ),
-    ),
+    h("div", { class: "table" }, h("table", {}, h("thead", {}, h("tr", {}, ...heads)), h("tbody", {}, ...rows))),
     h(
       "div",
       { class: "sharing" },
-      button("Save CSV", () => download(new Blob([csvOf(found)], { type: "text/csv" }), "lalaloc.csv"), {
-        id: "save-csv",
-      }),
+      save("CSV", "text/csv", csvOf(found)),
       // GeoJSON needs places on Earth, which only plans with an anchor have.
       features.length === found.length
-        ? button(
-            "Save GeoJSON",
-            () =>
-              download(
-                new Blob([JSON.stringify({ type: "FeatureCollection", features })], { type: "application/geo+json" }),
-                "lalaloc.geojson",
-              ),
-            { id: "save-geojson" },
-          )
+        ? save("GeoJSON", "application/geo+json", JSON.stringify({ type: "FeatureCollection", features }))
         : h("p", { class: "hint" }, "GeoJSON can be saved for plans whose place on Earth is known."),
     ),
   );

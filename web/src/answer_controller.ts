@@ -11,7 +11,7 @@ import { HintForm } from "./hints";
 import { layoutLines, roomAt } from "./layout";
 import type { LiveAnswer } from "./look/live_lines";
 import type { FoundPlace } from "./look/look_around";
-import { clearError, clearErrors, showError } from "./notices";
+import { attempt, clearError, clearErrors, showError } from "./notices";
 import { PhotoView } from "./photo_view";
 import { type Photo, Photos } from "./photos";
 import { savePicture } from "./pictures";
@@ -38,7 +38,6 @@ export class AnswerController {
   private venue: ChosenVenue | null = null;
   private answer: Answer | null = null;
   private answeredPhoto: Photo | null = null;
-  /** Index of the selected candidate. */
   private selected = 0;
   /** The marker's pose after the user moved it away from the candidate. */
   private moved: Pose | null = null;
@@ -142,13 +141,11 @@ export class AnswerController {
     this.photoView.setView(photo === null ? null : (answer?.view ?? null));
     showAnswer(answer, photo, {
       select: (index) => this.select(index),
-      save: async (shown, answered) => {
-        clearError(this.error, this.fields);
+      save: (shown, answered) => {
         // An answer that a link opened has no photograph until one is added.
         const name = answered?.file.name ?? "answer";
-        await savePicture(name, this.photoView.toCanvas(), this.scene.svg, captionWords(shown)).catch(
-          (error: unknown) => showError(this.error, error),
-        );
+        const save = () => savePicture(name, this.photoView.toCanvas(), this.scene.svg, captionWords(shown));
+        return attempt(this.error, save, this.fields);
       },
     });
     showAll(answer === null ? [] : this.photos.list, (chosen) => this.photos.choose(chosen));
@@ -185,12 +182,9 @@ export class AnswerController {
       void this.actions.showPlan(candidate.floorplan_id);
       return;
     }
-    const {
-      position: { x_m, y_m },
-      heading_deg,
-    } = candidate;
-    this.scene.marker.place({ x_m, y_m, heading_deg }, this.scene.box);
-    this.drawLines({ x_m, y_m, heading_deg });
+    const pose: Pose = { ...candidate.position, heading_deg: candidate.heading_deg };
+    this.scene.marker.place(pose, this.scene.box);
+    this.drawLines(pose);
   }
 
   /** Show the layout from the pose that the user gave the marker. */
@@ -260,7 +254,7 @@ export class AnswerController {
     this.cancelQuery();
     const { signal } = (this.query = new AbortController());
     const { group } = this.photos;
-    for (const asked of group?.photos ?? [photo]) asked.answer = null;
+    for (const asked of group ?? [photo]) asked.answer = null;
     this.show(null);
     clearError(this.error, this.fields);
     this.find.setAttribute("aria-busy", "true");

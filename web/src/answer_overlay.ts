@@ -7,12 +7,8 @@ import { placesOf } from "./places";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Answer } from "./types";
 
-// 95 % of a normal distribution in two dimensions, and in one, lie within this many standard deviations.
-const WITHIN_95 = Math.sqrt(5.991),
-  NORMAL_95 = 1.96;
-
-/** Return half the width of the 95 % interval of a value. */
-export const normal95 = (deviation: number): number => NORMAL_95 * deviation;
+// 95 % of a normal distribution in two dimensions lie within this many standard deviations.
+const WITHIN_95 = Math.sqrt(5.991);
 
 /** Return the radii (m) of the ellipse that contains a position with a probability of 95 %, the longer one first. */
 export function within95([[xx, xy], [, yy]]: NonNullable<Answer["covariance_m2"]>): [number, number] {
@@ -65,36 +61,29 @@ export function companions(
   choose: (photo: Photo) => void,
 ): SVGGElement {
   const unit = unitOf(box);
-  const asked = photos.flatMap((photo, index) =>
-    photo.answer === null || photo.answer.floorplan_id !== planId
-      ? []
-      : [{ photo, answer: photo.answer, number: index + 1 }],
-  );
   return s(
     "g",
     { class: "companions" },
-    ...asked
-      .filter(({ photo }) => photo !== current)
-      .map(({ photo, answer, number }) => {
-        const { x_m, y_m } = answer.position,
-          turn = answer.heading_deg;
-        return s(
-          "g",
-          { class: "companion", transform: `translate(${x_m} ${-y_m})`, onclick: () => choose(photo) },
-          s("title", {}, `Photograph ${number}: ${photo.file.name}`),
-          s("path", { class: "gaze", d: `M0 0V${-5 * unit}`, transform: `rotate(${turn})` }),
-          s("circle", { r: 0.9 * unit }),
-          s(
-            "text",
-            {
-              "font-size": 1.9 * unit,
-              transform: `rotate(${turn}) translate(0 ${-6.6 * unit}) rotate(${-turn})`,
-              y: 0.68 * unit,
-            },
-            `photo ${number}`,
-          ),
-        );
-      }),
+    ...photos.map((photo, index) => {
+      if (photo === current || photo.answer === null || photo.answer.floorplan_id !== planId) return null;
+      const { position, heading_deg: turn } = photo.answer;
+      return s(
+        "g",
+        { class: "companion", transform: `translate(${position.x_m} ${-position.y_m})`, onclick: () => choose(photo) },
+        s("title", {}, `Photograph ${index + 1}: ${photo.file.name}`),
+        s("path", { class: "gaze", d: `M0 0V${-5 * unit}`, transform: `rotate(${turn})` }),
+        s("circle", { r: 0.9 * unit }),
+        s(
+          "text",
+          {
+            "font-size": 1.9 * unit,
+            transform: `rotate(${turn}) translate(0 ${-6.6 * unit}) rotate(${-turn})`,
+            y: 0.68 * unit,
+          },
+          `photo ${index + 1}`,
+        ),
+      );
+    }),
   );
 }
 

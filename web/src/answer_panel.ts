@@ -2,13 +2,13 @@
 
 import { linkTo } from "./answer_link";
 import {
-  accuracyWords,
   adviceWords,
   confidenceWords,
   HEADING_SOURCES,
   headingWords,
   milliseconds,
   percent,
+  placeWords,
   roomWords,
   seenWords,
   stepWords,
@@ -54,7 +54,6 @@ export function showAnswer(answer: Answer | null, photo: Photo | null, actions: 
   );
 }
 
-/** Mark the selected candidate. */
 export function markSelected(index: number | null): void {
   byId("answer-body")
     .querySelectorAll("[data-rank]")
@@ -64,25 +63,16 @@ export function markSelected(index: number | null): void {
 }
 
 function summary(answer: Answer): HTMLElement {
-  const { x_m, y_m } = answer.position,
-    share = answer.confidence ?? 0;
-  const accuracy = accuracyWords(answer);
+  const share = answer.confidence ?? 0,
+    heading = headingWords(answer.heading_deg, answer.heading_std_deg);
   return h(
     "div",
     { class: "verdict" },
     h("p", { class: "words" }, confidenceWords(answer.confidence)),
     h("p", { class: "room" }, answer.room),
     answer.venue_id != null && h("p", { class: "plan-of" }, planOf(answer, answer)),
-    h(
-      "p",
-      { class: "where" },
-      `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`,
-    ),
-    h(
-      "p",
-      { class: "hint" },
-      `Heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}. ± is a 95 % interval.`,
-    ),
+    h("p", { class: "where" }, placeWords(answer)),
+    h("p", { class: "hint" }, `Heading ${heading}. ± is a 95 % interval.`),
     answer.confidence !== null &&
       h(
         "div",
@@ -100,7 +90,7 @@ function planOf(answer: Answer, place: { floorplan_id: string; level: number | n
 }
 
 /** State what was assumed, and what the user can do about an uncertain answer. */
-function remarks(answer: Answer): HTMLElement[] {
+function remarks(answer: Answer): (HTMLElement | false)[] {
   const { view, together } = answer,
     advice = adviceWords(answer),
     step = stepWords(answer),
@@ -110,32 +100,26 @@ function remarks(answer: Answer): HTMLElement[] {
     h("p", { class: "warning" }, plainWords(warning)),
   );
   return [
-    ...(step === null ? [] : [h("p", { class: "advice", id: "next-step" }, step)]),
-    ...(advice === null ? [] : [h("p", { class: "advice" }, advice)]),
-    ...(together === undefined
-      ? []
-      : [
-          h(
-            "p",
-            { class: "assumed" },
-            `From ${together.photographs} photographs together`,
-            together.confidence === null
-              ? "."
-              : `: ${percent(together.confidence)} probability that all of their places are right within 1 m.`,
-          ),
-        ]),
-    ...(elsewhere < NOTABLE_ELSEWHERE
-      ? []
-      : [
-          h(
-            "p",
-            { class: "assumed" },
-            `${percent(elsewhere)} probability that the photograph shows `,
-            "no place of this plan: another floor or building, or rooms that have changed.",
-          ),
-        ]),
-    ...(looks === null ? [] : [h("p", { class: "assumed" }, looks)]),
-    ...(view == null ? [] : [h("p", { class: "assumed" }, viewWords(view))]),
+    step !== null && h("p", { class: "advice", id: "next-step" }, step),
+    advice !== null && h("p", { class: "advice" }, advice),
+    together !== undefined &&
+      h(
+        "p",
+        { class: "assumed" },
+        `From ${together.photographs} photographs together`,
+        together.confidence === null
+          ? "."
+          : `: ${percent(together.confidence)} probability that all of their places are right within 1 m.`,
+      ),
+    elsewhere >= NOTABLE_ELSEWHERE &&
+      h(
+        "p",
+        { class: "assumed" },
+        `${percent(elsewhere)} probability that the photograph shows `,
+        "no place of this plan: another floor or building, or rooms that have changed.",
+      ),
+    looks !== null && h("p", { class: "assumed" }, looks),
+    view != null && h("p", { class: "assumed" }, viewWords(view)),
     ...warnings,
   ];
 }
@@ -144,38 +128,18 @@ function remarks(answer: Answer): HTMLElement[] {
 function places(answer: Answer, { select }: AnswerActions): HTMLElement {
   const listed = placesOf(answer),
     left = remainder(answer, listed),
-    elsewhere = answer.probability_elsewhere ?? 0;
-  const row = (place: Place, rank: number): HTMLElement =>
-    h(
-      "li",
-      {},
-      h(
-        "button",
-        {
-          type: "button",
-          "data-rank": place.index,
-          "aria-pressed": String(rank === 0),
-          onclick: () => select(place.index),
-        },
-        ...cells(
-          rank + 1,
-          h(
-            "span",
-            { class: "name" },
-            place.candidate.room,
-            answer.venue_id != null && h("small", {}, planOf(answer, place.candidate)),
-          ),
-          place.probability,
-        ),
-      ),
-      place.others.length > 0 &&
-        h(
-          "div",
-          { class: "ways" },
-          "or the camera faces ",
-          ...place.others.map((index) => otherWay(answer, index, select)),
-        ),
-    );
+    elsewhere = answer.probability_elsewhere ?? 0,
+    nowhere = answer.venue_id == null ? "not in this plan" : "in none of the plans";
+  const row = ({ index, candidate, probability, others }: Place, rank: number): HTMLElement => {
+    const plan = answer.venue_id != null && h("small", {}, planOf(answer, candidate));
+    const name = h("span", { class: "name" }, candidate.room, plan);
+    const choose = button(cells(rank + 1, name, probability), () => select(index), {
+      "data-rank": index,
+      "aria-pressed": String(rank === 0),
+    });
+    const ways = others.map((other) => otherWay(answer, other, select));
+    return h("li", {}, choose, ways.length > 0 && h("div", { class: "ways" }, "or the camera faces ", ...ways));
+  };
   return h(
     "div",
     { class: "places" },
@@ -185,12 +149,7 @@ function places(answer: Answer, { select }: AnswerActions): HTMLElement {
       "ul",
       {},
       left !== null && h("li", { class: "rest" }, ...cells("", "other places of the plan", left)),
-      elsewhere >= 0.005 &&
-        h(
-          "li",
-          { class: "rest" },
-          ...cells("", answer.venue_id == null ? "not in this plan" : "in none of the plans", elsewhere),
-        ),
+      elsewhere >= 0.005 && h("li", { class: "rest" }, ...cells("", nowhere, elsewhere)),
     ),
   );
 }
@@ -208,11 +167,8 @@ function cells(rank: number | string, name: HTMLElement | string, share: number 
 function otherWay(answer: Answer, index: number, select: (index: number) => void): HTMLElement {
   const { heading_deg, probability } = answer.candidates[index]!;
   const share = probability === null ? "" : ` (${percent(probability)})`;
-  return h(
-    "button",
-    { type: "button", "data-rank": index, "aria-pressed": "false", onclick: () => select(index) },
-    `${headingWords(heading_deg, null)}${share}`,
-  );
+  const label = `${headingWords(heading_deg, null)}${share}`;
+  return button(label, () => select(index), { "data-rank": index, "aria-pressed": "false" });
 }
 
 function facts(answer: Answer): HTMLElement {

@@ -1,7 +1,10 @@
 /** Words for the parts of an answer. */
 
-import { normal95, within95 } from "./answer_overlay";
+import { within95 } from "./answer_overlay";
 import type { Answer, ViewAnswer } from "./types";
+
+// 95 % of a normal distribution lie within this many standard deviations.
+const NORMAL_95 = 1.96;
 
 /** Describe a confidence. */
 export function confidenceWords(confidence: number | null): string {
@@ -19,20 +22,18 @@ export const percent = (share: number): string =>
 export const milliseconds = (duration: number): string =>
   duration >= 1000 ? `${(duration / 1000).toFixed(1)} s` : `${Math.round(duration)} ms`;
 
-/** Return the 95 % radius of the position along the longer axis of the ellipse on the plan. */
-export function accuracyWords(answer: Answer): string | null {
-  if (answer.covariance_m2 === null) return null;
-  const [radius] = within95(answer.covariance_m2);
-  return radius < 1 ? `± ${Math.max(1, Math.round(100 * radius))} cm` : `± ${radius.toFixed(1)} m`;
+/** Return a position with its 95 % radius along the longer axis of the ellipse on the plan. */
+export function placeWords({ position: { x_m, y_m }, covariance_m2: covariance }: Answer): string {
+  const place = `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m`;
+  if (covariance === null) return place;
+  const [radius] = within95(covariance);
+  return `${place} ± ${radius < 1 ? `${Math.max(1, Math.round(100 * radius))} cm` : `${radius.toFixed(1)} m`}`;
 }
 
 /** Return an answer in two lines, for a picture of it. */
 export function captionWords(answer: Answer): string[] {
-  const { x_m, y_m } = answer.position,
-    accuracy = accuracyWords(answer);
-  const place = `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m${accuracy === null ? "" : ` ${accuracy}`}`;
   return [
-    `${answer.room}: ${place}, heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}`,
+    `${answer.room}: ${placeWords(answer)}, heading ${headingWords(answer.heading_deg, answer.heading_std_deg)}`,
     answer.confidence === null
       ? confidenceWords(null)
       : `${confidenceWords(answer.confidence)}; ${percent(answer.confidence)} probability of an error below 1 m`,
@@ -40,10 +41,8 @@ export function captionWords(answer: Answer): string[] {
 }
 
 /** Return a heading with its 95 % interval. */
-export function headingWords(headingDeg: number, deviationDeg: number | null): string {
-  const spread = deviationDeg === null ? 0 : normal95(deviationDeg);
-  return `${(Math.round(headingDeg) % 360).toFixed(0)}°${spread < 0.5 ? "" : ` ± ${spread.toFixed(0)}°`}`;
-}
+export const headingWords = (headingDeg: number, deviationDeg: number | null): string =>
+  angleWords(Math.round(headingDeg) % 360, deviationDeg ?? 0);
 
 /** Describe what was assumed about a photograph, with the origin of each value. */
 export function viewWords(view: ViewAnswer): string {
@@ -80,24 +79,21 @@ export function adviceWords(answer: Answer): string | null {
   const { view, together } = answer;
   if (view === null || view === undefined || view.advice === null) return null;
   const seen = `${seenDeg(view).toFixed(0)}° of the surroundings are too little to tell the place`;
-  return together?.motion === "turn"
+  return together !== undefined
     ? `Turn further: ${seen}. Add more photographs from the same spot.`
     : `Turn around: ${seen}. Add photographs from the same spot, each turned by at most half the field of view, and choose “Taken from one spot, turning”.`;
 }
 
 /** Return the step that makes an unsure answer surest; null if there is none. */
-export function stepWords({ view }: Answer): string | null {
-  const step = view?.next_step;
-  if (step == null) return null;
-  return `Next: ${step.text}.`;
-}
+export const stepWords = ({ view }: Answer): string | null =>
+  view?.next_step ? `Next: ${view.next_step.text}.` : null;
 
 function seenDeg({ seen }: ViewAnswer): number {
   return seen.reduce((sum, { from_deg, to_deg }) => sum + to_deg - from_deg, 0);
 }
 
 function angleWords(value: number, deviation: number): string {
-  const spread = normal95(deviation);
+  const spread = NORMAL_95 * deviation;
   return `${value.toFixed(0)}°${spread < 0.5 ? "" : ` ± ${spread.toFixed(0)}°`}`;
 }
 

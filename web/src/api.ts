@@ -28,6 +28,3 @@ export const api = new Client({
   attempts: 3,
   retryMs: 10_000,
 });
-
-/** Send a request; after 401, send it again with the key that the user gives. */
-export const request: Client["request"] = (path, init) => api.request(path, init);

@@ -10,7 +10,7 @@ import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
 import { LookAround } from "./look/look_around";
 import { PhoneLink } from "./look/phone_link";
-import { clearError, clearErrors, InputError, showError } from "./notices";
+import { attempt, clearErrors, InputError, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";
@@ -55,12 +55,7 @@ class Page {
     place: (signal) => this.place(signal),
     showPlan: (planId, revision) => this.plans.choose(planId, revision),
   });
-  private readonly editor = new Editor(this.scene.svg, {
-    draw: (plan) => this.scene.drawRooms(plan),
-    visible: () => this.scene.viewport.current,
-    fit: (box) => this.scene.viewport.fit(box),
-    ended: (stored) => this.onEdited(stored),
-  });
+  private readonly editor = new Editor(this.scene, (stored) => this.onEdited(stored));
   private readonly session = new LiveSession({
     place: () => this.place(),
     showPlan: (planId) => void this.plans.choose(planId),
@@ -69,10 +64,7 @@ class Page {
       this.answers.photos.choose(null);
     },
   });
-  private readonly look = new LookAround({
-    find: (frames, directions, signal) => this.answers.findTurn(frames, directions, signal),
-    findFilm: (film, signal) => this.answers.findFilm(film, signal),
-  });
+  private readonly look = new LookAround(this.answers);
   private readonly phone = new PhoneLink();
   /** True once the user has chosen a plan, which the example must not replace. */
   private hasStarted = false;
@@ -111,12 +103,9 @@ class Page {
   }
 
   private async showPhoneLink(): Promise<void> {
-    clearError(byId("plan-error"));
-    try {
+    await attempt(byId("plan-error"), async () => {
       this.phone.open((this.scene.plan ?? (await this.storeExample())).id);
-    } catch (error) {
-      showError(byId("plan-error"), error);
-    }
+    });
   }
 
   /** Show the plan, the answer or the session that the address names, if any. */
@@ -130,17 +119,14 @@ class Page {
       packed = named("answer-data");
     if (id === null && packed === null) return this.session.follow(named("session"));
     this.answers.cancelQuery();
-    clearError(byId("plan-error"));
-    try {
+    await attempt(byId("plan-error"), async () => {
       const answer = packed === null ? await api.answer(id!) : await linkedAnswer(packed);
       if (answer.venue_id != null) await this.venues.choose(answer.venue_id, null);
       else this.venues.leave();
       await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
       this.answers.photos.choose(null);
       this.answers.show(answer);
-    } catch (error) {
-      showError(byId("plan-error"), error);
-    }
+    });
     return true;
   }
 

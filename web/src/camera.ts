@@ -14,27 +14,27 @@ const LARGEST_STEP = radians(1);
 // Perspective cameras are drawn up to this angle from the optical axis.
 const WIDEST = Math.tan(radians(80));
 
+/** Return the direction of an azimuth and an elevation. */
+export const rayOf = (azimuth: number, elevation: number): Ray => [
+  Math.cos(elevation) * Math.sin(azimuth),
+  Math.cos(elevation) * Math.cos(azimuth),
+  Math.sin(elevation),
+];
+
 /**
- * Project lines of (azimuth from the photograph's centre, elevation) to a photograph that fills `size`; parts that it does
- * not show are cut off.
+ * Project a line of (azimuth from the photograph's centre, elevation) to a photograph that fills `size`; parts that it
+ * does not show are cut off.
  */
-export function throughCamera(lines: Point[][], view: CameraView, size: Size): Point[][] {
+export function throughCamera(line: Point[], view: CameraView, size: Size): Point[][] {
   const place = placeOf(view, size),
-    tilt = tiltOf(view);
-  return lines.flatMap((line) => {
-    const pieces: Point[][] = [[]];
-    for (const [azimuth, elevation] of dense(line)) {
-      const level: Ray = [
-        Math.cos(elevation) * Math.sin(azimuth),
-        Math.cos(elevation) * Math.cos(azimuth),
-        Math.sin(elevation),
-      ];
-      const point = place(tilt(level));
-      if (point !== null && inside(point, size)) pieces.at(-1)!.push(point);
-      else if (pieces.at(-1)!.length > 0) pieces.push([]);
-    }
-    return pieces.filter((piece) => piece.length > 1);
-  });
+    tilt = tiltOf(view),
+    pieces: Point[][] = [[]];
+  for (const [azimuth, elevation] of dense(line)) {
+    const point = place(tilt(rayOf(azimuth, elevation)));
+    if (point !== null && inside(point, size)) pieces.at(-1)!.push(point);
+    else if (pieces.at(-1)!.length > 0) pieces.push([]);
+  }
+  return pieces.filter((piece) => piece.length > 1);
 }
 
 /** Return whether a picture of a size shows a place. */

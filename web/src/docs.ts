@@ -1,6 +1,6 @@
 /** API documentation at /docs: Swagger UI, with the API key of this tab. */
 
-import { key, request } from "./api";
+import { api, key } from "./api";
 import { byId } from "./dom";
 import { connectKeyDialog } from "./key_dialog";
 import { showError } from "./notices";
@@ -14,7 +14,7 @@ declare const SwaggerUIBundle: (options: Record<string, unknown>) => SwaggerUi;
 async function start(): Promise<void> {
   connectKeyDialog();
   try {
-    const spec: unknown = await (await request("/openapi.json")).json();
+    const spec: unknown = await api.json("/openapi.json");
     const ui = SwaggerUIBundle({
       spec,
       dom_id: "#api",

@@ -5,19 +5,19 @@ type Attributes = Record<string, string | number | boolean | null | undefined | 
 
 const SVG = "http://www.w3.org/2000/svg";
 
-function fill(element: Element, attributes: Attributes, children: Child[]): void {
+function fill<E extends Element>(element: E, attributes: Attributes, children: Child[]): E {
   for (const [name, value] of Object.entries(attributes)) {
     if (value === null || value === undefined || value === false) continue;
     if (typeof value === "function") element.addEventListener(name.slice(2), value);
     else element.setAttribute(name, value === true ? "" : String(value));
   }
   element.append(...present(children));
+  return element;
 }
 
+// The DOM turns numbers into text.
 function present(children: Child[]): (Node | string)[] {
-  return children
-    .filter((child): child is Node | string | number => child !== null && child !== undefined && child !== false)
-    .map((child) => (typeof child === "number" ? String(child) : child));
+  return children.filter((child) => child !== null && child !== undefined && child !== false) as (Node | string)[];
 }
 
 /** Create an HTML element; attributes that begin with "on" are listeners. */
@@ -26,23 +26,17 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   attributes: Attributes = {},
   ...children: Child[]
 ): HTMLElementTagNameMap[K] {
-  const element = document.createElement(tag);
-  fill(element, attributes, children);
-  return element;
+  return fill(document.createElement(tag), attributes, children);
 }
 
-/** Create an SVG element. */
 export function s<K extends keyof SVGElementTagNameMap>(
   tag: K,
   attributes: Attributes = {},
   ...children: Child[]
 ): SVGElementTagNameMap[K] {
-  const element = document.createElementNS(SVG, tag) as SVGElementTagNameMap[K];
-  fill(element, attributes, children);
-  return element;
+  return fill(document.createElementNS(SVG, tag) as SVGElementTagNameMap[K], attributes, children);
 }
 
-/** Return an element of the page by its id. */
 export function byId<T extends HTMLElement = HTMLElement>(id: string): T {
   const element = document.getElementById(id);
   if (element === null) throw new Error(`the page has no #${id}`);
@@ -65,12 +59,13 @@ export const ARROWS: Record<string, [number, number]> = {
   ArrowDown: [0, -1],
 };
 
-/** Call `move` for every movement of the pointer until it is released. */
-export function followPointer(move: (event: PointerEvent) => void): void {
+/** Call `move` for every movement of the pointer until it is released, and then `done`. */
+export function followPointer(move: (event: PointerEvent) => void, done?: () => void): void {
   const end = (): void => {
     removeEventListener("pointermove", move);
     removeEventListener("pointerup", end);
     removeEventListener("pointercancel", end);
+    done?.();
   };
   addEventListener("pointermove", move);
   addEventListener("pointerup", end);
@@ -83,6 +78,19 @@ export function scrollTo(element: HTMLElement): void {
   element.scrollIntoView({ block: element.offsetHeight > innerHeight ? "start" : "nearest" });
 }
 
+/** Show a dialog of the page; return whether it is closed by the button with a value. */
+export function confirmed(id: string, value: string): Promise<boolean> {
+  const dialog = byId<HTMLDialogElement>(id);
+  dialog.showModal();
+  return new Promise((resolve) => {
+    const onClose = (): void => {
+      resolve(dialog.returnValue === value);
+      dialog.returnValue = "";
+    };
+    dialog.addEventListener("close", onClose, { once: true });
+  });
+}
+
 /** Offer a file for download. */
 export function download(content: Blob, name: string): void {
   const url = URL.createObjectURL(content);
@@ -92,7 +100,14 @@ export function download(content: Blob, name: string): void {
   setTimeout(() => URL.revokeObjectURL(url), 10_000);
 }
 
-/** Create a button. */
-export function button(label: string, act: () => void, attributes: Attributes = {}): HTMLButtonElement {
-  return h("button", { type: "button", ...attributes, onclick: () => act() }, label);
+/** Create a button with a text, or with several children. */
+export function button(label: string | Child[], act: () => void, attributes: Attributes = {}): HTMLButtonElement {
+  const children = typeof label === "string" ? [label] : label;
+  return h("button", { type: "button", ...attributes, onclick: () => act() }, ...children);
+}
+
+/** Create a button of the list of plans, or of venues. */
+export function planButton(name: string, facts: string, isChosen: boolean, choose: () => void): HTMLButtonElement {
+  const parts = [h("span", { class: "name" }, name), h("span", { class: "facts" }, facts)];
+  return button(parts, choose, { class: "plan", "aria-pressed": String(isChosen) });
 }

@@ -1,4 +1,4 @@
-/** Files and folders that are dropped on the page. */
+/** Files and folders that are chosen, or dropped on the page. */
 
 const PICTURES = /^image\/(jpeg|png|webp|heic|heif)$/;
 // Some systems do not know the type of phones' files.
@@ -6,6 +6,15 @@ const PHONE_FILES = /\.hei[cf]$/i;
 
 /** Return true for a file that can be a photograph. */
 export const isPicture = (file: File): boolean => PICTURES.test(file.type) || PHONE_FILES.test(file.name);
+
+/** Accept the files that are chosen in a field, at least one; the same can be chosen again. */
+export function acceptChoice(field: HTMLInputElement, take: (files: File[]) => void): void {
+  field.addEventListener("change", () => {
+    const files = [...(field.files ?? [])];
+    field.value = "";
+    if (files.length > 0) take(files);
+  });
+}
 
 /** Accept files, and the files of folders, dropped on an element. */
 export function acceptDrops(target: HTMLElement, take: (files: File[]) => void): void {

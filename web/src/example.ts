@@ -13,12 +13,10 @@ export const FLAT: Example = {
 };
 export const ROOMS: Example = { plan: "rooms.json", photos: ["lythwood_room.jpg"] };
 
-/** Return the plan of an example. */
 export async function examplePlan({ plan }: Example): Promise<PlanDocument> {
   return (await fetch(`/web/example-${plan}`)).json();
 }
 
-/** Return the photographs of an example. */
 export async function exampleFiles({ photos }: Example): Promise<File[]> {
   return Promise.all(
     photos.map(async (name) => {

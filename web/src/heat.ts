@@ -3,9 +3,9 @@
  * place of the answer is as wide as its covariance, which is finer than the pose grid.
  */
 
-import { s } from "./dom";
-import { inside } from "./layout";
-import { type Box, boxOf, path } from "./plan_drawing";
+import { h, s } from "./dom";
+import { isIn } from "./layout";
+import { type Box, boxOf, extentOf, path } from "./plan_drawing";
 import type { Answer, PlanDocument, Point, Posterior, RoomDocument } from "./types";
 
 // Places less probable than the best one by this factor are not coloured.
@@ -30,7 +30,6 @@ export interface Cells {
   rows: number;
 }
 
-/** Cells with a value each. */
 type Field = Cells & { values: Float64Array };
 
 /** Draw a picture for each room with any probability, clipped to its floor. */
@@ -38,17 +37,13 @@ export function heatMap(posterior: Posterior, plan: PlanDocument, answer: Refine
   const cell = cellSize(plan);
   const fields = plan.rooms.map((room) => fieldOf(posterior, room, cell, answer)).filter((field) => field !== null);
   const best = fields.reduce((most, { values }) => values.reduce((a, b) => Math.max(a, b), most), Number.MIN_VALUE);
-  for (const { values } of fields)
-    values.forEach((value, index) => {
-      values[index] = shadeOf(value, best);
-    });
-  return roomPictures("posterior", fields, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
+  const shaded = fields.map((field) => ({ ...field, values: field.values.map((value) => shadeOf(value, best)) }));
+  return roomPictures("posterior", shaded, (shade) => MAX_OPACITY * Math.min(1, shade / OPAQUE_SHADE));
 }
 
 /** Place of an answer with its uncertainty. */
 type Refined = Pick<Answer, "position" | "covariance_m2">;
 
-/** Return the size of the cells of a plan's maps. */
 export function cellSize(plan: PlanDocument): number {
   const whole = boxOf(plan);
   return Math.max(Math.max(whole.width, whole.height) / CELLS, MIN_CELL_M);
@@ -56,13 +51,10 @@ export function cellSize(plan: PlanDocument): number {
 
 /** Cover a room with cells. */
 export function cellsOf(room: RoomDocument, cell: number): Cells {
-  const xs = room.polygon.map(([x]) => x),
-    ys = room.polygon.map(([, y]) => y);
-  const left = Math.min(...xs),
-    top = Math.max(...ys);
-  const columns = Math.ceil((Math.max(...xs) - left) / cell),
-    rows = Math.ceil((top - Math.min(...ys)) / cell);
-  return { room, box: { x: left, y: -top, width: columns * cell, height: rows * cell }, columns, rows };
+  const { left, right, low, high } = extentOf(room.polygon);
+  const columns = Math.ceil((right - left) / cell),
+    rows = Math.ceil((high - low) / cell);
+  return { room, box: { x: left, y: -high, width: columns * cell, height: rows * cell }, columns, rows };
 }
 
 /** Draw shades from 0 to 1 as a picture for each room, clipped to its floor; `name` is unique on the page. */
@@ -72,35 +64,22 @@ export function roomPictures(name: string, fields: Field[], opacity: (shade: num
     "g",
     { class: `heat ${name}`, "aria-hidden": "true" },
     ...fields.map((field, index) => {
-      const {
-          room,
-          box: { x, y, width, height },
-        } = field,
-        id = `${name}-${index}`;
+      const { room, box } = field,
+        id = `${name}-${index}`,
+        floor = path(room.polygon) + (room.holes ?? []).map(path).join(""),
+        href = pictureOf(field, ramp, opacity);
       return s(
         "g",
         {},
-        s(
-          "clipPath",
-          { id },
-          s("path", { d: path(room.polygon) + (room.holes ?? []).map(path).join(""), "clip-rule": "evenodd" }),
-        ),
-        s("image", {
-          href: pictureOf(field, ramp, opacity),
-          x,
-          y,
-          width,
-          height,
-          preserveAspectRatio: "none",
-          "clip-path": `url(#${id})`,
-        }),
+        s("clipPath", { id }, s("path", { d: floor, "clip-rule": "evenodd" })),
+        s("image", { href, ...box, preserveAspectRatio: "none", "clip-path": `url(#${id})` }),
       );
     }),
   );
 }
 
 /** Return the shade of a density on a logarithmic scale: 1 for the best place, 0 for negligible ones. */
-export function shadeOf(density: number, best: number): number {
+function shadeOf(density: number, best: number): number {
   return Math.max(0, 1 - Math.log(Math.max(density / best, MIN_RATIO)) / Math.log(MIN_RATIO));
 }
 
@@ -129,9 +108,6 @@ function fieldOf(posterior: Posterior, room: RoomDocument, cell: number, answer:
   return { ...cells, values };
 }
 
-const isIn = (room: RoomDocument, x: number, y: number): boolean =>
-  inside(room.polygon, x, y) && !(room.holes ?? []).some((hole) => inside(hole, x, y));
-
 /** Add a normal distribution about the place of an answer, with its covariance but no narrower than a cell. */
 function addNormal(values: Float64Array, cells: Cells, { position, covariance_m2 }: Refined, peak: number): void {
   const { box, columns, rows } = cells,
@@ -154,15 +130,12 @@ function splat(field: Float64Array, columns: number, rows: number, [x, y]: Point
     row = Math.floor(y),
     right = x - column,
     down = y - row;
-  for (const [i, j, share] of [
-    [0, 0, (1 - right) * (1 - down)],
-    [1, 0, right * (1 - down)],
-    [0, 1, (1 - right) * down],
-    [1, 1, right * down],
-  ] as const) {
-    const cell = Math.max(0, Math.min(rows - 1, row + j)) * columns + Math.max(0, Math.min(columns - 1, column + i));
-    field[cell] = field[cell]! + share * value;
-  }
+  for (const j of [0, 1])
+    for (const i of [0, 1]) {
+      const share = (i === 0 ? 1 - right : right) * (j === 0 ? 1 - down : down);
+      const cell = Math.max(0, Math.min(rows - 1, row + j)) * columns + Math.max(0, Math.min(columns - 1, column + i));
+      field[cell] = field[cell]! + share * value;
+    }
 }
 
 /** Return half of a normal distribution's weights, from its mean. */
@@ -198,9 +171,7 @@ function rampOf(list: string): Colour[] {
 }
 
 function pictureOf({ columns, rows, values }: Field, ramp: Colour[], opacity: (shade: number) => number): string {
-  const canvas = document.createElement("canvas");
-  canvas.width = columns;
-  canvas.height = rows;
+  const canvas = h("canvas", { width: columns, height: rows });
   const context = canvas.getContext("2d")!;
   const picture = context.createImageData(columns, rows);
   values.forEach((shade, index) => {

@@ -86,11 +86,7 @@ export class ImportForm {
       void this.picture.open(file).catch((error: unknown) => showError(byId("plan-error"), error));
     }
     this.file = file;
-    const labels: [string, string][] = [
-      ["units", "Unit"],
-      ...FIELDS.map(([name, label]): [string, string] => [name, label]),
-    ];
-    const shown = labels
+    const shown = [["units", "Unit"] as const, ...FIELDS]
       .filter(([name]) => !isPicture || OF_PICTURES.includes(name))
       .map(([name, label]) => {
         const input = this.inputs.get(name)!;
@@ -125,12 +121,8 @@ export class ImportForm {
       button("Cancel", () => this.cancelled()),
     );
     const fields = h("div", { class: "fields" }, ...shown);
-    const level = (name: string): HTMLElement =>
-      h(
-        "li",
-        {},
-        button(name, () => this.sendLevel(name)),
-      );
+    const choices = levels.map((name) => button(name, () => this.sendLevel(name)));
+    const items = choices.map((choice) => h("li", {}, choice));
     show(
       byId("import-form"),
       h(
@@ -138,7 +130,7 @@ export class ImportForm {
         { open: isNeeded || factor !== null },
         h("summary", {}, heading),
         ...(levels.length > 0
-          ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...levels.map(level)), ask]
+          ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...items), ask]
           : isPicture
             ? [this.picture.element, ask, h("details", {}, h("summary", {}, "Other ways to state the scale"), fields)]
             : [fields, ask]),

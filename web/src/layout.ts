@@ -102,15 +102,8 @@ export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight
     lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![1]]) });
     const next = pieces[(index + 1) % pieces.length]!;
     const near = Math.min(distanceAt(piece.wall, piece.to), distanceAt(next.wall, piece.to));
-    const [floor, ceiling] = wallElevations(near, cameraHeight, room.ceiling_height_m);
-    if (pieces.length > 1)
-      lines.push({
-        kind: "edge",
-        points: [
-          [piece.to, floor],
-          [piece.to, ceiling],
-        ],
-      });
+    const corner = wallElevations(near, cameraHeight, room.ceiling_height_m);
+    if (pieces.length > 1) lines.push({ kind: "edge", points: corner.map((elevation) => [piece.to, elevation]) });
     lines.push(...openingLines(x, y, piece, room, cameraHeight));
   });
   return lines;
@@ -199,8 +192,14 @@ function unwrapped(angle: number, near: number): number {
 
 /** Return the room that contains a point, null in walls and outside. */
 export function roomAt(rooms: RoomLayout[], x: number, y: number): RoomLayout | null {
-  return rooms.find((room) => inside(room.polygon, x, y) && !room.holes.some((hole) => inside(hole, x, y))) ?? null;
+  return rooms.find((room) => isIn(room, x, y)) ?? null;
 }
+
+type Floor = { polygon: Point[]; holes?: Point[][] | null };
+
+/** Test whether a room contains a point. */
+export const isIn = ({ polygon, holes }: Floor, x: number, y: number): boolean =>
+  inside(polygon, x, y) && !(holes ?? []).some((hole) => inside(hole, x, y));
 
 /** Test whether a polygon contains a point, by the parity of crossings. */
 export function inside(polygon: Point[], x: number, y: number): boolean {

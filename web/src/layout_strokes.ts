@@ -37,7 +37,6 @@ export function strokeLines(context: CanvasRenderingContext2D, lines: SeenLine[]
   }
 }
 
-/** Create the legend of the lines. */
 export function linesLegend(): HTMLElement {
   return h(
     "ul",

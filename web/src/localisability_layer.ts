@@ -19,7 +19,6 @@ const SOFT_M2 = 1;
 const OPACITY = 0.92;
 
 export class LocalisabilityLayer {
-  /** The layer on the map. */
   readonly element = s("g");
   private readonly panel = byId("localisability");
   private readonly open = button("Will it work here?", () => void this.toggle(), {
@@ -182,20 +181,13 @@ export class LocalisabilityLayer {
       const cells = cellsOf(room, cell);
       return { ...cells, values: shadesOf(cells, found, found.rooms[index]!.id, condition) };
     });
-    show(
-      this.element,
-      roomPictures("localisability", fields, () => OPACITY),
-    );
+    const pictures = roomPictures("localisability", fields, () => OPACITY);
+    show(this.element, pictures);
   }
 }
 
 /** Return the probability of every cell, as in lalaloc_core/draw/heat.py: the mean of its room's places by distance. */
-function shadesOf(
-  { box, columns, rows }: Cells,
-  found: Localisability,
-  room: string,
-  condition: Condition,
-): Float64Array {
+function shadesOf({ box, columns, rows }: Cells, found: Localisability, room: string, condition: Condition) {
   const shades = new Float64Array(columns * rows).fill(found.probability[condition]);
   const places = found.places.filter((place) => place.room === room);
   if (places.length === 0) return shades;

@@ -7,17 +7,40 @@ import { labelOf, plainWords } from "./plain_words";
 
 export { InputError };
 
+// Plain words by the slugs of frequent errors; the service's own messages are written for developers.
+const PLAIN_TEXTS: Record<string, string> = {
+  "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
+  "foreign-features": "The service has another model than this page has loaded. Load the page again.",
+  "features-required":
+    "This service takes no photographs. Load the page again: it then computes features in the browser.",
+  overloaded: "The service is overloaded.",
+  "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
+};
+
+type Fields = Record<string, HTMLElement>;
+
+/** Do some work; show its error in an element, and mark the fields that cause it. */
+export async function attempt(place: HTMLElement, work: () => Promise<unknown>, fields: Fields = {}): Promise<void> {
+  clearError(place, fields);
+  try {
+    await work();
+  } catch (error) {
+    showError(place, error, fields);
+  }
+}
+
 /** Show an error in an element with the role alert and mark the fields that cause it. */
-export function showError(place: HTMLElement, error: unknown, fields: Record<string, HTMLElement> = {}): void {
+export function showError(place: HTMLElement, error: unknown, fields: Fields = {}): void {
   clearError(place, fields);
   const failure = error instanceof ServiceError ? error : null;
   const text = error instanceof Error ? error.message : String(error);
   const faults = failure?.faults ?? [];
   const title = failure?.title ?? (error instanceof InputError ? null : "Something went wrong");
+  const plain = PLAIN_TEXTS[failure?.slug ?? ""];
   show(
     place,
     title !== null && h("strong", {}, title),
-    h("p", {}, plainText(failure) ?? plainWords(failure?.detail ?? text)),
+    h("p", {}, plain ? `${plain} (${failure!.detail})` : plainWords(failure?.detail ?? text)),
     faults.length > 0 &&
       h(
         "ul",
@@ -51,7 +74,7 @@ export function showFieldError(place: HTMLElement, field: HTMLElement, text: str
 }
 
 /** Remove an error and its marks. */
-export function clearError(place: HTMLElement, fields: Record<string, HTMLElement> = {}): void {
+export function clearError(place: HTMLElement, fields: Fields = {}): void {
   place.hidden = true;
   show(place);
   for (const field of Object.values(fields)) {
@@ -66,21 +89,6 @@ export function clearErrors(): void {
     const marked = document.querySelectorAll<HTMLElement>(`[aria-describedby="${place.id}"]`);
     clearError(place, Object.fromEntries([...marked].entries()));
   }
-}
-
-/** Return plain words for frequent errors; the service's own messages are written for developers. */
-function plainText(failure: ServiceError | null): string | null {
-  if (failure === null) return null;
-  const words: Record<string, string> = {
-    "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
-    "foreign-features": "The service has another model than this page has loaded. Load the page again.",
-    "features-required":
-      "This service takes no photographs. Load the page again: it then computes features in the browser.",
-    overloaded: "The service is overloaded.",
-    "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
-  };
-  const text = words[failure.slug];
-  return text === undefined ? null : `${text} (${failure.detail})`;
 }
 
 let hide: number | undefined;

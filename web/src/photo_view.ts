@@ -1,7 +1,7 @@
 /** Photograph, full spheres in a viewer, with the lines of the layout over it. */
 
 import { throughCamera } from "./camera";
-import { button, h, show } from "./dom";
+import { ARROWS, button, h, show } from "./dom";
 import { type LayoutLine, radians } from "./layout";
 import { linesLegend, strokeLines } from "./layout_strokes";
 import { InputError } from "./notices";
@@ -174,16 +174,10 @@ export class PhotoView {
 
   private onKey(event: KeyboardEvent): void {
     if (this.sphere === null || this.shape !== "around") return;
-    const turns: Record<string, Point> = {
-      ArrowLeft: [-TURN_BY, 0],
-      ArrowRight: [TURN_BY, 0],
-      ArrowUp: [0, TURN_BY],
-      ArrowDown: [0, -TURN_BY],
-    };
     const zooms: Record<string, number> = { "+": 10, "=": 10, "-": -10 };
-    const turn = turns[event.key],
+    const arrow = ARROWS[event.key],
       zoom = zooms[event.key];
-    if (turn !== undefined) this.sphere.turnBy(...turn);
+    if (arrow !== undefined) this.sphere.turnBy(TURN_BY * arrow[0], TURN_BY * arrow[1]);
     else if (zoom !== undefined) this.sphere.zoomBy(zoom);
     else return;
     event.preventDefault();
@@ -215,8 +209,8 @@ export class PhotoView {
 
   private projected(line: LayoutLine, shape: Shape, size: Size): Point[][] {
     const relative = line.points.map(([azimuth, elevation]): Point => [azimuth - this.heading, elevation]);
-    if (shape === "flat") return this.view === null ? [] : throughCamera([relative], this.view, this.flatSize(size));
-    return shape === "around" ? perspective([relative], this.gaze(), size) : equirectangular([relative], size);
+    if (shape === "flat") return this.view === null ? [] : throughCamera(relative, this.view, this.flatSize(size));
+    return shape === "around" ? perspective(relative, this.gaze(), size) : equirectangular(relative, size);
   }
 
   /** Return the size of a flat photograph, which the stage contains. */

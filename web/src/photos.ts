@@ -1,11 +1,11 @@
 /** Photographs with their settings and answers. */
 
 import { Compass } from "./compass";
-import { byId, h, show } from "./dom";
-import { acceptDrops, isPicture } from "./drops";
+import { button, byId, h, show } from "./dom";
+import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { NO_HINTS } from "./hints";
 import { clearErrors, InputError, showError } from "./notices";
-import type { Answer, Hints, Together } from "./types";
+import type { Answer, Hints } from "./types";
 
 export interface Photo {
   file: File;
@@ -20,12 +20,6 @@ export interface Photo {
   direction: number | null;
   /** Fields and photographs of the latest query, for code snippets. */
   asked: { fields: Record<string, string>; files: File[]; onDevice: boolean };
-}
-
-/** Photographs of one visit that are localised together. */
-export interface Group {
-  motion: Together["motion"];
-  photos: readonly Photo[];
 }
 
 // Fields of the form by their names in the request.
@@ -50,8 +44,10 @@ export class Photos {
     NAMES.map((name) => [name, byId<HTMLInputElement | HTMLSelectElement>(SETTINGS[name])]),
   ) as Record<Setting, HTMLInputElement | HTMLSelectElement>;
   private readonly choice = byId<HTMLFieldSetElement>("together");
+  private readonly isTurn = this.choice.querySelector<HTMLInputElement>("input[value=turn]")!;
   private readonly all: Photo[] = [];
-  private chosen: Photo | null = null;
+  /** The chosen photograph. */
+  current: Photo | null = null;
 
   /** `changed` is called when another photograph is chosen or its settings change. */
   constructor(private readonly changed: (photo: Photo | null, isOther: boolean) => void) {
@@ -62,16 +58,8 @@ export class Photos {
     byId("compass-place").append(this.compass.element);
     for (const field of Object.values(this.inputs)) field.addEventListener("input", () => this.read());
     this.choice.addEventListener("change", () => this.onMotion());
-    const input = byId<HTMLInputElement>("photo-file");
-    input.addEventListener("change", () => {
-      this.add([...(input.files ?? [])]);
-      input.value = "";
-    });
+    acceptChoice(byId("photo-file"), (files) => this.add(files));
     acceptDrops(byId("photo-panel"), (files) => this.add(files));
-  }
-
-  get current(): Photo | null {
-    return this.chosen;
   }
 
   get list(): readonly Photo[] {
@@ -82,12 +70,9 @@ export class Photos {
     return { ...this.inputs, headings_deg: this.inputs.heading_deg };
   }
 
-  /** All photographs, if they are to be localised together; null if each is localised by itself. */
-  get group(): Group | null {
-    const motion = this.choice.hidden
-      ? ""
-      : (this.choice.querySelector<HTMLInputElement>("input:checked")?.value ?? "");
-    return motion === "turn" ? { motion, photos: this.all } : null;
+  /** All photographs, if they are to be localised together as a turn; null if each is localised by itself. */
+  get group(): readonly Photo[] | null {
+    return !this.choice.hidden && this.isTurn.checked ? this.all : null;
   }
 
   /** Add pictures and choose the first of them; those of examples give way to the user's own. */
@@ -107,7 +92,7 @@ export class Photos {
         asked: { fields: {}, files: [file], onDevice: false },
       }));
     if (added.length > 0) this.forgetGroup();
-    if (added.length > 0 && !isExample) this.discardExamples();
+    if (added.length > 0 && !isExample) this.discard(this.all.filter((photo) => photo.isExample));
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
     if (rejected.length === 0) return;
@@ -119,12 +104,8 @@ export class Photos {
   takeTurn(frames: File[], directions: readonly number[] | null): void {
     this.discard(this.all);
     this.add(frames, false, directions);
-    this.choice.querySelector<HTMLInputElement>("input[value=turn]")!.checked = true;
+    this.isTurn.checked = true;
     this.onMotion();
-  }
-
-  private discardExamples(): void {
-    this.discard(this.all.filter(({ isExample }) => isExample));
   }
 
   private discard(photos: readonly Photo[]): void {
@@ -134,9 +115,8 @@ export class Photos {
     }
   }
 
-  /** Choose a photograph, or none. */
   choose(photo: Photo | null): void {
-    this.chosen = photo;
+    this.current = photo;
     for (const name of NAMES) this.inputs[name].value = photo?.settings[name] ?? "";
     this.showHeading();
     byId("photo-settings").toggleAttribute("disabled", photo === null);
@@ -150,52 +130,49 @@ export class Photos {
     this.drawStrip();
   }
 
-  /** Remove all hints. */
   forgetHints(): void {
     for (const photo of this.all) photo.hints = NO_HINTS;
   }
 
-  /** Set the hints of the chosen photograph. */
   setHints(hints: Hints): void {
-    if (this.chosen === null) return;
-    this.chosen.hints = hints;
-    this.onChanged(this.chosen);
+    if (this.current === null) return;
+    this.current.hints = hints;
+    this.onChanged(this.current);
   }
 
   private remove(photo: Photo): void {
     const index = this.all.indexOf(photo);
-    this.all.splice(index, 1);
-    URL.revokeObjectURL(photo.url);
+    this.discard([photo]);
     this.forgetGroup();
-    if (photo === this.chosen) this.choose(this.all[Math.min(index, this.all.length - 1)] ?? null);
+    if (photo === this.current) this.choose(this.all[Math.min(index, this.all.length - 1)] ?? null);
     else {
       this.drawStrip();
-      this.changed(this.chosen, false);
+      this.changed(this.current, false);
     }
   }
 
   /** Show the heading in the form on the compass. */
   private showHeading(): void {
-    const heading = this.chosen?.settings.heading_deg;
+    const heading = this.current?.settings.heading_deg;
     this.compass.set(heading === undefined ? null : Number(heading));
   }
 
   /** Settings that all photographs of a group share: those of the camera. */
   private get shared(): Photo["settings"] {
-    if (this.group === null || this.chosen === null) return {};
-    const { heading_deg: _, ...shared } = this.chosen.settings;
+    if (this.group === null || this.current === null) return {};
+    const { heading_deg: _, ...shared } = this.current.settings;
     return shared;
   }
 
   private read(): void {
-    if (this.chosen === null) return;
+    if (this.current === null) return;
     const given = NAMES.map((name) => [name, this.inputs[name].value.trim()] as const).filter(
       ([, value]) => value !== "",
     );
-    this.chosen.settings = Object.fromEntries(given);
+    this.current.settings = Object.fromEntries(given);
     this.share();
     this.showHeading();
-    this.onChanged(this.chosen);
+    this.onChanged(this.current);
   }
 
   private share(): void {
@@ -211,7 +188,7 @@ export class Photos {
     this.share();
     this.forgetGroup();
     this.drawStrip();
-    if (this.chosen !== null) this.onChanged(this.chosen);
+    if (this.current !== null) this.onChanged(this.current);
   }
 
   private onChanged(photo: Photo): void {
@@ -239,18 +216,14 @@ export class Photos {
           {
             type: "button",
             class: "thumb",
-            "aria-pressed": String(photo === this.chosen),
+            "aria-pressed": String(photo === this.current),
             "aria-label": `Photograph ${name}${photo.answer === null ? "" : `, found in ${photo.answer.room}`}`,
             onclick: () => this.choose(photo),
           },
           h("img", { src: photo.url, alt: "" }),
           h("span", {}, photo.answer === null ? name : `✓ ${photo.answer.room}`),
         );
-        const remove = h(
-          "button",
-          { type: "button", class: "remove", "aria-label": `Remove ${name}`, onclick: () => this.remove(photo) },
-          "×",
-        );
+        const remove = button("×", () => this.remove(photo), { class: "remove", "aria-label": `Remove ${name}` });
         return h("li", {}, choose, remove);
       }),
     );

@@ -1,8 +1,9 @@
 /** Scale of a picture: two points and the distance between them. */
 
 import { ARROWS, followPointer, h, s, show } from "./dom";
-import { unitOf } from "./plan_drawing";
-import { clearError, InputError, showFieldError } from "./notices";
+import { ends, unitOf } from "./plan_drawing";
+import { clearError, showFieldError } from "./notices";
+import { loadPicture } from "./pictures";
 import { placeOf } from "./pose_marker";
 import type { Point } from "./types";
 import { Viewport } from "./viewport";
@@ -69,19 +70,10 @@ export class PictureScale {
   /** Show a picture. Rejects if the file is not one. */
   async open(file: File): Promise<void> {
     this.close();
-    const url = URL.createObjectURL(file);
-    const picture = new Image();
-    picture.src = url;
-    try {
-      await picture.decode();
-    } catch {
-      URL.revokeObjectURL(url);
-      throw new InputError(`The browser cannot show “${file.name}” as a picture.`);
-    }
-    this.url = url;
-    const width = picture.naturalWidth,
-      height = picture.naturalHeight;
-    show(this.picture, s("image", { href: url, x: 0, y: 0, width, height }));
+    const picture = await loadPicture(file, `The browser cannot show “${file.name}” as a picture.`);
+    const { src, naturalWidth: width, naturalHeight: height } = picture;
+    this.url = src;
+    show(this.picture, s("image", { href: src, x: 0, y: 0, width, height }));
     this.ends = [
       [0.25 * width, -0.5 * height],
       [0.75 * width, -0.5 * height],
@@ -123,13 +115,12 @@ export class PictureScale {
 
   private draw(): void {
     if (this.url === null) return;
-    const size = unitOf(this.viewport.current),
-      [[ax, ay], [bx, by]] = this.ends;
+    const size = unitOf(this.viewport.current);
     const focused = [...this.overlay.children].indexOf(document.activeElement as Element);
     show(
       this.overlay,
       this.frame !== null && this.frameBox(this.frame),
-      s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }),
+      s("line", ends(this.ends)),
       ...this.ends.map((end, index) => this.handle(end, index, size)),
     );
     if (focused > 0) (this.overlay.children[focused] as SVGElement).focus();

@@ -1,7 +1,7 @@
-/** Pictures to save: the map as it is shown, and an answer with its photograph. */
+/** Pictures: loaded from files, and saved, the map as it is shown, and an answer with its photograph. */
 
-import { byId, download } from "./dom";
-import { clearError, InputError, showError } from "./notices";
+import { byId, download, h } from "./dom";
+import { attempt, InputError } from "./notices";
 
 // Pixels of the longer side, and properties that style sheets set.
 const PIXELS = 2400;
@@ -25,12 +25,22 @@ const STYLES = [
   "visibility",
 ];
 
+/** Load a picture, whose address is to be revoked after use. Rejects with a message if the browser cannot show the file. */
+export async function loadPicture(file: Blob, message: string): Promise<HTMLImageElement> {
+  const picture = new Image();
+  picture.src = URL.createObjectURL(file);
+  try {
+    await picture.decode();
+  } catch {
+    URL.revokeObjectURL(picture.src);
+    throw new InputError(message);
+  }
+  return picture;
+}
+
 /** Save the map with a click on its button; `name` returns the name of the plan. */
 export function connectSaveMap(map: SVGSVGElement, name: () => string): void {
-  byId("save-map").addEventListener("click", () => {
-    clearError(byId("plan-error"));
-    saveMap(map, name()).catch((error: unknown) => showError(byId("plan-error"), error));
-  });
+  byId("save-map").addEventListener("click", () => void attempt(byId("plan-error"), () => saveMap(map, name())));
 }
 
 /** Save an answer as the page shows it: the photograph with the layout, null without one, the map, and a caption. */
@@ -45,9 +55,8 @@ export async function savePicture(
   const parts = photo === null ? [below] : [photo, below];
   const heights = parts.map((part) => Math.round((part.height * width) / part.width));
   const line = Math.round(width / 40);
-  const canvas = document.createElement("canvas");
-  canvas.width = width;
-  canvas.height = heights.reduce((sum, height) => sum + height, 0) + Math.round((caption.length + 0.6) * 1.4 * line);
+  const height = heights.reduce((sum, own) => sum + own, 0) + Math.round((caption.length + 0.6) * 1.4 * line);
+  const canvas = h("canvas", { width, height });
   const context = canvas.getContext("2d")!,
     { color, fontFamily } = getComputedStyle(document.documentElement);
   context.fillStyle = getComputedStyle(map.parentElement!).backgroundColor;
@@ -72,18 +81,10 @@ async function saveMap(map: SVGSVGElement, name: string): Promise<void> {
 async function mapCanvas(map: SVGSVGElement, pixels: number): Promise<HTMLCanvasElement> {
   const { width, height } = map.getBoundingClientRect(),
     scale = pixels / Math.max(width, height);
-  const picture = new Image();
-  picture.src = URL.createObjectURL(new Blob([standalone(map, scale)], { type: "image/svg+xml" }));
-  try {
-    await picture.decode();
-  } catch {
-    throw new InputError("The browser cannot draw the map as a picture.");
-  } finally {
-    URL.revokeObjectURL(picture.src);
-  }
-  const canvas = document.createElement("canvas");
-  canvas.width = Math.round(scale * width);
-  canvas.height = Math.round(scale * height);
+  const file = new Blob([standalone(map, scale)], { type: "image/svg+xml" });
+  const picture = await loadPicture(file, "The browser cannot draw the map as a picture.");
+  URL.revokeObjectURL(picture.src);
+  const canvas = h("canvas", { width: Math.round(scale * width), height: Math.round(scale * height) });
   const context = canvas.getContext("2d")!;
   context.fillStyle = getComputedStyle(map.parentElement!).backgroundColor;
   context.fillRect(0, 0, canvas.width, canvas.height);

@@ -2,9 +2,9 @@
 
 import { api } from "./api";
 import { button, byId, download, h, named, s, show } from "./dom";
-import { acceptDrops, isPicture } from "./drops";
+import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
-import { clearError, InputError, say, showError } from "./notices";
+import { attempt, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { choicesOf, Floors, type Row } from "./pin_floors";
@@ -58,8 +58,9 @@ class PinPage {
     this.svg.append(this.base, this.names, this.pins);
     this.choice.addEventListener("change", () => void this.guarded(() => this.choose(this.choice.value)));
     this.levels.addEventListener("change", () => void this.guarded(() => this.showPlan(this.levels.value)));
-    this.onFiles("plan-file", ([file]) => this.upload(file!));
-    for (const id of ["photo-files", "photo-folder"]) this.onFiles(id, (files) => this.add(files));
+    acceptChoice(byId("plan-file"), ([file]) => void this.guarded(() => this.upload(file!)));
+    for (const id of ["photo-files", "photo-folder"])
+      acceptChoice(byId(id), (files) => void this.guarded(() => this.add(files)));
     acceptDrops(byId("folder"), (files) => void this.guarded(() => this.addAny(files)));
     acceptDrops(byId("place"), (files) => void this.guarded(() => this.addAny(files, files.length === 1)));
     this.filter.addEventListener("change", () => this.draw());
@@ -92,23 +93,7 @@ class PinPage {
     } else if (floorplans.length > 0) await this.choose(`plan:${floorplans[0]!.id}`);
   }
 
-  private onFiles(id: string, act: (files: File[]) => Promise<void>): void {
-    const input = byId<HTMLInputElement>(id);
-    input.addEventListener("change", () => {
-      const files = [...(input.files ?? [])];
-      input.value = "";
-      if (files.length > 0) void this.guarded(() => act(files));
-    });
-  }
-
-  private async guarded(work: () => Promise<void>): Promise<void> {
-    clearError(this.error);
-    try {
-      await work();
-    } catch (failure) {
-      showError(this.error, failure);
-    }
-  }
+  private readonly guarded = (work: () => Promise<void>): Promise<void> => attempt(this.error, work);
 
   /** Begin a choice; the returned function says whether it is still the last one: answers can overtake each other. */
   private request(): () => boolean {
@@ -280,11 +265,7 @@ class PinPage {
     });
   }
 
-  private async correct(
-    row: Pick<Row, "id" | "correction">,
-    correction: Correction | null,
-    isUndo = false,
-  ): Promise<void> {
+  private async correct(row: Row, correction: Correction | null, isUndo = false): Promise<void> {
     if (this.album === null) return;
     await api.correctPhotograph(this.album.id, row.id, correction as Schemas["CorrectionDocument"] | null);
     if (!isUndo) this.done.push({ id: row.id, before: row.correction });
@@ -311,13 +292,12 @@ class PinPage {
       this.pins,
       this.shown === null ? [] : this.pinsOf(shown, this.shown, { move: this.move, show: this.actions.show }),
     );
-    const groups = GROUPS.map(([title, states]) => {
+    const groups = GROUPS.flatMap(([title, states]) => {
       const own = shown.filter(({ pin }) => (states as readonly string[]).includes(pin?.state ?? "waiting"));
-      return (
-        own.length > 0 && [h("h3", {}, `${title} (${own.length})`), h("ul", {}, ...own.map((row) => this.card(row)))]
-      );
+      if (own.length === 0) return [];
+      return [h("h3", {}, `${title} (${own.length})`), h("ul", {}, ...own.map((row) => this.card(row)))];
     });
-    show(byId("photographs"), ...groups.flatMap((group) => group || []));
+    show(byId("photographs"), ...groups);
     if (focused && document.activeElement?.id !== focused)
       document.getElementById(focused)?.focus({ preventScroll: true });
     const moved = this.rows.map(movedOf).filter((text) => text !== null);
@@ -339,11 +319,8 @@ class PinPage {
     const kinds = Object.entries(FILES).map(([name, media]) =>
       button(name, () => void this.guarded(() => save(name, media))),
     );
-    show(
-      place,
-      ...kinds,
-      button("Print", () => print()),
-    );
+    const paper = button("Print", () => print());
+    show(place, ...kinds, paper);
   }
 
   /** Return the pins in a plan; without actions, for paper. */

@@ -42,14 +42,8 @@ export function movedOf({ number, name, pin }: Row): string | null {
   return `${number} ${name ?? ""}: ${[rooms, way].filter(Boolean).join(", ")}`;
 }
 
-/** Return a photograph with the walls seen from a place over it. */
-export function shotOf(
-  row: Row,
-  picture: Thumbnail | null,
-  place: PinnedAt | null,
-  floors: Floors,
-  height: number | null,
-) {
+/** Return a photograph with the walls over it that are seen from its pin, or from another place by `draw`. */
+export function shotOf(row: Row, picture: Thumbnail | null, floors: Floors, height: number | null) {
   if (picture === null)
     return Object.assign(h("div", { class: "shot none" }, "No preview"), {
       draw: (_: PinnedAt | null): void => undefined,
@@ -65,20 +59,21 @@ export function shotOf(
       points.map(([azimuth, elevation]): Point => [radians(((degrees(azimuth - turn) + 540) % 360) - 180), elevation]),
     );
     const isSphere = row.view.projection === "equirectangular";
-    const drawn = isSphere ? equirectangular(lines, size) : throughCamera(lines, row.view, size);
+    const drawn = lines.flatMap((line) =>
+      isSphere ? equirectangular(line, size) : throughCamera(line, row.view, size),
+    );
     const d = drawn.map((line) => `M${line.map((point) => point.join(" ")).join("L")}`).join("");
     over.replaceChildren(s("path", { class: "dark", d }), s("path", { d }));
   };
-  draw(place);
+  draw(row.pin?.place ?? null);
   const element = h("div", { class: "shot" }, h("img", { src: picture.url, alt: "", loading: "lazy" }), over);
   return Object.assign(element, { draw });
 }
 
-/** Return the card of a photograph. */
 export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, height: number | null, act: CardActions) {
   const { pin } = row,
     place = pin?.place ?? null;
-  const shot = shotOf(row, picture, place, floors, height);
+  const shot = shotOf(row, picture, floors, height);
   const isOpen = pin !== null && pin.state !== "corrected" && row.correction === null;
   const choices = isOpen ? pin.suggestions : [];
   const preview = (at: PinnedAt | null) => (): void => shot.draw(at);

@@ -27,7 +27,6 @@ export class Floors {
   /** The venue; null for one plan. */
   venue: string | null = null;
 
-  /** Begin with a plan. */
   async takePlan(plan: Plan): Promise<void> {
     this.venue = null;
     this.levels = [];

@@ -40,14 +40,7 @@ export function pinOf(row: Row, radius: number, svg: SVGSVGElement, act: PinActi
     begin.preventDefault();
     begin.stopPropagation();
     pin.focus();
-    followPointer((event) => moved(placeOf(svg, event)));
-    const end = (): void => {
-      removeEventListener("pointerup", end);
-      removeEventListener("pointercancel", end);
-      done();
-    };
-    addEventListener("pointerup", end);
-    addEventListener("pointercancel", end);
+    followPointer((event) => moved(placeOf(svg, event)), done);
   };
   pin.addEventListener("pointerdown", (event) => {
     let target: Point | null = null;

@@ -20,7 +20,7 @@ export function showPages(
     h(
       "li",
       {},
-      shotOf(row, thumbnails.get(row.id) ?? null, row.pin?.place ?? null, floors, height),
+      shotOf(row, thumbnails.get(row.id) ?? null, floors, height),
       h("p", {}, arrowOf(row), h("strong", {}, ` ${row.number} ${row.name ?? ""}`)),
       h("p", {}, [row.view.taken_at?.replace("T", " ").slice(0, 16), factsOf(row)].filter(Boolean).join(" · ")),
     );

@@ -18,22 +18,27 @@ const WALL_M = 0.12;
 /** Return the areas of the plan's file that became no room. */
 export const lostAreas = (plan: Plan | null): Point[][] => plan?.import_report?.no_room ?? [];
 
+/** Return the smallest and the largest coordinates of points. */
+export function extentOf(points: Point[]) {
+  const xs = points.map(([x]) => x),
+    ys = points.map(([, y]) => y);
+  return { left: Math.min(...xs), right: Math.max(...xs), low: Math.min(...ys), high: Math.max(...ys) };
+}
+
 /** Return the box around a plan and areas that became no room, with a margin. */
 export function boxOf(plan: PlanDocument, lost: Point[][] = []): Box {
   const points = [...plan.rooms.map((room) => room.polygon), ...lost].flat();
   if (points.length === 0) return { x: -1, y: -9, width: 12, height: 10 };
-  const xs = points.map(([x]) => x),
-    ys = points.map(([, y]) => -y);
-  const x = Math.min(...xs),
-    y = Math.min(...ys);
-  const width = Math.max(...xs) - x,
-    height = Math.max(...ys) - y;
-  const margin = MARGIN * Math.max(width, height, 1);
-  return { x: x - margin, y: y - margin, width: width + 2 * margin, height: height + 2 * margin };
+  const { left, right, low, high } = extentOf(points),
+    margin = MARGIN * Math.max(right - left, high - low, 1);
+  return { x: left - margin, y: -high - margin, width: right - left + 2 * margin, height: high - low + 2 * margin };
 }
 
 export const path = (polygon: Point[]): string =>
   polygon.map(([x, y], index) => `${index === 0 ? "M" : "L"}${x} ${-y}`).join("") + "Z";
+
+/** Return the attributes of a line. */
+export const ends = ([[ax, ay], [bx, by]]: [Point, Point]) => ({ x1: ax, y1: -ay, x2: bx, y2: -by });
 
 /** Return the unit for texts and handles, which have the same size on every plan. */
 export const unitOf = (box: Box): number => Math.max(box.width, box.height) / 100;
@@ -44,9 +49,9 @@ export function drawPlan(group: SVGGElement, plan: PlanDocument, lost: Point[][]
     const whole = path(room.polygon) + (room.holes ?? []).map(path).join("");
     return s("path", { class: `room ${room.type ?? "unknown"}`, d: whole, "fill-rule": "evenodd" });
   });
-  const walls = plan.rooms.flatMap((room) =>
-    (room.walls ?? []).map(([a, b]) => s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })),
-  );
+  const walls = plan.rooms
+    .flatMap((room) => room.walls ?? [])
+    .map((wall) => s("line", { class: "wall", ...ends(wall) }));
   // Walls are strokes around floors; the strokes of adjacent rooms meet.
   const solid = s("path", {
     class: "solid",
@@ -70,10 +75,7 @@ export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box, lost
   show(
     group,
     ...[...named, ...lost.map((area): [Point[], string] => [area, "no room"])].flatMap(([polygon, name]) => {
-      const {
-        place: [x, y],
-        clearance,
-      } = labelPlace(polygon);
+      const [[x, y], clearance] = labelPlace(polygon);
       const size = Math.min(2.2 * unit, (3.4 * clearance) / Math.max(name.length, 4));
       return size < 0.8 * unit
         ? []
@@ -85,8 +87,7 @@ export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box, lost
 }
 
 function openingShape(opening: OpeningDocument): SVGGElement {
-  const [[ax, ay], [bx, by]] = opening.line;
-  const line = { x1: ax, y1: -ay, x2: bx, y2: -by };
+  const line = ends(opening.line);
   // A wall-wide stroke in the colour of the floor interrupts the wall.
   return s(
     "g",
@@ -99,30 +100,24 @@ function openingShape(opening: OpeningDocument): SVGGElement {
 const RASTER = 24;
 
 /** Return the raster point farthest from the walls of a room, and its distance to them. */
-export function labelPlace(polygon: Point[]): { place: Point; clearance: number } {
-  const xs = polygon.map(([x]) => x),
-    ys = polygon.map(([, y]) => y);
-  const left = Math.min(...xs),
-    low = Math.min(...ys);
-  const width = Math.max(...xs) - left,
-    height = Math.max(...ys) - low;
-  let best: { place: Point; clearance: number } = { place: polygon[0]!, clearance: -1 };
+function labelPlace(polygon: Point[]): [Point, number] {
+  const { left, right, low, high } = extentOf(polygon);
+  let best: [Point, number] = [polygon[0]!, -1];
   for (let row = 1; row < RASTER; row++) {
     for (let column = 1; column < RASTER; column++) {
-      const place: Point = [left + (width * column) / RASTER, low + (height * row) / RASTER];
+      const place: Point = [left + ((right - left) * column) / RASTER, low + ((high - low) * row) / RASTER];
       if (!inside(polygon, ...place)) continue;
       const clearance = Math.min(
         ...polygon.map((from, index) => distanceTo(place, from, polygon[(index + 1) % polygon.length]!)),
       );
       // Prefer the centre among equally good points.
       const aside = Math.hypot(column / RASTER - 0.5, row / RASTER - 0.5);
-      if (clearance * (1 - 0.1 * aside) > best.clearance) best = { place, clearance };
+      if (clearance * (1 - 0.1 * aside) > best[1]) best = [place, clearance];
     }
   }
   return best;
 }
 
-/** Return the distance of a point to a segment. */
 export function distanceTo([x, y]: Point, [ax, ay]: Point, [bx, by]: Point): number {
   const ex = bx - ax,
     ey = by - ay,

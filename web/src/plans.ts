@@ -2,12 +2,12 @@
 
 import type { ImportStep } from "../../clients/typescript/src/index";
 import { api, ServiceError } from "./api";
-import { button, byId, h, show } from "./dom";
-import { acceptDrops } from "./drops";
-import { followPlan } from "./events";
+import { button, byId, confirmed, h, planButton, show } from "./dom";
+import { acceptChoice, acceptDrops } from "./drops";
+import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
 import { checkPixels, hasOptions, ImportForm } from "./import_form";
-import { clearError, say, showError } from "./notices";
+import { attempt, clearError, say, showError } from "./notices";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 /** True if the import guessed nothing that the user may want to correct. */
@@ -74,14 +74,9 @@ export class Plans {
     this.connectMenu();
     byId("example-flat").addEventListener("click", () => (this.pending = this.pickExample(FLAT)));
     byId("example-rooms").addEventListener("click", () => (this.pending = this.pickExample(ROOMS)));
-    const input = byId<HTMLInputElement>("plan-file");
-    input.addEventListener("change", () => {
-      const file = input.files?.[0];
-      input.value = "";
+    acceptChoice(byId("plan-file"), ([file]) => void this.begin(file!));
+    acceptDrops(byId("plan-panel"), ([file]) => {
       if (file !== undefined) void this.begin(file);
-    });
-    acceptDrops(byId("plan-panel"), (files) => {
-      if (files[0] !== undefined) void this.begin(files[0]);
     });
   }
 
@@ -112,7 +107,6 @@ export class Plans {
     return this.found;
   }
 
-  /** Choose a plan by its id. */
   choose(id: string, revision?: string): Promise<Plan | null> {
     const chosen = this.open(id, revision);
     this.pending = chosen;
@@ -164,7 +158,6 @@ export class Plans {
     this.take(null);
   }
 
-  /** Show a plan. */
   take(plan: Plan | null): void {
     this.current = plan;
     this.actions.chosen(plan);
@@ -196,7 +189,6 @@ export class Plans {
     this.importing.close();
   }
 
-  /** Upload a file as a new plan. */
   async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
     clearError(this.error, this.importing.fields);
     // The form of the previous file does not apply to this one.
@@ -246,20 +238,16 @@ export class Plans {
   }
 
   private async follow(plan: Plan): Promise<void> {
-    const own = (this.following = new AbortController());
+    const { signal } = (this.following = new AbortController());
     try {
-      await followPlan(
-        plan.id,
-        (event) => {
-          if (this.current?.id !== plan.id) return;
-          if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
-          else if (event.status === "deleted") this.showNone();
-          else void this.renew(plan.id);
-        },
-        own.signal,
-      );
+      for await (const event of eventsOf(plan.id, signal)) {
+        if (this.current?.id !== plan.id) continue;
+        if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
+        else if (event.status === "deleted") this.showNone();
+        else void this.renew(plan.id);
+      }
     } catch (error) {
-      if (!own.signal.aborted) showError(this.error, error);
+      if (!signal.aborted) showError(this.error, error);
     }
   }
 
@@ -283,32 +271,14 @@ export class Plans {
   }
 
   private async remove(plan: PlanSummary): Promise<void> {
-    if (!(await this.confirm(plan))) return;
-    clearError(this.error);
-    try {
+    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions? This cannot be undone.`;
+    if (!(await confirmed("delete-dialog", "delete"))) return;
+    await attempt(this.error, async () => {
       await api.deletePlan(plan.id);
       say(`“${plan.name}” is deleted.`);
       if (this.current?.id === plan.id) this.showNone();
       await this.load();
-    } catch (error) {
-      showError(this.error, error);
-    }
-  }
-
-  private confirm(plan: PlanSummary): Promise<boolean> {
-    const dialog = byId<HTMLDialogElement>("delete-dialog");
-    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions? This cannot be undone.`;
-    dialog.showModal();
-    return new Promise((resolve) =>
-      dialog.addEventListener(
-        "close",
-        () => {
-          resolve(dialog.returnValue === "delete");
-          dialog.returnValue = "";
-        },
-        { once: true },
-      ),
-    );
+    });
   }
 
   private draw(): void {
@@ -320,22 +290,12 @@ export class Plans {
             ? "failed"
             : "";
       const facts = [`${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}`, `${plan.area_m2.toFixed(0)} m²`, state];
-      const choose = h(
-        "button",
-        {
-          type: "button",
-          class: "plan",
-          "aria-pressed": String(plan.id === this.current?.id),
-          onclick: () => this.pick(plan.id),
-        },
-        h("span", { class: "name" }, plan.name),
-        h("span", { class: "facts" }, facts.filter(Boolean).join(", ")),
-      );
-      const remove = h(
-        "button",
-        { type: "button", class: "remove", "aria-label": `Delete ${plan.name}`, onclick: () => void this.remove(plan) },
-        "×",
-      );
+      const isChosen = plan.id === this.current?.id;
+      const choose = planButton(plan.name, facts.filter(Boolean).join(", "), isChosen, () => this.pick(plan.id));
+      const remove = button("×", () => void this.remove(plan), {
+        class: "remove",
+        "aria-label": `Delete ${plan.name}`,
+      });
       return h("li", {}, choose, remove);
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));

@@ -1,6 +1,6 @@
 /** Camera marker on the plan, moved with pointer or keyboard. */
 
-import { byId, followPointer, s } from "./dom";
+import { ARROWS, byId, followPointer, s } from "./dom";
 import { degrees, radians } from "./layout";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Point, Pose } from "./types";
@@ -123,19 +123,13 @@ export class PoseMarker {
 
   private onKey(event: KeyboardEvent): void {
     const step = event.shiftKey ? FAR_STEP_M : STEP_M;
-    const steps: Record<string, Point> = {
-      ArrowLeft: [-step, 0],
-      ArrowRight: [step, 0],
-      ArrowUp: [0, step],
-      ArrowDown: [0, -step],
-    };
     const turns: Record<string, number> = { ",": -TURN_DEG, ".": TURN_DEG };
-    const moved = steps[event.key],
+    const arrow = ARROWS[event.key],
       turned = turns[event.key];
-    if (moved === undefined && turned === undefined) return;
+    if (arrow === undefined && turned === undefined) return;
     event.preventDefault();
     const { x_m, y_m, heading_deg } = this.pose,
-      [dx, dy] = moved ?? [0, 0];
-    this.move({ x_m: x_m + dx, y_m: y_m + dy, heading_deg: (heading_deg + (turned ?? 0) + 360) % 360 });
+      [dx, dy] = arrow ?? [0, 0];
+    this.move({ x_m: x_m + step * dx, y_m: y_m + step * dy, heading_deg: (heading_deg + (turned ?? 0) + 360) % 360 });
   }
 }

@@ -17,8 +17,8 @@ export interface Size {
 const NEAR = 0.02;
 type Vector = [number, number, number];
 
-/** Project lines of (yaw, elevation) as a camera sees them; parts behind it are cut off. */
-export function perspective(lines: Point[][], gaze: Gaze, size: Size): Point[][] {
+/** Project a line of (yaw, elevation) as a camera sees it; parts behind it are cut off. */
+export function perspective(line: Point[], gaze: Gaze, size: Size): Point[][] {
   const focal = (0.5 * size.height) / Math.tan(0.5 * gaze.verticalFov);
   const sine = Math.sin(gaze.pitch),
     cosine = Math.cos(gaze.pitch);
@@ -32,7 +32,7 @@ export function perspective(lines: Point[][], gaze: Gaze, size: Size): Point[][]
     0.5 * size.width + (focal * right) / forward,
     0.5 * size.height - (focal * up) / forward,
   ];
-  return lines.flatMap((line) => inFront(line.map(turned)).map((piece) => piece.map(onScreen)));
+  return inFront(line.map(turned)).map((piece) => piece.map(onScreen));
 }
 
 function inFront(line: Vector[]): Vector[][] {
@@ -54,25 +54,23 @@ function inFront(line: Vector[]): Vector[][] {
   return pieces;
 }
 
-/** Project the same lines to the flat picture; lines that cross its edge are cut in two. */
-export function equirectangular(lines: Point[][], size: Size): Point[][] {
+/** Project the same line to the flat picture; one that crosses its edge is cut in two. */
+export function equirectangular(line: Point[], size: Size): Point[][] {
   const place = ([yaw, elevation]: Point, turns: number): Point => [
     ((yaw - turns * 2 * Math.PI) / (2 * Math.PI) + 0.5) * size.width,
     (0.5 - elevation / Math.PI) * size.height,
   ];
   const turnOf = ([yaw]: Point): number => Math.floor((yaw + Math.PI) / (2 * Math.PI));
-  return lines.flatMap((line) => {
-    const pieces: Point[][] = [[]];
-    line.forEach((point, index) => {
-      const turn = turnOf(point),
-        previous = line[index - 1];
-      if (previous !== undefined && turnOf(previous) !== turn) {
-        // Both parts continue beyond their edge of the canvas.
-        pieces.at(-1)!.push(place(point, turnOf(previous)));
-        pieces.push([place(previous, turn)]);
-      }
-      pieces.at(-1)!.push(place(point, turn));
-    });
-    return pieces;
+  const pieces: Point[][] = [[]];
+  line.forEach((point, index) => {
+    const turn = turnOf(point),
+      previous = line[index - 1];
+    if (previous !== undefined && turnOf(previous) !== turn) {
+      // Both parts continue beyond their edge of the canvas.
+      pieces.at(-1)!.push(place(point, turnOf(previous)));
+      pieces.push([place(previous, turn)]);
+    }
+    pieces.at(-1)!.push(place(point, turn));
   });
+  return pieces;
 }

@@ -4,10 +4,9 @@ import { api } from "./api";
 import { device } from "./device/device";
 import { hintFields } from "./hints";
 import { InputError } from "./notices";
-import type { Group, Photo } from "./photos";
+import type { Photo } from "./photos";
 import type { Answer, ChosenVenue, Plan, SequenceAnswer } from "./types";
 
-/** Plan or venue to search. */
 export type Place = Plan | ChosenVenue;
 
 const isVenue = (place: Place): place is ChosenVenue => "listed" in place;
@@ -32,16 +31,16 @@ export async function askFilm(place: Place, film: File, signal: AbortSignal): Pr
     throw new InputError(
       "Films are sent to the service. Untick “Keep this photograph on my device”, or add photographs.",
     );
-  return answerOf(await api.localiseFilm(placeFields(place), film, { signal }), 0, "turn", place);
+  return answerOf(await api.localiseFilm(placeFields(place), film, { signal }), 0, place);
 }
 
-/** Ask for photographs of one visit together. */
-export async function askTogether(place: Place, { motion, photos }: Group, signal: AbortSignal): Promise<void> {
+/** Ask for the photographs of a turn together. */
+export async function askTogether(place: Place, photos: readonly Photo[], signal: AbortSignal): Promise<void> {
   const { heading_deg: _, heading_tolerance_deg: tolerance, ...shared } = photos[0]!.settings;
   const headings = photos.map(({ settings }) =>
     settings.heading_deg === undefined ? null : Number(settings.heading_deg),
   );
-  const fields: Record<string, string> = { ...placeFields(place), motion, ...shared };
+  const fields: Record<string, string> = { ...placeFields(place), motion: "turn", ...shared };
   if (headings.some((heading) => heading !== null)) {
     fields.headings_deg = JSON.stringify(headings);
     if (tolerance !== undefined) fields.heading_tolerance_deg = tolerance;
@@ -61,12 +60,12 @@ export async function askTogether(place: Place, { motion, photos }: Group, signa
   if (signal.aborted) return;
   photos.forEach((photo, index) => {
     photo.asked = { fields, files, onDevice };
-    photo.answer = answerOf(found, index, motion, place);
+    photo.answer = answerOf(found, index, place);
   });
 }
 
 /** Return the answer to one photograph of several. */
-function answerOf(found: SequenceAnswer, index: number, motion: Group["motion"], place: Place): Answer {
+function answerOf(found: SequenceAnswer, index: number, place: Place): Answer {
   const { poses, confidence, warnings, floorplan_revision, ...common } = found;
   const pose = poses[index]!;
   const among = new Set(pose.candidates.map(({ floorplan_id }) => floorplan_id));
@@ -85,6 +84,6 @@ function answerOf(found: SequenceAnswer, index: number, motion: Group["motion"],
       : null,
     answer_id: null,
     posterior: null,
-    together: { motion, photographs: poses.length, confidence },
+    together: { photographs: poses.length, confidence },
   };
 }

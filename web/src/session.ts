@@ -4,7 +4,8 @@ import { ellipse } from "./answer_overlay";
 import { api, ServiceError } from "./api";
 import { device } from "./device/device";
 import { button, byId, h, s, show } from "./dom";
-import { clearError, showError } from "./notices";
+import { acceptChoice } from "./drops";
+import { attempt } from "./notices";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Plan, Session, Venue } from "./types";
 
@@ -52,11 +53,7 @@ export class LiveSession {
   private plan: { id: string | undefined; box: Box } = { id: undefined, box: { x: 0, y: 0, width: 1, height: 1 } };
 
   constructor(private readonly actions: SessionActions) {
-    this.input.addEventListener("change", () => {
-      const files = [...(this.input.files ?? [])];
-      this.input.value = "";
-      void this.add(files);
-    });
+    acceptChoice(this.input, (files) => void this.add(files));
     byId("session").append(
       h("div", { class: "session-bar" }, this.begin, this.next, this.stop),
       this.error,
@@ -73,12 +70,13 @@ export class LiveSession {
 
   /** Follow a session that another client feeds; return false without an id. */
   async follow(id: string | null): Promise<boolean> {
-    if (id !== null && id !== this.session?.id) await this.attempt(async () => this.open(await api.session(id), false));
+    if (id !== null && id !== this.session?.id)
+      await attempt(this.error, async () => this.open(await api.session(id), false));
     return id !== null;
   }
 
   private async start(): Promise<void> {
-    await this.attempt(async () => {
+    await attempt(this.error, async () => {
       const place = await this.actions.place();
       this.open(await api.createSession("plans" in place ? { venue_id: place.id } : { floorplan_id: place.id }), true);
       history.replaceState(null, "", `#session=${this.session!.id}`);
@@ -114,7 +112,7 @@ export class LiveSession {
     const id = this.session?.id;
     this.sending = true;
     this.next.setAttribute("aria-busy", "true");
-    await this.attempt(async () => {
+    await attempt(this.error, async () => {
       for (const file of files) {
         if (this.session?.id !== id) return;
         const session = await this.sent(file);
@@ -142,7 +140,7 @@ export class LiveSession {
   private async end(): Promise<void> {
     const { session, isOwn } = this;
     this.close();
-    if (session !== null && isOwn) await this.attempt(async () => api.deleteSession(session.id));
+    if (session !== null && isOwn) await attempt(this.error, () => api.deleteSession(session.id));
   }
 
   private close(): void {
@@ -150,15 +148,6 @@ export class LiveSession {
     history.replaceState(null, "", location.pathname);
     show(this.state);
     this.draw();
-  }
-
-  private async attempt(work: () => Promise<void>): Promise<void> {
-    clearError(this.error);
-    try {
-      await work();
-    } catch (error) {
-      showError(this.error, error);
-    }
   }
 
   private take(session: Session): void {
@@ -173,6 +162,7 @@ export class LiveSession {
     const others = (pose?.candidates ?? []).slice(1).filter(({ probability }) => probability >= MIN_SHARE);
     const level = (at: { level?: number | null }): string =>
       at.level === null || at.level === undefined ? "" : `, level ${at.level}`;
+    const possible = others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`);
     show(
       this.state,
       h("p", { id: "session-mode", class: `mode ${mode}` }, pose === null ? "Add the first photograph." : MODES[mode]),
@@ -183,12 +173,7 @@ export class LiveSession {
           h("strong", {}, `${pose.room}${level(pose)}`),
           ` ${percent(pose.probability)} probable, after ${photographs} ${photographs === 1 ? "photograph" : "photographs"}`,
         ),
-      others.length > 0 &&
-        h(
-          "p",
-          { class: "hint" },
-          `Also possible: ${others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`).join(", ")}`,
-        ),
+      possible.length > 0 && h("p", { class: "hint" }, `Also possible: ${possible.join(", ")}`),
       ...(pose?.warnings ?? []).map((warning) => h("p", { class: "hint" }, warning)),
       h("p", { class: "hint" }, "Others can watch at ", h("a", { href: `#session=${id}` }, "this address"), "."),
     );

@@ -37,13 +37,9 @@ export class Sphere {
     return { yaw, pitch, verticalFov: radians(this.viewer.state.vFov) };
   }
 
-  turnTo(yaw: number, pitch: number): void {
-    this.viewer.rotate({ yaw, pitch });
-  }
-
   turnBy(yaw: number, pitch: number): void {
     const now = this.viewer.getPosition();
-    this.turnTo(now.yaw + yaw, Math.max(-1.5, Math.min(1.5, now.pitch + pitch)));
+    this.viewer.rotate({ yaw: now.yaw + yaw, pitch: Math.max(-1.5, Math.min(1.5, now.pitch + pitch)) });
   }
 
   zoomBy(steps: number): void {

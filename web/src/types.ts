@@ -8,13 +8,10 @@ export type OpeningDocument = Schemas["OpeningDocument"];
 export type OpeningKind = OpeningDocument["kind"];
 export type PlanDocument = Schemas["FloorPlanDocument"];
 export type PlanSummary = Schemas["FloorPlanSummary"];
-export type PlanList = Schemas["FloorPlanList"];
 export type PlanEvent = Schemas["PlanEvent"];
 export type Venue = Schemas["VenueSummary"];
 /** The venue that is searched, with the first of its plans. */
 export type ChosenVenue = Venue & { listed: VenuePlanList["plans"] };
-export type VenueList = Schemas["VenueList"];
-export type VenuePlanDocument = Schemas["VenuePlanDocument"];
 export type VenuePlanList = Schemas["VenuePlanList"];
 export type RoomLayout = Schemas["RoomLayoutAnswer"];
 export type Layout = Schemas["LayoutAnswer"];
@@ -31,10 +28,7 @@ export type Answer = Omit<Schemas["LocaliseAnswer"], "floorplan_revision"> & {
   together?: Together;
 };
 export type Session = Schemas["SessionAnswer"];
-export type SessionDocument = Schemas["SessionDocument"];
 export type ViewAnswer = Schemas["ViewAnswer"];
-export type Problem = Schemas["Problem"];
-export type Fault = Schemas["Fault"];
 
 export type { Plan } from "../../clients/typescript/src/index";
 
@@ -44,9 +38,8 @@ export interface Pose {
   heading_deg: number;
 }
 
-/** Photographs that were localised together, and the probability that all of their places are right. */
+/** Photographs of a turn that were localised together, and the probability that all of their places are right. */
 export interface Together {
-  motion: "turn";
   photographs: number;
   confidence: number | null;
 }

@@ -2,7 +2,7 @@
 
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
-import { clearError, InputError, say, showError } from "./notices";
+import { attempt, InputError, say } from "./notices";
 import type { PlanSummary, Venue } from "./types";
 
 interface Row {
@@ -28,17 +28,12 @@ export class VenueForm {
 
   /** `made` is called with the stored venue. */
   constructor(private readonly made: (venue: Venue) => void) {
+    const label = h("label", { class: "sr", for: this.choice.id }, "Plan to add");
     show(
       byId("venue-form"),
       this.error,
       h("div", {}, h("label", { for: this.name.id }, "Name of the venue"), this.name),
-      h(
-        "div",
-        { class: "row" },
-        h("label", { class: "sr", for: this.choice.id }, "Plan to add"),
-        this.choice,
-        this.add,
-      ),
+      h("div", { class: "row" }, label, this.choice, this.add),
       this.rows,
       button("Create the venue", () => void this.send(), { class: "primary", id: "venue-form-make" }),
     );
@@ -70,8 +65,7 @@ export class VenueForm {
       ["name", this.name] as const,
       ...this.chosen.map(({ level }, index) => [`plans.${index}.level`, level] as const),
     ]);
-    clearError(this.error, fields);
-    try {
+    const create = async (): Promise<void> => {
       const missing = this.chosen.find(({ level }) => Number.isNaN(level.valueAsNumber));
       if (this.name.value.trim() === "") throw new InputError("Enter a name for the venue.");
       if (this.chosen.length === 0) throw new InputError("Add at least one plan.");
@@ -84,9 +78,8 @@ export class VenueForm {
       this.draw();
       say(`“${venue.name}” is stored.`);
       this.made(venue);
-    } catch (error) {
-      showError(this.error, error, fields);
-    }
+    };
+    await attempt(this.error, create, fields);
   }
 
   private draw(): void {
@@ -102,11 +95,7 @@ export class VenueForm {
           h("span", { class: "name" }, plan.name),
           h("span", { "aria-hidden": "true" }, "level"),
           level,
-          h(
-            "button",
-            { type: "button", class: "remove", "aria-label": `Remove ${plan.name}`, onclick: () => this.remove(index) },
-            "×",
-          ),
+          button("×", () => this.remove(index), { class: "remove", "aria-label": `Remove ${plan.name}` }),
         ),
       ),
     );

@@ -1,8 +1,8 @@
 /** Venues: groups of plans that are searched together. */
 
 import { api } from "./api";
-import { byId, h, show } from "./dom";
-import { clearError, showError } from "./notices";
+import { byId, h, planButton, show } from "./dom";
+import { attempt, showError } from "./notices";
 import type { ChosenVenue, PlanSummary, Venue } from "./types";
 import { VenueForm } from "./venue_form";
 
@@ -28,15 +28,12 @@ export class Venues {
   private readonly error = byId("plan-error");
   private readonly form = new VenueForm((venue) => void this.take(venue));
   private found: Venue[] = [];
-  private venue: ChosenVenue | null = null;
+  /** The venue that is searched. */
+  current: ChosenVenue | null = null;
 
   constructor(private readonly actions: VenueActions) {
     this.choice.addEventListener("change", () => actions.showPlan(this.choice.value));
     byId("venue-leave").addEventListener("click", () => this.leave());
-  }
-
-  get current(): ChosenVenue | null {
-    return this.venue;
   }
 
   /** Offer the listed plans for a new venue. */
@@ -68,10 +65,9 @@ export class Venues {
 
   /** Choose a venue by its id and show one of its plans: `planId`, by default the first; null shows none. */
   async choose(id: string, planId?: string | null): Promise<void> {
-    clearError(this.error);
-    try {
+    await attempt(this.error, async () => {
       const [venue, { plans, next_cursor: more }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
-      this.venue = { ...venue, listed: plans };
+      this.current = { ...venue, listed: plans };
       byId("venue-name").textContent = venue.name;
       byId("venue-facts").textContent =
         `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}` +
@@ -87,18 +83,16 @@ export class Venues {
       );
       this.bar.hidden = false;
       this.draw();
-      this.actions.chosen(this.venue);
+      this.actions.chosen(this.current);
       const first = planId === undefined ? plans[0]?.floorplan_id : planId;
       if (first) this.actions.showPlan(first);
-    } catch (error) {
-      showError(this.error, error);
-    }
+    });
   }
 
   /** Search a single plan again. */
   leave(): void {
-    if (this.venue === null) return;
-    this.venue = null;
+    if (this.current === null) return;
+    this.current = null;
     this.bar.hidden = true;
     this.draw();
     this.actions.chosen(null);
@@ -110,26 +104,11 @@ export class Venues {
   }
 
   private draw(): void {
-    show(
-      this.list,
-      ...this.found.map((venue) =>
-        h(
-          "li",
-          {},
-          h(
-            "button",
-            {
-              type: "button",
-              class: "plan",
-              "aria-pressed": String(venue.id === this.venue?.id),
-              onclick: () => this.pick(venue.id),
-            },
-            h("span", { class: "name" }, venue.name),
-            h("span", { class: "facts" }, `venue, ${venue.plans} plans`),
-          ),
-        ),
-      ),
-    );
+    const entries = this.found.map(({ id, name, plans }) => {
+      const choose = planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id));
+      return h("li", {}, choose);
+    });
+    show(this.list, ...entries);
     byId("venues").hidden = this.found.length === 0;
   }
 }

@@ -9,7 +9,8 @@ const MAX_ZOOM = 40;
 
 export class Viewport {
   private whole: Box = { x: 0, y: 0, width: 1, height: 1 };
-  private box: Box = this.whole;
+  /** The visible part. */
+  current: Box = this.whole;
 
   /** `changed` is called when another part is visible. */
   constructor(
@@ -37,10 +38,6 @@ export class Viewport {
     svg.addEventListener("pointerdown", (event) => this.onPointer(event));
   }
 
-  get current(): Box {
-    return this.box;
-  }
-
   /** Show a whole drawing. */
   fit(whole: Box): void {
     this.whole = whole;
@@ -48,23 +45,23 @@ export class Viewport {
   }
 
   private show(box: Box): void {
-    this.box = box;
+    this.current = box;
     this.svg.setAttribute("viewBox", `${box.x} ${box.y} ${box.width} ${box.height}`);
     this.changed();
   }
 
   private zoom(
     factor: number,
-    about: Point = [this.box.x + 0.5 * this.box.width, -this.box.y - 0.5 * this.box.height],
+    about: Point = [this.current.x + 0.5 * this.current.width, -this.current.y - 0.5 * this.current.height],
   ): void {
-    const width = this.box.width * factor;
+    const width = this.current.width * factor;
     if (width > 3 * this.whole.width || width < this.whole.width / MAX_ZOOM) return;
     const [x, y] = [about[0], -about[1]];
     this.show({
-      x: x + (this.box.x - x) * factor,
-      y: y + (this.box.y - y) * factor,
+      x: x + (this.current.x - x) * factor,
+      y: y + (this.current.y - y) * factor,
       width,
-      height: this.box.height * factor,
+      height: this.current.height * factor,
     });
   }
 
@@ -74,7 +71,7 @@ export class Viewport {
     const from = placeOf(this.svg, event);
     followPointer((moving) => {
       const to = placeOf(this.svg, moving);
-      this.show({ ...this.box, x: this.box.x - (to[0] - from[0]), y: this.box.y + (to[1] - from[1]) });
+      this.show({ ...this.current, x: this.current.x - (to[0] - from[0]), y: this.current.y + (to[1] - from[1]) });
     });
   }
 }

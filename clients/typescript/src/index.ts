@@ -174,13 +174,10 @@ export class Client {
   albumPhotographs = (id: string) =>
     this.json<Schemas["AlbumPhotographList"]>(of("albums", id, "/photographs?limit=500"));
   /** Return the pins of an album as a file; a drawing of a venue needs a plan. */
-  albumFile = async (id: string, media: "application/geo+json" | "text/csv" | "image/svg+xml", planId?: string) =>
-    (
-      await this.request(
-        of("albums", id, `/photographs${planId ? `?floorplan_id=${encodeURIComponent(planId)}` : ""}`),
-        { headers: { Accept: media } },
-      )
-    ).blob();
+  albumFile = async (id: string, media: "application/geo+json" | "text/csv" | "image/svg+xml", planId?: string) => {
+    const path = `/photographs${planId ? `?floorplan_id=${encodeURIComponent(planId)}` : ""}`;
+    return (await this.request(of("albums", id, path), { headers: { Accept: media } })).blob();
+  };
   /** State where a photograph of an album was taken; null undoes it. The rest is then solved again. */
   correctPhotograph = (id: string, photographId: string, correction: Schemas["CorrectionDocument"] | null) =>
     this.json<Schemas["AlbumPhotographAnswer"]>(

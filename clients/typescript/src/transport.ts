@@ -24,12 +24,8 @@ export function upload(
     sending.upload.onprogress = ({ loaded, total }) => onProgress(loaded, total);
     sending.onerror = () => reject(new TypeError("no answer"));
     sending.onload = () => {
-      const lines = sending
-        .getAllResponseHeaders()
-        .trim()
-        .split("\r\n")
-        .map((line) => line.split(": "));
-      const answered = lines.map(([name, ...value]): [string, string] => [name!, value.join(": ")]);
+      const lines = sending.getAllResponseHeaders().matchAll(/^([^:\s]+): (.*)$/gm);
+      const answered = [...lines].map(([, name, value]): [string, string] => [name!, value!]);
       const { status, statusText } = sending,
         body = status === 204 || status === 304 ? null : sending.response;
       resolve(new Response(body, { status, statusText, headers: answered }));

@@ -1,7 +1,7 @@
 /** Tilt of a camera from straight lines, as in lalaloc_core/photograph/levelling.py, which explains the method; angles are radians. */
 
 import { type Ray, tiltOf } from "../camera";
-import { radians } from "../layout";
+import { degrees, radians } from "../layout";
 import type { Size } from "../projection";
 import type { Segment } from "./segments";
 
@@ -153,7 +153,7 @@ function unit(ray: Ray): Ray {
 
 /** Return the rotation of level rays into the frame of a camera. */
 function rotation(pitch: number, roll: number): (ray: Ray) => Ray {
-  const angle = (value: number) => ({ value_deg: (value * 180) / Math.PI, std_deg: 0, source: "assumed" as const });
+  const angle = (value: number) => ({ value_deg: degrees(value), std_deg: 0, source: "assumed" as const });
   return tiltOf({ projection: "perspective", pitch: angle(pitch), roll: angle(roll) });
 }
 
@@ -220,11 +220,7 @@ function total(lines: Line[], angles: Angles, least: number): number {
 function refined(lines: Line[], start: Angles): Mode {
   const prior = [1 / PRIOR[0] ** 2, 1 / PRIOR[1] ** 2, 0];
   let angles = start,
-    information = [
-      [1, 0, 0],
-      [0, 1, 0],
-      [0, 0, 1],
-    ],
+    information: number[][] = [],
     least = SIGMA;
   for (let step = 0; step < STEPS; step++) {
     least = Math.max(SIGMA, COARSE_SIGMA * 0.7 ** step);

@@ -118,10 +118,8 @@ export class Model {
   /** Return probability and azimuth of each object in a picture with the given azimuths of columns; none without a classifier. */
   async objects(rgb: Uint8ClampedArray, { width, height }: Size, azimuths: number[]): Promise<Float32Array[]> {
     if (!this.manifest.objects) return [];
-    const outputs = await this.run(OBJECTS, new Uint8Array(rgb), [1, height, width, 3], HEIGHT_M, [
-      "probability",
-      "by_column",
-    ]);
+    const names = ["probability", "by_column"],
+      outputs = await this.run(OBJECTS, new Uint8Array(rgb), [1, height, width, 3], HEIGHT_M, names);
     const probability = outputs.probability!,
       byColumn = outputs.by_column!,
       columns = azimuths.length;

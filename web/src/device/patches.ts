@@ -1,7 +1,7 @@
 /** Level patches of photographs that are no full spheres, as in lalaloc_core/photograph/patches.py; angles are radians. */
 
-import { type CameraView, inside, placeOf, type Ray, tiltOf } from "../camera";
-import { radians } from "../layout";
+import { type CameraView, inside, placeOf, rayOf, tiltOf } from "../camera";
+import { degrees, radians } from "../layout";
 import { nearest, type Pixels, sample } from "./pixels";
 
 export interface PatchSize {
@@ -44,12 +44,7 @@ export function cutPatch(picture: Pixels, view: CameraView, azimuth: number, siz
     const elevation = size.top - (row + 0.5) * perPixel;
     for (let column = 0; column < size.width; column++, to += 4) {
       const turned = azimuth + (column + 0.5) * perPixel - 0.5 * size.hfov;
-      const ray: Ray = [
-        Math.cos(elevation) * Math.sin(turned),
-        Math.cos(elevation) * Math.cos(turned),
-        Math.sin(elevation),
-      ];
-      const point = place(tilt(ray));
+      const point = place(tilt(rayOf(turned, elevation)));
       if (point === null || !inside(point, picture)) patch.fill(UNSEEN, to, to + 3);
       else {
         sample(picture, point[0], point[1], nearest, patch, to);
@@ -79,6 +74,5 @@ export function seenDeg(view: CameraView): [number, number] {
         azimuths.push(Math.atan2(across, forward));
     }
   }
-  const degrees = (angle: number): number => (angle * 180) / Math.PI;
   return azimuths.length === 0 ? [-half, half] : [degrees(Math.min(...azimuths)), degrees(Math.max(...azimuths))];
 }

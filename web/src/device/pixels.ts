@@ -1,6 +1,6 @@
 /** Pictures as pixels: decoding, scaling and levelling, as in lalaloc_core/photograph. */
 
-import { type Ray, tiltOf } from "../camera";
+import { rayOf, tiltOf } from "../camera";
 import { InputError } from "../input_error";
 import type { ViewAnswer } from "../types";
 
@@ -81,12 +81,7 @@ export function levelled(sphere: Pixels, view: Pick<ViewAnswer, "projection" | "
     const elevation = (0.5 - (row + 0.5) / height) * Math.PI;
     for (let column = 0; column < width; column++, to += 3) {
       const azimuth = ((column + 0.5) / width - 0.5) * 2 * Math.PI;
-      const ray: Ray = [
-        Math.cos(elevation) * Math.sin(azimuth),
-        Math.cos(elevation) * Math.cos(azimuth),
-        Math.sin(elevation),
-      ];
-      const [right, forward, up] = tilt(ray);
+      const [right, forward, up] = tilt(rayOf(azimuth, elevation));
       const x = (Math.atan2(right, forward) / (2 * Math.PI) + 0.5) * width,
         y = (0.5 - Math.asin(Math.max(-1, Math.min(1, up))) / Math.PI) * height;
       sample(sphere, x, y, aroundPoles, turned.rgb, to);

@@ -110,15 +110,9 @@ function grow(seed: number, tolerance: number, width: number, { angle }: Edges, 
     for (const down of [-width, 0, width]) {
       for (const across of [-1, 0, 1]) {
         const index = region[next]! + down + across;
-        // Pixels of the last row and column have no direction, so that only the left border can be crossed.
-        if (
-          index < 0 ||
-          (column === 0 && across < 0) ||
-          index >= used.length ||
-          used[index] === 1 ||
-          angle[index] === NONE
-        )
-          continue;
+        // Pixels of the last row and column have no direction, so that only the left border can be crossed; above and below
+        // the picture, `used` is undefined.
+        if ((column === 0 && across < 0) || used[index] !== 0 || angle[index] === NONE) continue;
         if (Math.abs(turn(angle[index]! - direction)) > tolerance) continue;
         used[index] = 1;
         region.push(index);
@@ -134,11 +128,7 @@ function grow(seed: number, tolerance: number, width: number, { angle }: Edges, 
 const turn = (angle: number): number => angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
 
 /** Return the axis of a region, weighted by the strength of its edges, and the share of its rectangle that the region fills. */
-function fitted(
-  region: number[],
-  width: number,
-  { strength }: Edges,
-): { segment: Segment; length: number; density: number } {
+function fitted(region: number[], width: number, { strength }: Edges) {
   let sum = 0,
     x = 0,
     y = 0;
@@ -176,5 +166,6 @@ function fitted(
     density = region.length / (Math.max(length, 1) * Math.max(below - above, 1));
   // The edge of a pixel lies between it and its neighbours: at its lower right corner.
   const end = (along: number): [number, number] => [x + 1 + along * cosine, y + 1 + along * sine];
-  return { segment: [...end(first), ...end(last)], length, density };
+  const segment: Segment = [...end(first), ...end(last)];
+  return { segment, length, density };
 }

@@ -2,6 +2,7 @@
 
 import type { CameraView } from "../camera";
 import { InputError } from "../input_error";
+import { degrees } from "../layout";
 import { type Attitude, estimateAttitude, estimateCalibration, MAX_ESTIMATED_SD } from "./attitude";
 import { type Header, featuresFile } from "./features_file";
 import { findLens, type Lens, poseAngle, type Stated } from "./lens";
@@ -15,10 +16,11 @@ import { findSegments } from "./segments";
 /** Messages to the worker: a photograph, or a file of the model that it needs. */
 export type Task =
   { kind: "encode"; file: File; stated: Stated; manifest: Manifest } | { kind: "file"; content: ArrayBuffer };
+type Features = Uint8Array<ArrayBuffer>;
 /** Messages from the worker. */
 export type Result =
   | { kind: "need"; name: string }
-  | { kind: "done"; features: Uint8Array<ArrayBuffer> }
+  | { kind: "done"; features: Features }
   | { kind: "failed"; message: string; isInput: boolean };
 
 type Angle = Header["pitch"];
@@ -71,7 +73,7 @@ scope.onmessage = ({ data }) => {
   }
 };
 
-async function encode(file: File, stated: Stated, encoder: Model): Promise<Uint8Array<ArrayBuffer>> {
+async function encode(file: File, stated: Stated, encoder: Model): Promise<Features> {
   const metadata = readMetadata(await file.arrayBuffer()),
     bitmap = await decoded(file, file.name);
   try {
@@ -95,10 +97,7 @@ interface Photograph {
   metadata: Metadata;
 }
 
-async function sphere(
-  { bitmap, lens, stated, metadata }: Photograph,
-  encoder: Model,
-): Promise<Uint8Array<ArrayBuffer>> {
+async function sphere({ bitmap, lens, stated, metadata }: Photograph, encoder: Model): Promise<Features> {
   const tilt = (entered: Angle | null, name: string, most: number): Angle => {
     const value_deg = poseAngle(metadata, name, -most, most) ?? 0;
     return entered ?? { value_deg, std_deg: GIVEN_SD_DEG, source: value_deg === 0 ? "assumed" : "gpano" };
@@ -124,7 +123,7 @@ async function sphere(
   return featuresFile(header, await encoder.sphere(pixels.rgb));
 }
 
-async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Model): Promise<Uint8Array<ArrayBuffer>> {
+async function patched({ bitmap, lens: known, stated }: Photograph, encoder: Model): Promise<Features> {
   const { width, height } = bitmap,
     size = encoder.patchSize,
     entered = [statedPitch(stated), statedRoll(stated)] as const;
@@ -207,17 +206,12 @@ function linedBy({ pitch, roll, yaw, pitchSd, rollSd, yawSd }: Attitude): Lined 
   return { pitch: angle(pitch, pitchSd), roll: angle(roll, rollSd), wall_direction: yawSd < Math.PI ? walls : null };
 }
 
-const common = (
-  lens: Lens,
-  { digest }: Model,
-): Pick<Header, "model" | "projection" | "projection_source" | "warnings"> => ({
+const common = (lens: Lens, { digest }: Model) => ({
   model: digest,
   projection: lens.projection,
   projection_source: lens.projectionSource,
   warnings: lens.warnings,
 });
-
-const degrees = (angle: number): number => (angle * 180) / Math.PI;
 
 const statedPitch = ({ pitch_deg }: Stated): Angle | null => givenAngle("Tilted up by", pitch_deg, MAX_PITCH_DEG);
 const statedRoll = ({ roll_deg }: Stated): Angle | null => givenAngle("Leaning right by", roll_deg, MAX_ROLL_DEG);

@@ -22,7 +22,6 @@ export interface WallRef {
   edge: number;
 }
 
-/** Return both ends of a wall. */
 export function wallOf(plan: PlanDocument, { room, edge }: WallRef): [Point, Point] {
   const polygon = plan.rooms[room]!.polygon;
   return [polygon[edge]!, polygon[(edge + 1) % polygon.length]!];
@@ -32,8 +31,9 @@ function withRoom(plan: PlanDocument, index: number, change: (room: RoomDocument
   return { ...plan, rooms: plan.rooms.map((room, position) => (position === index ? change(room) : room)) };
 }
 
-function withOutline(plan: PlanDocument, index: number, polygon: Point[]): PlanDocument {
-  const before = plan.rooms[index]!.polygon;
+function withOutline(plan: PlanDocument, index: number, change: (polygon: Point[]) => Point[]): PlanDocument {
+  const before = plan.rooms[index]!.polygon,
+    polygon = change(before);
   const moved = withRoom(plan, index, (room) => ({ ...room, polygon }));
   if (before.length !== polygon.length) return moved;
   return { ...moved, openings: (plan.openings ?? []).map((opening) => carried(opening, before, polygon)) };
@@ -71,66 +71,40 @@ function resized(line: [Point, Point], before: [Point, Point], direction: Point)
 
 const same = (a: Point, b: Point): boolean => a[0] === b[0] && a[1] === b[1];
 
-function frame(
-  from: Point,
-  to: Point,
-): {
-  length: number;
-  direction: Point;
-  along: (point: Point) => number;
-  off: (point: Point) => number;
-  point: (along: number, off: number) => Point;
-} {
+function frame(from: Point, to: Point) {
   const length = Math.hypot(to[0] - from[0], to[1] - from[1]);
   const direction: Point = length === 0 ? [1, 0] : [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
   return {
     length,
     direction,
-    along: ([x, y]) => (x - from[0]) * direction[0] + (y - from[1]) * direction[1],
-    off: ([x, y]) => (y - from[1]) * direction[0] - (x - from[0]) * direction[1],
-    point: (along, off) => [
+    along: ([x, y]: Point): number => (x - from[0]) * direction[0] + (y - from[1]) * direction[1],
+    off: ([x, y]: Point): number => (y - from[1]) * direction[0] - (x - from[0]) * direction[1],
+    point: (along: number, off: number): Point => [
       from[0] + along * direction[0] - off * direction[1],
       from[1] + along * direction[1] + off * direction[0],
     ],
   };
 }
 
-export function moveCorner(plan: PlanDocument, room: number, corner: number, to: Point): PlanDocument {
-  return withOutline(
-    plan,
-    room,
-    plan.rooms[room]!.polygon.map((point, position) => (position === corner ? rounded(to) : point)),
-  );
-}
+export const moveCorner = (plan: PlanDocument, room: number, corner: number, to: Point): PlanDocument =>
+  withOutline(plan, room, (polygon) => polygon.map((point, index) => (index === corner ? rounded(to) : point)));
 
 /** Move both ends of a wall. */
-export function moveWall(plan: PlanDocument, { room, edge }: WallRef, by: Point): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon,
-    next = (edge + 1) % polygon.length;
-  return withOutline(
-    plan,
-    room,
-    polygon.map((point, position) => (position === edge || position === next ? plus(point, by) : point)),
-  );
-}
+export const moveWall = (plan: PlanDocument, { room, edge }: WallRef, by: Point): PlanDocument =>
+  withOutline(plan, room, (polygon) => {
+    const next = (edge + 1) % polygon.length;
+    return polygon.map((point, index) => (index === edge || index === next ? plus(point, by) : point));
+  });
 
 /** Add a corner on a wall. */
-export function splitWall(plan: PlanDocument, { room, edge }: WallRef, corner: Point): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon;
-  return withOutline(plan, room, [...polygon.slice(0, edge + 1), rounded(corner), ...polygon.slice(edge + 1)]);
-}
+export const splitWall = (plan: PlanDocument, { room, edge }: WallRef, corner: Point): PlanDocument =>
+  withOutline(plan, room, (polygon) => [...polygon.slice(0, edge + 1), rounded(corner), ...polygon.slice(edge + 1)]);
 
 /** Remove a corner; triangles stay as they are. */
-export function removeCorner(plan: PlanDocument, room: number, corner: number): PlanDocument {
-  const polygon = plan.rooms[room]!.polygon;
-  return polygon.length <= 3
+export const removeCorner = (plan: PlanDocument, room: number, corner: number): PlanDocument =>
+  plan.rooms[room]!.polygon.length <= 3
     ? plan
-    : withOutline(
-        plan,
-        room,
-        polygon.filter((_, position) => position !== corner),
-      );
-}
+    : withOutline(plan, room, (polygon) => polygon.filter((_, index) => index !== corner));
 
 export function addRoom(plan: PlanDocument, polygon: Point[]): PlanDocument {
   const room: RoomDocument = { name: `room ${plan.rooms.length + 1}`, type: "unknown", polygon: polygon.map(rounded) };
@@ -214,33 +188,30 @@ export function removeOpening(plan: PlanDocument, index: number): PlanDocument {
   return { ...plan, openings: (plan.openings ?? []).filter((_, position) => position !== index) };
 }
 
-/** Slide an opening along its direction, as near to a place as possible. */
-export function slideOpening(plan: PlanDocument, index: number, place: Point): PlanDocument {
-  const line = plan.openings![index]!.line,
-    along = frame(...line);
-  const by = along.along(place) - 0.5 * along.length;
-  return changeOpening(plan, index, {
-    line: [rounded(along.point(by, 0)), rounded(along.point(by + along.length, 0))],
-  });
+/** Move the ends of an opening to distances along its direction. */
+function withEnds(
+  plan: PlanDocument,
+  index: number,
+  ends: (line: ReturnType<typeof frame>) => [number, number],
+): PlanDocument {
+  const line = frame(...plan.openings![index]!.line),
+    [from, to] = ends(line);
+  return changeOpening(plan, index, { line: [rounded(line.point(from, 0)), rounded(line.point(to, 0))] });
 }
+
+/** Slide an opening along its direction, as near to a place as possible. */
+export const slideOpening = (plan: PlanDocument, index: number, place: Point): PlanDocument =>
+  withEnds(plan, index, ({ along, length }) => [along(place) - 0.5 * length, along(place) + 0.5 * length]);
 
 /** Move one end of an opening along its direction. */
-export function stretchOpening(plan: PlanDocument, index: number, end: 0 | 1, place: Point): PlanDocument {
-  const line = plan.openings![index]!.line,
-    along = frame(...line);
-  const share = along.along(place);
-  const [from, to] =
-    end === 0 ? [Math.min(share, along.length - MIN_WIDTH_M), along.length] : [0, Math.max(share, MIN_WIDTH_M)];
-  return changeOpening(plan, index, { line: [rounded(along.point(from, 0)), rounded(along.point(to, 0))] });
-}
+export const stretchOpening = (plan: PlanDocument, index: number, end: 0 | 1, place: Point): PlanDocument =>
+  withEnds(plan, index, ({ along, length }) =>
+    end === 0 ? [Math.min(along(place), length - MIN_WIDTH_M), length] : [0, Math.max(along(place), MIN_WIDTH_M)],
+  );
 
 /** Set the width of an opening about its centre. */
-export function widenOpening(plan: PlanDocument, index: number, width: number): PlanDocument {
-  const line = plan.openings![index]!.line,
-    along = frame(...line);
-  const from = 0.5 * (along.length - width);
-  return changeOpening(plan, index, { line: [rounded(along.point(from, 0)), rounded(along.point(from + width, 0))] });
-}
+export const widenOpening = (plan: PlanDocument, index: number, width: number): PlanDocument =>
+  withEnds(plan, index, ({ length }) => [0.5 * (length - width), 0.5 * (length + width)]);
 
 export const widthOf = ({ line: [a, b] }: OpeningDocument): number => Math.hypot(b[0] - a[0], b[1] - a[1]);
 

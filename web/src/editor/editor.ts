@@ -1,27 +1,17 @@
 /** Plan editor: changes a copy, with undo and redo, and stores it as a new revision or a new plan. */
 
 import { api, ServiceError } from "../api";
-import { button, byId, h, show } from "../dom";
-import { clearError, InputError, say, showError } from "../notices";
-import { type Box, boxOf, lostAreas, unitOf } from "../plan_drawing";
+import { button, byId, confirmed, h, show } from "../dom";
+import { attempt, clearError, InputError, say, showError } from "../notices";
+import { boxOf, lostAreas, unitOf } from "../plan_drawing";
+import type { PlanScene } from "../plan_scene";
 import type { Plan, PlanDocument, Point } from "../types";
 import * as change from "./changes";
 import { setFormPlan, showForm } from "./forms";
-import { Handles, type Selection } from "./handles";
+import { type EditActions, Handles, type Selection } from "./handles";
 import { History } from "./history";
 import { type Tool, Tools } from "./tools";
-import { TracedPictures } from "./traced_pictures";
-import { Underlay } from "./underlay";
-
-export interface EditorHost {
-  /** Draw the edited plan. */
-  draw: (plan: PlanDocument) => void;
-  /** Return the visible part in metres. */
-  visible: () => Box;
-  fit: (box: Box) => void;
-  /** Editing ended; null if nothing was stored. */
-  ended: (stored: Plan | null) => void;
-}
+import { TracedPictures, Underlay } from "./underlay";
 
 const EMPTY: PlanDocument = { name: "New plan", rooms: [], openings: [] };
 const NEW_ROOM_M: Point = [4, 3];
@@ -45,35 +35,38 @@ export class Editor {
   private readonly error = byId("plan-error");
   private readonly hint = h("p", { class: "hint", role: "status", id: "edit-hint" });
   private readonly measure = h("div", { class: "measure", hidden: true });
+  private readonly undo = button("Undo", () => this.step("undo"), { id: "undo" });
+  private readonly redo = button("Redo", () => this.step("redo"), { id: "redo" });
   private history: History<PlanDocument> | null = null;
   private saved: PlanDocument = EMPTY;
   private base: Plan | null = null;
   private selection: Selection = { kind: "none" };
   private measured = 0;
   private readonly traced = new TracedPictures();
+  private readonly actions: EditActions = {
+    edit: (plan, goesOn) => this.edit(plan, goesOn),
+    select: (selection) => this.select(selection),
+  };
 
+  /** `ended` is called when editing ends, with null if nothing was stored. */
   constructor(
-    svg: SVGSVGElement,
-    private readonly host: EditorHost,
+    private readonly scene: PlanScene,
+    private readonly ended: (stored: Plan | null) => void,
   ) {
+    const { svg } = scene;
     this.underlay = new Underlay(svg);
-    this.handles = new Handles(svg, {
-      edit: (plan, goesOn) => this.edit(plan, goesOn),
-      select: (selection) => this.select(selection),
-    });
+    this.handles = new Handles(svg, this.actions);
     this.tools = new Tools(svg, {
       edit: (plan) => {
         const isRoom = plan.rooms.length > (this.history?.now.rooms.length ?? 0);
         this.selection = isRoom
           ? { kind: "room", index: plan.rooms.length - 1 }
           : { kind: "opening", index: (plan.openings ?? []).length - 1 };
-        this.edit(plan, false);
+        this.edit(plan);
       },
       done: () => this.drawBar(),
       measured: (distance) => this.onMeasured(distance),
-      instruct: (text) => {
-        this.hint.textContent = text;
-      },
+      instruct: (text) => show(this.hint, text),
     });
     svg.addEventListener("pointerdown", (event) => this.onGround(event));
     addEventListener("keydown", (event) => this.onKey(event));
@@ -104,7 +97,7 @@ export class Editor {
     this.underlay.remove();
     clearError(this.error);
     this.tools.choose(plan === null ? "room" : "select");
-    this.host.fit(boxOf(this.saved, lostAreas(plan)));
+    this.scene.viewport.fit(boxOf(this.saved, lostAreas(plan)));
     this.drawBar();
     this.redraw();
     if (plan !== null) void this.layOriginal(plan);
@@ -126,18 +119,15 @@ export class Editor {
   redraw(): void {
     if (this.history === null) return;
     const plan = this.history.now,
-      unit = unitOf(this.host.visible());
+      unit = unitOf(this.scene.viewport.current);
     setFormPlan(plan);
-    this.host.draw(plan);
+    this.scene.drawRooms(plan);
     this.tools.update(plan, unit);
     this.handles.draw(plan, this.selection, unit);
-    showForm(this.form, plan, this.selection, {
-      edit: (next) => this.edit(next, false),
-      select: (selection) => this.select(selection),
-    });
+    showForm(this.form, plan, this.selection, this.actions);
   }
 
-  private edit(plan: PlanDocument, goesOn: boolean): void {
+  private edit(plan: PlanDocument, goesOn = false): void {
     this.history?.push(plan, goesOn);
     this.redraw();
     this.drawUndo();
@@ -158,11 +148,12 @@ export class Editor {
     show(this.form);
     show(this.handles.element);
     this.measure.hidden = true;
-    this.host.ended(stored);
+    this.ended(stored);
   }
 
   private drawBar(): void {
     if (this.history === null) return;
+    const { slider, box } = this.underlay;
     const tool = ([name, label]: [Tool, string]): HTMLElement =>
       button(
         label,
@@ -185,16 +176,10 @@ export class Editor {
         ...TOOLS.map(tool),
         button("Add 4 × 3 m room", () => this.addRoom(), { id: "add-room" }),
         h("label", { class: "file" }, picture, h("span", {}, "Picture to trace")),
-        button("Undo", () => this.step("undo"), { id: "undo" }),
-        button("Redo", () => this.step("redo"), { id: "redo" }),
+        this.undo,
+        this.redo,
       ),
-      this.underlay.box !== null &&
-        h(
-          "label",
-          { class: "inline", for: this.underlay.slider.id },
-          "Picture through the rooms",
-          this.underlay.slider,
-        ),
+      box !== null && h("label", { class: "inline", for: slider.id }, "Picture through the rooms", slider),
       this.measure,
       this.hint,
       h(
@@ -205,20 +190,15 @@ export class Editor {
           id: "save",
         }),
         this.base !== null && button("Save as a new plan", () => void this.saveNew(), { id: "save-new" }),
-        button("Stop editing", () => this.leave(), { id: "stop" }),
+        button("Stop editing", () => void this.leave(), { id: "stop" }),
       ),
     );
     this.drawUndo();
   }
 
   private drawUndo(): void {
-    for (const [id, can] of [
-      ["undo", this.history?.canUndo],
-      ["redo", this.history?.canRedo],
-    ] as const) {
-      const control = document.getElementById(id) as HTMLButtonElement | null;
-      if (control !== null) control.disabled = !can;
-    }
+    this.undo.disabled = !this.history?.canUndo;
+    this.redo.disabled = !this.history?.canRedo;
   }
 
   private step(way: "undo" | "redo"): void {
@@ -244,23 +224,19 @@ export class Editor {
         [right + width, depth],
         [right, depth],
       ]),
-      false,
     );
-    this.host.fit(boxOf(this.history.now));
+    this.scene.viewport.fit(boxOf(this.history.now));
   }
 
   private async lay(file: File): Promise<void> {
-    clearError(this.error);
-    try {
+    await attempt(this.error, async () => {
       await this.underlay.lay({ file, name: file.name });
       const { width, height } = this.underlay.box!;
-      this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
+      this.scene.viewport.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
       say("Set the scale next: click two points with a known distance.");
       this.tools.choose("scale");
       this.drawBar();
-    } catch (error) {
-      showError(this.error, error);
-    }
+    });
   }
 
   private onMeasured(distance: number): void {
@@ -293,12 +269,13 @@ export class Editor {
     }
     clearError(this.error);
     const factor = distance / this.measured,
-      seen = this.host.visible();
+      { viewport } = this.scene,
+      seen = viewport.current;
     this.measure.hidden = true;
     this.underlay.scale(factor);
     this.tools.choose("select");
-    this.edit(change.scaled(this.history.now, factor), false);
-    this.host.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
+    this.edit(change.scaled(this.history.now, factor));
+    viewport.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
     say(`The plan was scaled by ${factor.toFixed(3)}.`);
   }
 
@@ -349,26 +326,13 @@ export class Editor {
       }
       // One more step of the history, so that undo returns to the user's version.
       this.selection = { kind: "none" };
-      this.edit(this.base.plan, false);
+      this.edit(this.base.plan);
       this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” returns to your version; saving makes it the latest.`;
     });
   }
 
-  private leave(): void {
-    const dialog = byId<HTMLDialogElement>("leave-dialog");
-    if (!this.isChanged) {
-      this.close(null);
-      return;
-    }
-    dialog.showModal();
-    dialog.addEventListener(
-      "close",
-      () => {
-        if (dialog.returnValue === "leave") this.close(null);
-        dialog.returnValue = "";
-      },
-      { once: true },
-    );
+  private async leave(): Promise<void> {
+    if (!this.isChanged || (await confirmed("leave-dialog", "leave"))) this.close(null);
   }
 
   /** Show the form of the whole plan after a click beside the rooms; a drag there moves the drawing. */

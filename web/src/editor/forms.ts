@@ -3,7 +3,7 @@
 import { button, h, show } from "../dom";
 import type { OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from "../types";
 import * as change from "./changes";
-import type { Selection } from "./handles";
+import type { EditActions, Selection } from "./handles";
 
 type RoomType = NonNullable<RoomDocument["type"]>;
 
@@ -31,13 +31,7 @@ const ASSUMED = "2.5 assumed";
 const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
-export interface FormActions {
-  edit: (plan: PlanDocument) => void;
-  select: (selection: Selection) => void;
-}
-
-/** Show the form of the selection. */
-export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: FormActions): void {
+export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: EditActions): void {
   if (place.contains(document.activeElement) && document.activeElement instanceof HTMLInputElement) {
     // The form already shows the typed text.
     if (place.dataset.of === JSON.stringify(selection)) return;
@@ -58,7 +52,7 @@ export function setFormPlan(plan: PlanDocument): void {
   current = plan;
 }
 
-function planForm(plan: PlanDocument, { edit }: FormActions): (HTMLElement | null)[] {
+function planForm(plan: PlanDocument, { edit }: EditActions): (HTMLElement | null)[] {
   const set = (values: Partial<PlanDocument>): void => edit({ ...current, ...values });
   return [
     h("h3", {}, "The whole plan"),
@@ -85,7 +79,7 @@ function planForm(plan: PlanDocument, { edit }: FormActions): (HTMLElement | nul
 }
 
 /** Name the rooms with ceilings of their own, to which the height of the plan does not apply. */
-function ownCeilings({ rooms }: PlanDocument, edit: FormActions["edit"]): HTMLElement | null {
+function ownCeilings({ rooms }: PlanDocument, edit: EditActions["edit"]): HTMLElement | null {
   const own = rooms.flatMap(({ name, ceiling_height_m: height }, index) =>
     height == null ? [] : [`${name || `room ${index + 1}`} ${height.toFixed(2)} m`],
   );
@@ -101,7 +95,7 @@ function ownCeilings({ rooms }: PlanDocument, edit: FormActions["edit"]): HTMLEl
 }
 
 /** Checkboxes for the kinds that are shown completely, whose absence then counts as well. */
-function completeKinds(plan: PlanDocument, edit: FormActions["edit"]): HTMLElement {
+function completeKinds(plan: PlanDocument, edit: EditActions["edit"]): HTMLElement {
   const claimed = change.claimedKinds(plan);
   return h(
     "fieldset",
@@ -119,7 +113,7 @@ function completeKinds(plan: PlanDocument, edit: FormActions["edit"]): HTMLEleme
   );
 }
 
-function roomForm(room: RoomDocument, index: number, { edit, select }: FormActions): HTMLElement[] {
+function roomForm(room: RoomDocument, index: number, { edit, select }: EditActions): HTMLElement[] {
   const set = (values: Partial<RoomDocument>): void => edit(change.changeRoom(current, index, values));
   return [
     h("h3", {}, "Room"),
@@ -144,7 +138,7 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: FormActio
   ];
 }
 
-function openingForm(opening: OpeningDocument, index: number, { edit, select }: FormActions): HTMLElement[] {
+function openingForm(opening: OpeningDocument, index: number, { edit, select }: EditActions): HTMLElement[] {
   const set = (values: Partial<OpeningDocument>): void => edit(change.changeOpening(current, index, values));
   return [
     h("h3", {}, "Opening"),
@@ -163,7 +157,7 @@ function openingForm(opening: OpeningDocument, index: number, { edit, select }: 
 }
 
 /** Return the way back to the form of the plan. */
-const wholePlan = (select: FormActions["select"]): HTMLElement =>
+const wholePlan = (select: EditActions["select"]): HTMLElement =>
   button("The whole plan", () => select({ kind: "none" }), { id: "whole-plan" });
 
 function field(id: string, label: string, input: HTMLElement): HTMLElement {

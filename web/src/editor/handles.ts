@@ -1,16 +1,16 @@
 /** Handles of corners, walls and openings, for pointer and keyboard. */
 
 import { ARROWS, followPointer, s, show } from "../dom";
-import { path } from "../plan_drawing";
+import { ends, path } from "../plan_drawing";
 import { placeOf } from "../pose_marker";
 import type { OpeningKind, PlanDocument, Point } from "../types";
 import * as change from "./changes";
 
 export type Selection = { kind: "none" } | { kind: "room"; index: number } | { kind: "opening"; index: number };
 
-export interface HandleActions {
+export interface EditActions {
   /** Another plan; `goesOn` while the user drags. */
-  edit: (plan: PlanDocument, goesOn: boolean) => void;
+  edit: (plan: PlanDocument, goesOn?: boolean) => void;
   select: (selection: Selection) => void;
 }
 
@@ -26,7 +26,7 @@ export class Handles {
 
   constructor(
     private readonly svg: SVGSVGElement,
-    private readonly actions: HandleActions,
+    private readonly actions: EditActions,
   ) {}
 
   /** Draw the handles of the selection and keep the focus. */
@@ -103,10 +103,7 @@ export class Handles {
       const middle: Point = [0.5 * (ax + bx), 0.5 * (ay + by)];
       const split = (): void => this.actions.edit(change.splitWall(this.plan, wall, middle), false);
       const line = s("line", {
-        x1: ax,
-        y1: -ay,
-        x2: bx,
-        y2: -by,
+        ...ends(change.wallOf(this.plan, wall)),
         class: "grab-wall",
         id: `edit-wall-${edge}`,
         tabindex: 0,
@@ -152,10 +149,7 @@ export class Handles {
       if (!isSelected) this.actions.select({ kind: "opening", index });
     };
     const line = s("line", {
-      x1: ax,
-      y1: -ay,
-      x2: bx,
-      y2: -by,
+      ...ends(opening.line),
       class: `grab-opening${isSelected ? " selected" : ""}`,
       id: `edit-opening-${index}`,
       tabindex: 0,
@@ -178,14 +172,14 @@ export class Handles {
       slide(to, goesOn);
     });
     if (!isSelected) return [line];
-    const ends = opening.line.map(([x, y], end) => {
+    const tips = opening.line.map(([x, y], end) => {
       const handle = s("circle", { cx: x, cy: -y, r: 0.9 * this.unit, class: "corner", "aria-hidden": "true" });
       this.drag(handle, (to, goesOn) =>
         this.actions.edit(change.stretchOpening(this.plan, index, end as 0 | 1, to), goesOn),
       );
       return handle;
     });
-    return [line, ...ends];
+    return [line, ...tips];
   }
 
   /** Follow a pointer from its first movement on, even if the handle is redrawn. */

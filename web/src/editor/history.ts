@@ -3,45 +3,37 @@
 const MAX_STEPS = 200;
 
 export class History<T> {
-  private past: T[] = [];
-  private future: T[] = [];
+  private states: T[];
+  private index = 0;
 
-  constructor(private present: T) {}
+  constructor(first: T) {
+    this.states = [first];
+  }
 
   get now(): T {
-    return this.present;
+    return this.states[this.index]!;
   }
 
   get canUndo(): boolean {
-    return this.past.length > 0;
+    return this.index > 0;
   }
 
   get canRedo(): boolean {
-    return this.future.length > 0;
+    return this.index < this.states.length - 1;
   }
 
   /** Add a state; with `goesOn` it replaces the last one, as while dragging. */
-  push(next: T, goesOn = false): void {
-    if (next === this.present) return;
-    if (!goesOn) {
-      this.past.push(this.present);
-      if (this.past.length > MAX_STEPS) this.past.shift();
-    }
-    this.future = [];
-    this.present = next;
+  push(next: T, goesOn: boolean): void {
+    if (next === this.now) return;
+    this.states = [...this.states.slice(0, this.index + (goesOn ? 0 : 1)), next].slice(-MAX_STEPS - 1);
+    this.index = this.states.length - 1;
   }
 
   undo(): void {
-    const before = this.past.pop();
-    if (before === undefined) return;
-    this.future.push(this.present);
-    this.present = before;
+    if (this.canUndo) this.index--;
   }
 
   redo(): void {
-    const after = this.future.pop();
-    if (after === undefined) return;
-    this.past.push(this.present);
-    this.present = after;
+    if (this.canRedo) this.index++;
   }
 }

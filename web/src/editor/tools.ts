@@ -10,11 +10,9 @@ export type Tool = "select" | "room" | OpeningKind | "scale";
 
 export interface ToolActions {
   edit: (plan: PlanDocument) => void;
-  /** The tool has finished. */
   done: () => void;
   /** Two points were clicked; their distance as drawn. */
   measured: (distance: number) => void;
-  /** Show an instruction. */
   instruct: (text: string) => void;
 }
 
@@ -32,7 +30,7 @@ const MAX_OFFSET_UNITS = 4;
 
 export class Tools {
   readonly element = s("g", { class: "tool" });
-  private tool: Tool = "select";
+  current: Tool = "select";
   private points: Point[] = [];
   private unit = 0.1;
   private plan: PlanDocument = { rooms: [] };
@@ -47,19 +45,15 @@ export class Tools {
       if (this.points.length > 0) this.draw(this.snap(placeOf(svg, event)));
     });
     addEventListener("keydown", (event) => {
-      if (this.tool === "select") return;
+      if (this.current === "select") return;
       if (event.key === "Escape") this.choose("select");
-      if (event.key === "Enter" && this.tool === "room" && this.points.length > 2) this.close();
+      if (event.key === "Enter" && this.current === "room" && this.points.length > 2) this.close();
     });
   }
 
-  get current(): Tool {
-    return this.tool;
-  }
-
   choose(tool: Tool): void {
-    const wasOther = tool !== this.tool;
-    this.tool = tool;
+    const wasOther = tool !== this.current;
+    this.current = tool;
     this.points = [];
     this.svg.classList.toggle("pointing", tool !== "select");
     this.actions.instruct(HINTS[tool]);
@@ -77,7 +71,7 @@ export class Tools {
     const within = this.unit;
     const to = change.snapped(this.plan, place, within);
     // Snap nearly straight walls, as most are parallel to the axes.
-    if (this.tool !== "room" || previous === undefined) return to;
+    if (this.current !== "room" || previous === undefined) return to;
     const first = this.points[0]!;
     const align = (axis: 0 | 1): number =>
       [previous[axis], first[axis]].find((value) => Math.abs(value - place[axis]) < within) ?? to[axis];
@@ -85,13 +79,13 @@ export class Tools {
   }
 
   private onDown(event: PointerEvent): void {
-    if (this.tool === "select" || event.button !== 0) return;
+    if (this.current === "select" || event.button !== 0) return;
     event.preventDefault();
     event.stopPropagation();
     const place = placeOf(this.svg, event);
-    if (this.tool === "room") this.addCorner(this.snap(place), place);
-    else if (this.tool === "scale") this.addMeasured(place);
-    else this.putOpening(this.tool, place);
+    if (this.current === "room") this.addCorner(this.snap(place), place);
+    else if (this.current === "scale") this.addMeasured(place);
+    else this.putOpening(this.current, place);
   }
 
   private addCorner(corner: Point, place: Point): void {
@@ -134,7 +128,7 @@ export class Tools {
 
   private draw(ahead: Point | null): void {
     const points =
-      ahead === null || (this.tool === "scale" && this.points.length === 2) ? this.points : [...this.points, ahead];
+      ahead === null || (this.current === "scale" && this.points.length === 2) ? this.points : [...this.points, ahead];
     show(
       this.element,
       points.length > 1 && s("path", { class: "drawn", d: path(points).slice(0, -1) }),

@@ -1,10 +1,15 @@
 /** Picture that shows through the rooms, to draw over and to check them, from the plan's origin to the right and up. */
 
+import { api } from "../api";
 import { h, s, show } from "../dom";
-import { InputError } from "../notices";
+import { loadPicture } from "../pictures";
+import type { Plan } from "../types";
 
 const FIRST_WIDTH_M = 12;
 const FIRST_SHARE = 0.6;
+// Note of reports without the angle, by which earlier versions turned the picture.
+const TURNED = /\bturned by\b/;
+const MAX_KEPT = 4;
 
 /** A picture and its place below a plan; without a scale it is 12 m wide. */
 export interface Traced {
@@ -13,6 +18,31 @@ export interface Traced {
   metresPerPixel?: number;
   /** Clockwise rotation about its centre. */
   turnedDeg?: number;
+}
+
+/** Pictures that lie below plans again without being asked for. */
+export class TracedPictures {
+  /** The latest pictures below plans that were stored on this page, by the ids of the plans. */
+  private readonly kept = new Map<string, Traced>();
+
+  /** Keep the picture below a plan that is stored. */
+  keep(planId: string, traced: Traced | null): void {
+    if (traced === null) return;
+    this.kept.delete(planId);
+    this.kept.set(planId, traced);
+    for (const oldest of [...this.kept.keys()].slice(0, -MAX_KEPT)) this.kept.delete(oldest);
+  }
+
+  /** Return the picture that a plan was drawn over or read from; null if there is none, or its angle is unknown. */
+  async of(plan: Plan): Promise<Traced | null> {
+    const kept = this.kept.get(plan.id),
+      report = plan.import_report;
+    if (kept !== undefined) return kept;
+    if (report?.format !== "picture") return null;
+    const { metres_per_unit: metresPerPixel, turned_deg: turnedDeg } = report;
+    if (turnedDeg === 0 && report.notes.some((note) => TURNED.test(note))) return null;
+    return { file: await api.original(plan.id), name: plan.name, metresPerPixel, turnedDeg };
+  }
 }
 
 export class Underlay {
@@ -42,17 +72,9 @@ export class Underlay {
   /** Lay a picture under the plan. Rejects if the file is not a picture. */
   async lay(traced: Traced): Promise<void> {
     const { file, name, metresPerPixel } = traced;
-    const url = URL.createObjectURL(file);
-    const picture = new Image();
-    picture.src = url;
-    try {
-      await picture.decode();
-    } catch {
-      URL.revokeObjectURL(url);
-      throw new InputError(`The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
-    }
+    const picture = await loadPicture(file, `The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
     this.remove();
-    this.url = url;
+    this.url = picture.src;
     this.laid = traced;
     this.size = { width: picture.naturalWidth, height: picture.naturalHeight };
     this.metresPerPixel = metresPerPixel ?? FIRST_WIDTH_M / picture.naturalWidth;

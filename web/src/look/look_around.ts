@@ -1,6 +1,7 @@
 /** “Look around”: the rear camera takes the photographs of a turn by itself, and shows the plan's lines afterwards. */
 
 import { button, h } from "../dom";
+import { acceptChoice } from "../drops";
 import { clearError, showError } from "../notices";
 import { FrameJudge, takeFrame } from "./frames";
 import { drawLive, type LiveAnswer } from "./live_lines";
@@ -14,11 +15,10 @@ const TICK_MS = 120,
 const REFUSED =
   "The motion sensors are not allowed, so the photographs tell the angles by overlap. Safari asks once only: load the page again to be asked.";
 
-export interface LookActions {
+export interface Finder {
   /** Find the place of frames, with their directions (degrees) if a gyroscope told them; null if it was stopped. */
-  find: (frames: File[], directions: number[] | null, signal: AbortSignal) => Promise<FoundPlace | null>;
-  /** Find the place of a film. */
-  findFilm: (film: File, signal: AbortSignal) => Promise<boolean>;
+  findTurn(frames: File[], directions: number[] | null, signal: AbortSignal): Promise<FoundPlace | null>;
+  findFilm(film: File, signal: AbortSignal): Promise<boolean>;
 }
 
 /** Answer in words, and for the live picture; null until the walls of its plan are loaded. */
@@ -78,10 +78,10 @@ export class LookAround {
   private said: Hint | null = null;
   private isTaking = false;
 
-  constructor(private readonly actions: LookActions) {
+  constructor(private readonly finder: Finder) {
     document.body.append(this.dialog);
     this.dialog.addEventListener("close", () => this.stop());
-    this.film.addEventListener("change", () => void this.localiseFilm());
+    acceptChoice(this.film, ([film]) => void this.localiseFilm(film!));
     // The camera's light goes out when the page is left, too.
     addEventListener("pagehide", () => this.dialog.close());
     document.addEventListener("visibilitychange", () => {
@@ -89,7 +89,6 @@ export class LookAround {
     });
   }
 
-  /** Open the dialog and begin. */
   async open(): Promise<void> {
     this.begin();
     this.found = this.live = null;
@@ -180,7 +179,6 @@ export class LookAround {
     else if (this.turn.wants(hint)) await this.takeNow();
   }
 
-  /** Take the current frame. */
   private async takeNow(): Promise<void> {
     if (this.isTaking || this.state !== "looking" || this.video.videoWidth === 0) return;
     this.isTaking = true;
@@ -206,7 +204,7 @@ export class LookAround {
     const { signal } = (this.query = new AbortController());
     try {
       const directions = this.turn.hasGyroscope ? this.turn.taken.map((yaw) => yaw - this.turn.taken[0]!) : null;
-      const found = await this.actions.find(this.frames, directions, signal);
+      const found = await this.finder.findTurn(this.frames, directions, signal);
       if (found === null || signal.aborted) return;
       this.state = "found";
       this.found = found;
@@ -223,15 +221,12 @@ export class LookAround {
     }
   }
 
-  private async localiseFilm(): Promise<void> {
-    const film = this.film.files?.[0];
-    this.film.value = "";
-    if (film === undefined) return;
+  private async localiseFilm(film: File): Promise<void> {
     clearError(this.error);
     this.hint.textContent = `Reading “${film.name}”…`;
     const { signal } = (this.query = new AbortController());
     try {
-      if (await this.actions.findFilm(film, signal)) this.dialog.close();
+      if (await this.finder.findFilm(film, signal)) this.dialog.close();
     } catch (error) {
       if (signal.aborted) return;
       this.hint.textContent = "";

@@ -50,7 +50,6 @@ export function cameraAttitude(alpha: number, beta: number, gamma: number, scree
   };
 }
 
-/** Follows the phone's sensors. */
 export class Orientation {
   /** Latest attitude; null on devices without a gyroscope, and without the permission. */
   attitude: Attitude | null = null;

@@ -4,13 +4,11 @@ import { encode } from "uqr";
 
 import { button, h, s, show } from "../dom";
 
-/** Return the address of a plan on this page. */
-export const planLink = (planId: string): string => `${location.origin}${location.pathname}#plan=${planId}`;
-
 export class PhoneLink {
   private readonly code = h("div", { class: "qr" });
   private readonly link = h("a", {});
   private readonly warning = h("p", { class: "hint" });
+  private readonly close = button("Close", () => this.dialog.close());
   private readonly dialog = h(
     "dialog",
     { id: "phone-dialog", "aria-labelledby": "phone-title" },
@@ -18,20 +16,15 @@ export class PhoneLink {
     this.code,
     h("p", {}, this.link),
     this.warning,
-    h(
-      "div",
-      { class: "ask" },
-      button("Close", () => this.dialog.close()),
-    ),
+    h("div", { class: "ask" }, this.close),
   );
 
   constructor() {
     document.body.append(this.dialog);
   }
 
-  /** Show the code of a plan. */
   open(planId: string): void {
-    const address = planLink(planId),
+    const address = `${location.origin}${location.pathname}#plan=${planId}`,
       { data, size } = encode(address, { border: 2 });
     const dark = data.flatMap((row, y) => row.flatMap((isDark, x) => (isDark ? [`M${x} ${y}h1v1h-1z`] : [])));
     show(

@@ -25,7 +25,6 @@ export interface Moment {
   isWalking: boolean;
   /** Seconds since the moment before; 0 for the first. */
   passed: number;
-  /** The picture is higher than wide. */
   isUpright: boolean;
 }
 
@@ -44,7 +43,6 @@ export const HINTS: Record<Hint, string> = {
 /** Return an angle between -180° and 180°. */
 export const wrapped = (angle: number): number => ((((angle + 180) % 360) + 360) % 360) - 180;
 
-/** Follows the camera from frame to frame. */
 export class Turn {
   /** Direction of the camera, degrees clockwise from where it first looked. */
   yaw = 0;
