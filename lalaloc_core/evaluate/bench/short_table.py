@@ -1,4 +1,4 @@
-"""Short table of a model: walls and openings by azimuth on pictures by others, in a minute; a line of it for each run.
+"""Short table of a model: walls, openings and types of rooms in pictures by others, in a minute; a line for each run.
 
 FOLDER/<stage>.pt   weights of a run in half precision, which `lalaloc lab train --from` and `lab export` read
 FOLDER/runs.csv     a line for each time they were kept: hours and pictures of the run, notes, and the table
@@ -58,7 +58,8 @@ def _figures(
     spheres = summarise_azimuths([item.measures for item in read], OPENING_CLASSES)
     figures = _rows(f"{name} spheres", spheres)
     for field_deg in fields_deg:
-        figures |= _rows(f"{name} view {field_deg:g}", read_views(encoders, read, field_deg, views).by_reader["view"])
+        seen, row = read_views(encoders, read, field_deg, views), f"{name} view {field_deg:g}"
+        figures |= _rows(row, seen.by_reader["view"]) | {f"{row}: {kind}": value for kind, value in seen.types.items()}
     return figures
 
 

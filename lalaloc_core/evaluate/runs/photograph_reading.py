@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom
@@ -45,10 +45,13 @@ class ReadViews:
             "sphere" is the encoder of spheres with the whole photograph in sight, "constant" the median annotated
             distance everywhere.
         walls_within: shares of the views whose lines tell the direction of the walls within some degrees.
+        types: of views of rooms of a known type, the share whose objects tell it first, that of those with a recognised
+            object, and the mean log probability of the type; empty without objects.
     """
 
     by_reader: dict[str, AzimuthSummary]
     walls_within: dict[str, float]
+    types: dict[str, float]
 
 
 def read_photographs(encoders: PhotographEncoder, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
@@ -80,6 +83,7 @@ def read_views(
     constant = np.log(np.median(np.concatenate(annotated_m)))
     measures: dict[str, list[AzimuthMeasures]] = {"view": [], "sphere": [], "constant": []}
     misaligned_deg: list[float] = []
+    types: list[tuple[bool, bool, float]] = []
     for item in read:
         photograph, sphere = item.photograph, CachedSphere(item.photograph.photograph)
         width = len(item.profile_m)
@@ -94,6 +98,10 @@ def read_views(
             opened = view.open(size)
             query = encoders.query(opened, azimuth, CameraHeight(CAMERA_HEIGHT_M, 0.0))
             misaligned_deg.append(_misaligned_deg(opened, azimuth, photograph.outlines[0]))
+            kind = ROOM_TYPES.index(photograph.outlines[0].room_type)
+            if query.objects is not None and kind:
+                log = query.objects.room_type.log_probability
+                types.append((int(log.argmax()) == kind, bool(query.objects.objects), float(log[kind])))
             log_m, log_scale, scores = _azimuths(query, encoders.manifest.name)
             seen = np.isfinite(log_scale)
             readings = {
@@ -107,7 +115,16 @@ def read_views(
                 measures[reader].append(measure_azimuths(true_m, walls[seen], scale[seen], classes[seen], kinds))
     within = {f"{limit:g}": float(np.mean(np.array(misaligned_deg) < limit)) for limit in _DIRECTION_LIMITS_DEG}
     summaries = {reader: summarise_azimuths(of, OPENING_CLASSES) for reader, of in measures.items()}
-    return ReadViews(by_reader=summaries, walls_within=within)
+    return ReadViews(by_reader=summaries, walls_within=within, types=_of_types(types))
+
+
+def _of_types(views: Sequence[tuple[bool, bool, float]]) -> dict[str, float]:
+    """Return the figures of views, each with whether the type is right and an object named, and its log probability."""
+    if not views:
+        return {}
+    named = [is_right for is_right, is_named, _ in views if is_named]
+    share, _, log = (float(np.mean(values)) for values in zip(*views, strict=True))
+    return {"types": share, "types with an object": float(np.mean(named)) if named else 0.0, "types log": log}
 
 
 def read_azimuths(
