@@ -191,23 +191,38 @@ async def list_album_photographs(
     page, more = found[:count], None
     if len(found) > count:
         more = cursor_text(VenuePlace(float(page[-1].number), page[-1].id))
-    photographs = [_photograph_answer(record) for record in page]
-    if floorplan_id is not None:
-        photographs = [row for row in photographs if row.pin and row.pin.place and _plan_of(row) == floorplan_id]
     headers = VARY | ({} if more is None else {"Link": f'<?cursor={more}>; rel="next"'})
-    if media == JSON:
-        answer = AlbumPhotographList(photographs=photographs, next_cursor=more)
-        return Response(answer.model_dump_json(), headers=headers, media_type=JSON)
+    # On threads, as the pins of 500 photographs are megabytes.
+    if media == _SVG:
+        drawing = await _drawing(call, album, await call.process(_answers, page, floorplan_id), floorplan_id)
+        return Response(drawing, headers=headers | _INERT, media_type=_SVG)
     if media == _CSV:
-        name = {"Content-Disposition": 'attachment; filename="album.csv"'}
-        return Response(pins_csv(photographs), headers=headers | name, media_type=_CSV)
-    if media == GEOJSON:
-        features = pins_geojson(photographs)
-        if features is None:
-            raise errors.UnanchoredPlanError(_plan_of(next(row for row in photographs if row.pin)), album.venue_id)
-        return Response(json.dumps(features), headers=headers, media_type=GEOJSON)
-    drawing = await _drawing(call, album, photographs, floorplan_id)
-    return Response(drawing, headers=headers | _INERT, media_type=_SVG)
+        headers |= {"Content-Disposition": 'attachment; filename="album.csv"'}
+    content = await call.process(_content, media, album, page, floorplan_id, more)
+    return Response(content, headers=headers, media_type=media)
+
+
+def _answers(records: Sequence[PhotographRecord], floorplan_id: str | None) -> list[AlbumPhotographAnswer]:
+    """Return photographs with their pins; those of one plan, if it is named."""
+    photographs = [_photograph_answer(record) for record in records]
+    if floorplan_id is None:
+        return photographs
+    return [row for row in photographs if row.pin and row.pin.place and _plan_of(row) == floorplan_id]
+
+
+def _content(
+    media: str, album: AlbumRecord, page: Sequence[PhotographRecord], floorplan_id: str | None, more: str | None
+) -> bytes:
+    """Return photographs as JSON, CSV or GeoJSON; `more` is the cursor of the next page."""
+    photographs = _answers(page, floorplan_id)
+    if media == JSON:
+        return AlbumPhotographList(photographs=photographs, next_cursor=more).model_dump_json().encode()
+    if media == _CSV:
+        return pins_csv(photographs)
+    features = pins_geojson(photographs)
+    if features is None:
+        raise errors.UnanchoredPlanError(_plan_of(next(row for row in photographs if row.pin)), album.venue_id)
+    return json.dumps(features).encode()
 
 
 async def _drawing(
@@ -224,8 +239,12 @@ async def _drawing(
     except errors.UnknownRevisionError:
         plan, _ = await asyncio.to_thread(call.plan_at_revision, plan_id, None)
     rooms = await call.rendition(plan, "preview")
-    head, tail = pins_svg(f"{plan.name}: {album.name}", rooms.bounds_m, photographs)
-    return head.encode() + rooms.content.replace(_HEAT, b"") + tail.encode()
+
+    def draw() -> bytes:
+        head, tail = pins_svg(f"{plan.name}: {album.name}", rooms.bounds_m, photographs)
+        return head.encode() + rooms.content.replace(_HEAT, b"") + tail.encode()
+
+    return await call.process(draw)
 
 
 @router.get("/{photograph_id}", summary="Get a photograph of an album", **reads(AlbumPhotographAnswer, *_MISSING))

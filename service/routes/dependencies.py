@@ -144,6 +144,10 @@ class ApiCall:
         """Read the store on a thread with a timeout; see `BoundedReads.run`."""
         return await self.runtime.reads.run(self.tenant, work, *args, **kwargs)
 
+    async def process(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run work on what was read, on the same threads; see `BoundedReads.process`."""
+        return await self.runtime.reads.process(self.tenant, work, *args, **kwargs)
+
     def reading(self) -> AbstractAsyncContextManager[None]:
         """Return a block that holds a permit to read, for answers that are read part by part."""
         return reading(self.request.scope)

@@ -24,6 +24,7 @@ from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
 from service.query import AlbumOutcome, album_search
 from service.query.album_answers import compose_outcome
+from service.routes import album_photographs
 from service.schemas.albums import PinAnswer
 from service.storage.store import Store
 from service.storage.tables import ALBUMS
@@ -173,6 +174,23 @@ def test_pins_as_geojson_csv_and_svg(client: httpx.Client, solved: str, plan_id:
     assert "script" not in drawing.text
     bare = create(client, upload(client, FLAT))
     assert client.get(f"/albums/{bare}/photographs", headers={"Accept": "text/csv"}).text.count("\n") == 1
+
+
+@pytest.mark.one_replica
+def test_pins_are_read_and_written_beside_the_event_loop(
+    client: httpx.Client, solved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = set[str]()
+
+    def noted(work: Any, *args: Any, **options: Any) -> Any:
+        threads.add(threading.current_thread().name.partition("_")[0])
+        return work(*args, **options)
+
+    for name in ("_photograph_answer", "AlbumPhotographList", "pins_csv", "pins_geojson", "pins_svg"):
+        monkeypatch.setattr(album_photographs, name, partial(noted, getattr(album_photographs, name)))
+    for media in ("application/json", "text/csv", "application/geo+json", "image/svg+xml"):
+        assert client.get(f"/albums/{solved}/photographs", headers={"Accept": media}).status_code == 200
+    assert threads == {"lalaloc-reads"}
 
 
 @pytest.mark.slow
