@@ -149,6 +149,9 @@ class AlbumSolver:
             logging.getLogger(LOGGER_NAME).info("album waits", extra={"fields": fields})
             raise errors.StoreUnavailableError from error
         except Exception:
+            # A solve that was stopped, as its album was deleted or another replica has it, did not fail.
+            if progress.stopped:
+                return
             failed = True
             raise
         finally:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import io
 import json
 import threading
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +24,7 @@ from lalaloc_core.localise.album.pins import Album, Pin, PinPose
 from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
+from service.albums.album_solver import AlbumSolver
 from service.query import AlbumOutcome, album_search
 from service.query.album_answers import compose_outcome
 from service.routes import album_photographs
@@ -600,3 +603,26 @@ def test_pin_in_a_plan_that_is_not_searched_now_moved_only_if_the_venue_changed(
     first = outcome("a", {}, is_same=False)
     moved = PinAnswer.model_validate_json(outcome("b", dict(first.pins), is_same=is_same_place).pins["p"]).moved
     assert (moved is None) == is_same_place
+
+
+def solver_of(**jobs: Any) -> AlbumSolver:
+    """Return a solver with stand-ins for the rest of the service."""
+
+    async def run(_: str, work: Any, *args: Any, **options: Any) -> Any:
+        return work(*args, **options)
+
+    rest: Any = SimpleNamespace(album_jobs=SimpleNamespace(**jobs), run=run, model=SimpleNamespace(sha256=""))
+    rest.grids, rest.album_seconds = SimpleNamespace(grid_lease_s=0.1, sweep_s=0.1), SimpleNamespace(time=nullcontext)
+    return AlbumSolver(rest, rest, rest, rest, rest, rest)
+
+
+def test_solve_of_a_deleted_album_does_not_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def stopped(_: Any, _job: Any, progress: Any) -> None:
+        while not progress.stopped:
+            await asyncio.sleep(0.01)
+        raise ValueError("stopped")
+
+    monkeypatch.setattr(AlbumSolver, "_pin", stopped)
+    job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
+    solver = solver_of(renew=lambda *_: False, release=lambda *_, **__: None)
+    asyncio.run(solver._attempt(job))
