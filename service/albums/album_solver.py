@@ -89,8 +89,12 @@ class AlbumSolver:
         self._loop = asyncio.get_running_loop()
         try:
             while True:
-                with suppress(errors.StoreUnavailableError):
-                    await self._begin_due()
+                try:
+                    with suppress(errors.StoreUnavailableError):
+                        await self._begin_due()
+                except Exception:
+                    # The next look may succeed, and nobody sees the end of this task.
+                    logging.getLogger(LOGGER_NAME).exception("looking for albums to solve failed")
                 with suppress(TimeoutError):
                     async with asyncio.timeout(self._settings.grids.sweep_s):
                         await self._changed.wait()

@@ -626,3 +626,13 @@ def test_solve_of_a_deleted_album_does_not_fail(monkeypatch: pytest.MonkeyPatch)
     job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
     solver = solver_of(renew=lambda *_: False, release=lambda *_, **__: None)
     asyncio.run(solver._attempt(job))
+
+
+def test_solver_goes_on_after_an_error() -> None:
+    looks = iter([ValueError("damaged"), asyncio.CancelledError()])
+
+    def due(*_: Any) -> Any:
+        raise next(looks)
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(solver_of(due=due).run())
