@@ -14,8 +14,9 @@ from service.storage.stored_bytes import ROW_BYTES, deleted_bytes
 from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, FLOORPLANS, VENUE_PLANS, VENUES
 
 AlbumState = Literal["empty", "solving", "solved", "failed", "outdated"]
-# Bytes that count as stored for a correction and a pin, and for the common part of a solution, whatever their size.
-_PIN_BYTES, _SOLUTION_BYTES = 2048, 2048
+# Bytes that count as stored for a correction and a pin with all its rooms and suggestions, and for the common part of a
+# solution, whatever their size: a solve changes nothing that counts.
+_PIN_BYTES, _SOLUTION_BYTES = 4096, 2048
 # Columns of `PhotographRecord`.
 _LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in ("album_id", "entry", "stored_bytes")]
 

@@ -20,7 +20,7 @@ from sqlalchemy import update
 
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.localise.album.pins import Album, Pin, PinPose
+from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, Suggestion
 from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
@@ -29,7 +29,9 @@ from service.query import AlbumOutcome, album_search
 from service.query.album_answers import compose_outcome
 from service.routes import album_photographs
 from service.schemas.albums import PinAnswer
+from service.storage.album_rows import NewPhotograph
 from service.storage.store import Store
+from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import ALBUMS
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
@@ -636,3 +638,14 @@ def test_solver_goes_on_after_an_error() -> None:
 
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(solver_of(due=due).run())
+
+
+def test_pin_with_all_suggestions_takes_no_more_than_counts_as_stored() -> None:
+    place = {"plan_id": "f" * 32, "room_id": "living-room", "room": "living room"}
+    pose, rooms = PinPose(**place, x_m=1.25, y_m=2.25, heading=1.0), (RoomShare(**place, probability=0.1),) * 8
+    found = (Suggestion(pose=pose, probability=0.2),) * 5
+    pin = Pin(photograph_id="p", state="sure", pose=pose, confidence=1.0, within_1m=1.0, rooms=rooms, suggestions=found)
+    record: Any = SimpleNamespace(id=pose.plan_id, revision_id="e" * 32)
+    ground: Any = SimpleNamespace(records=[record], levels=[0.0], anchors=[None], warnings=[])
+    text = compose_outcome(Album(pins=(pin,)), ground, {}, {}, 1.5, is_same_place=True).pins["p"]
+    assert len(text) <= NewPhotograph(sha256="", name=None, facts="", entry=b"").stored_bytes - ROW_BYTES
