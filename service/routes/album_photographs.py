@@ -221,7 +221,8 @@ def _content(
         return pins_csv(photographs)
     features = pins_geojson(photographs)
     if features is None:
-        raise errors.UnanchoredPlanError(_plan_of(next(row for row in photographs if row.pin)), album.venue_id)
+        placed = next(row for row in photographs if row.pin and row.pin.place)
+        raise errors.UnanchoredPlanError(_plan_of(placed), album.venue_id)
     return json.dumps(features).encode()
 
 

@@ -25,6 +25,7 @@ from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
 from service.albums.album_solver import AlbumSolver
+from service.errors import UnanchoredPlanError
 from service.query import AlbumOutcome, album_search
 from service.query.album_answers import compose_outcome
 from service.routes import album_photographs
@@ -649,3 +650,13 @@ def test_pin_with_all_suggestions_takes_no_more_than_counts_as_stored() -> None:
     ground: Any = SimpleNamespace(records=[record], levels=[0.0], anchors=[None], warnings=[])
     text = compose_outcome(Album(pins=(pin,)), ground, {}, {}, 1.5, is_same_place=True).pins["p"]
     assert len(text) <= NewPhotograph(sha256="", name=None, facts="", entry=b"").stored_bytes - ROW_BYTES
+
+
+def test_plan_without_an_anchor_is_named_beside_a_pin_set_aside(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = None, SimpleNamespace(floorplan_id="f")
+    rows = [SimpleNamespace(pin=SimpleNamespace(place=place, geopose=None)) for place in places]
+    monkeypatch.setattr(album_photographs, "_answers", lambda *_: rows)
+    monkeypatch.setattr(album_photographs, "pins_geojson", lambda _: None)
+    album: Any = SimpleNamespace(venue_id=None)
+    with pytest.raises(UnanchoredPlanError, match="'f'"):
+        album_photographs._content("application/geo+json", album, [], None, None)
