@@ -72,7 +72,7 @@ def test_scanned_plans_are_drawings(seed: int) -> None:
 
 
 def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked() -> None:
-    with pytest.raises(InvalidFloorPlanError, match="is a photograph, not a floor plan"):
+    with pytest.raises(InvalidFloorPlanError, match="looks like a photograph, not like a floor plan"):
         import_plan((EXAMPLES / "real/hotel_room.jpg").read_bytes())
 
 
