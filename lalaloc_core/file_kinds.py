@@ -177,8 +177,12 @@ class Tones:
 
     @property
     def is_photograph(self) -> bool:
-        """True for photographs of rooms and landscapes, and for no drawing; pale photographs give False."""
-        return self.flat < _MAX_FLAT_OF_PHOTOGRAPHS and self.spread > _MIN_SPREAD_OF_PHOTOGRAPHS
+        """True for photographs of rooms and landscapes, and for no drawing; pale photographs give False.
+
+        Plans with coloured rooms or a dark site are as uneven, but have the lines and flat areas of `is_drawing`.
+        """
+        is_uneven = self.flat < _MAX_FLAT_OF_PHOTOGRAPHS and self.spread > _MIN_SPREAD_OF_PHOTOGRAPHS
+        return is_uneven and not self.is_drawing
 
     @property
     def is_drawing(self) -> bool:

@@ -39,6 +39,7 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     )
     for name, meaning in _OPTIONS.items():
         group.add_argument(f"--{name}", help=meaning)
+    group.add_argument("--is-plan", action="store_true", help="read a picture that looks like a photograph as a plan")
 
 
 def read_plans(file: Path, arguments: argparse.Namespace, trace: Trace | None = None) -> tuple[ImportedPlan, ...]:
@@ -47,6 +48,7 @@ def read_plans(file: Path, arguments: argparse.Namespace, trace: Trace | None = 
     from lalaloc_core.importers import ImportOptions, building_name, import_plans
 
     values = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
+    values["plan"] = "true" if arguments.is_plan else None
     options = ImportOptions.from_text({name: value for name, value in values.items() if value is not None})
     content = plan_content(file)
     with _progress_line(file.name) as on_step:

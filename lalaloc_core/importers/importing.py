@@ -148,7 +148,7 @@ _FORMATS = (
     _format("svg", "SVG", "image/svg+xml", "svg", f"units scale layers y_axis crop {_SCALE}", magic=_xml("svg")),
     _format("ifc", "IFC", "application/x-step", "ifc", "level", magic=re.compile(_START + rb"ISO-10303-21"),
             extra="ifc"),
-    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop {_SCALE}",
+    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop plan {_SCALE}",
             magic=re.compile(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff")),
     _format("pdf", "PDF", "application/pdf", "pdf", f"scale page crop {_SCALE}",
             magic=re.compile(rb".{0,1019}%PDF-", re.DOTALL)),
@@ -194,12 +194,19 @@ def import_plans(
     except InvalidInputError:
         raise
     except Exception as error:
-        if not _lacks_memory(error):
-            raise
-        raise InvalidFloorPlanError(
-            "the file needs more memory than is available (LALALOC_IMPORT_MEMORY_BYTES in the service); export a "
-            "single storey, or a smaller picture"
-        ) from error
+        if _lacks_memory(error):
+            raise InvalidFloorPlanError(
+                "the file needs more memory than is available (LALALOC_IMPORT_MEMORY_BYTES in the service); export a "
+                "single storey, or a smaller picture"
+            ) from error
+        # OpenCV is loaded with pictures only, so its errors are known by their module.
+        if type(error).__module__ == "cv2":
+            named = f" of '{building}'" if building else ""
+            raise InvalidFloorPlanError(
+                f"the picture{named} cannot be read: measuring its lines failed; check the scale (metres_per_pixel, "
+                "known_distance or scale), crop it to one storey (crop), or save it in another size"
+            ) from error
+        raise
     building = options.name or building
     if building is not None:
         several = len(plans) > 1

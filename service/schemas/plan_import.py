@@ -43,6 +43,9 @@ class _FileOptions(BaseModel):
     ceiling_height_m: float | None = Field(
         None, ge=1, le=20, description="Ceiling height of rooms without one in the file. Default: 2.5 m."
     )
+    plan: bool | None = Field(
+        None, description="True: the picture is a plan, although it looks like a photograph. Default: false."
+    )
 
 
 class ImportForm(_FileOptions):

@@ -38,6 +38,13 @@ def test_plain_pictures_are_neither(shade: int) -> None:
     assert Tones.of(np.zeros((8, 900), np.uint8)) is None
 
 
+@pytest.mark.parametrize(("still", "edges"), [(0.85, 0.06), (0.6, 0.06), (0.85, 0.02)])
+def test_uneven_picture_with_lines_and_flat_areas_is_no_photograph(still: float, edges: float) -> None:
+    # Flat, spread, darkest, uniform, ink, strokes, between and step are those of a plan with coloured rooms.
+    tones = Tones(0.5, 120.0, 100.0, 0.4, 0.1, 0.1, 0.2, 50.0, still, edges)
+    assert tones.is_photograph != (still > 0.75 and edges > 0.035)
+
+
 @pytest.mark.parametrize("style", STYLES)
 def test_drawn_and_scanned_plans_are_not_taken_for_photographs(style: Style) -> None:
     drawn = draw_plan(style, 3)
@@ -65,7 +72,7 @@ def test_scanned_plans_are_drawings(seed: int) -> None:
 
 
 def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked() -> None:
-    with pytest.raises(InvalidFloorPlanError, match="is a photograph, not a floor plan"):
+    with pytest.raises(InvalidFloorPlanError, match="looks like a photograph, not like a floor plan"):
         import_plan((EXAMPLES / "real/hotel_room.jpg").read_bytes())
 
 

@@ -20,7 +20,7 @@ from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from tests.importers.conftest import FLAT, dxf_file
-from tests.importers.test_pictures import open_hall
+from tests.importers.test_pictures import hall_beside_a_photograph, open_hall
 
 ROOM = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]]}}
 
@@ -134,6 +134,16 @@ def test_area_without_a_room_is_drawn(tmp_path: Path):
     # The view shows the whole area, to x = 9.8 m.
     left, _, width, _ = (float(value) for value in re.findall(r'viewBox="([^"]*)"', drawn)[0].split())
     assert left + width > 9.8
+
+
+def test_picture_that_looks_like_a_photograph_is_read_with_is_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    picture = tmp_path / "hall.png"
+    picture.write_bytes(hall_beside_a_photograph())
+    arguments = ["plan", "check", str(picture), "--metres-per-pixel", "0.01", "--crop", "0,0,1100,500"]
+    assert main(arguments) == 2
+    assert "if it is a plan, set plan=true (--is-plan on the command line)" in capsys.readouterr().err
+    assert main([*arguments, "--is-plan"]) == 0
+    assert "2 rooms" in capsys.readouterr().out
 
 
 def test_legend_lies_below_areas_without_a_room():

@@ -244,6 +244,11 @@ def test_reading_texts_ends_with_its_share_of_the_time():
     assert budget.elapsed_s < 15.0
 
 
+def test_lines_that_are_both_beside_a_high_text_are_joined_from_left_to_right():
+    runs = [(100.0, 130.0, 50.0, 1), (5.0, 40.0, 50.0, 1)]
+    assert lettering._join_runs(runs, [np.array([60.0, 0.0, 70.0, 100.0])]) == [(5.0, 130.0, 50.0, 1)]
+
+
 @pytest.mark.slow
 def test_lack_of_memory_leaves_the_rooms_without_names(tmp_path: Path):
     page = PrintedPlan()

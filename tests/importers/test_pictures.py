@@ -91,6 +91,13 @@ def open_hall(gap_m: float = 2.4) -> bytes:
     return picture_file(page)
 
 
+def hall_beside_a_photograph() -> bytes:
+    """Return the closed hall, 1100 x 500 pixels, beside patches of dark tones, which look like a photograph."""
+    hall = np.asarray(Image.open(io.BytesIO(open_hall(0.0))))
+    patches = np.random.default_rng(0).integers(40, 140, (50, 90), np.uint8).repeat(10, axis=0).repeat(10, axis=1)
+    return picture_file(np.hstack([hall, patches]))
+
+
 @pytest.mark.parametrize("gap_m", [0.0, 2.4])
 def test_area_without_rooms_is_reported(gap_m: float):
     plan = import_plan(open_hall(gap_m), ImportOptions(metres_per_pixel=0.01))

@@ -6,7 +6,9 @@ import json
 import random
 import re
 from collections.abc import Iterator
+from unittest.mock import Mock
 
+import cv2
 import pypdfium2
 import pytest
 from PIL import Image
@@ -108,3 +110,10 @@ def test_page_that_is_painted_over_and_over_is_refused_before_it_is_rendered(mon
     monkeypatch.setattr(pypdfium2.PdfPage, "render", pytest.fail)
     with pytest.raises(InvalidInputError, match="cover it more than 1000 times"):
         import_plans(pdf(b"0 0 800 800 re f " * 1100), _SCALE)
+
+
+def test_error_of_a_step_on_a_picture_is_a_refusal(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cv2, "threshold", Mock(side_effect=cv2.error("OpenCV: Assertion failed in function 'resize'")))
+    with pytest.raises(InvalidInputError, match=r"the picture of 'house' cannot be read.* check the scale") as caught:
+        import_plans(_whole("picture"), _SCALE, building="house")
+    assert INTERNAL.search(str(caught.value)) is None

@@ -24,7 +24,7 @@ from lalaloc_core.importers import Anchor, export_plan
 from tests.importers.conftest import EXTERNAL_ENTITY, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_ifc import DUPLEX, ifc_flat
-from tests.importers.test_pictures import open_hall, vector_pdf
+from tests.importers.test_pictures import hall_beside_a_photograph, open_hall, vector_pdf
 from tests.painted import picture_file
 from tests.service.conftest import StartApp, assert_problem, document_of, end_time_limits, localise, wait_for
 
@@ -232,6 +232,7 @@ def test_sample_model_of_two_storeys(client: httpx.Client) -> None:
         ({"page": "0"}, "page", "between 1 and"),
         ({"y_axis": "left"}, "y_axis", "set it to up or down"),
         ({"scale": "1:50", "metres_per_pixel": "0.01"}, "scale", "give only one of them"),
+        ({"plan": "perhaps"}, "plan", "must be true or false"),
         ({"color": "red"}, "color", "unknown part"),
     ],
 )
@@ -246,6 +247,13 @@ def test_invalid_option_is_rejected_by_name(
 def test_unused_option_gives_a_warning(client: httpx.Client) -> None:
     plan = store_plan(client, plan_file("native"), level="2")
     assert any("the option 'level' was ignored" in line for line in plan["warnings"])
+
+
+def test_picture_that_looks_like_a_photograph_is_read_with_plan_true(client: httpx.Client) -> None:
+    content, options = hall_beside_a_photograph(), {"metres_per_pixel": 0.01, "crop": "0,0,1100,500"}
+    assert "set plan=true" in assert_problem(send_plan(client, content, **options), 422, "invalid-floorplan")["detail"]
+    notes = store_plan(client, content, **options, plan=True)["import_report"]["notes"]
+    assert len([note for note in notes if "because plan=true is set" in note]) == 1
 
 
 @pytest.mark.parametrize(

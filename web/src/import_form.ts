@@ -4,6 +4,7 @@ import { api } from "./api";
 import { button, byId, h, show } from "./dom";
 import { InputError, showError } from "./notices";
 import { PictureScale } from "./picture_scale";
+import { labelOf } from "./plain_words";
 
 const UNITS = ["m", "cm", "mm", "in", "ft"];
 // Fields of the upload: name, label, placeholder.
@@ -52,6 +53,7 @@ export async function checkPixels(file: File): Promise<void> {
 export class ImportForm {
   private readonly inputs = new Map<string, HTMLInputElement | HTMLSelectElement>();
   private readonly picture = new PictureScale();
+  private readonly isPlan = h("input", { type: "checkbox", id: "import-plan" });
   private file: File | null = null;
 
   /** `again` uploads the file with the values of the form, `all` uploads all of its levels, `cancelled` gives up. */
@@ -73,7 +75,7 @@ export class ImportForm {
 
   /** Fields by name, for marking errors. */
   get fields(): Record<string, HTMLElement> {
-    return { ...Object.fromEntries(this.inputs), known_distance: this.picture.metres };
+    return { ...Object.fromEntries(this.inputs), known_distance: this.picture.metres, plan: this.isPlan };
   }
 
   /**
@@ -132,7 +134,12 @@ export class ImportForm {
         ...(levels.length > 0
           ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...items), ask]
           : isPicture
-            ? [this.picture.element, ask, h("details", {}, h("summary", {}, "Other ways to state the scale"), fields)]
+            ? [
+                this.picture.element,
+                h("label", { class: "check" }, this.isPlan, ` ${labelOf("plan")}`),
+                ask,
+                h("details", {}, h("summary", {}, "Other ways to state the scale"), fields),
+              ]
             : [fields, ask]),
       ),
     );
@@ -142,6 +149,7 @@ export class ImportForm {
   close(): void {
     this.file = null;
     this.picture.close();
+    this.isPlan.checked = false;
     for (const input of this.inputs.values()) input.value = "";
     show(byId("import-form"));
   }
@@ -194,6 +202,7 @@ export class ImportForm {
       part = this.picture.part;
     if (isPicture && distance !== null) values.known_distance = distance;
     if (isPicture && part !== null) values.crop = part;
+    if (isPicture && this.isPlan.checked) values.plan = "true";
     this.again(this.file, values);
   }
 }

@@ -23,6 +23,7 @@ const LABELS: Record<string, string> = {
   page: "Page of a PDF",
   layers: "Only these layers",
   ceiling_height_m: "Ceiling",
+  plan: "A plan, though it looks like a photograph",
   opening_kinds: "Complete in this plan",
   opening_trust: "Trust in openings",
   projection: "Kind",

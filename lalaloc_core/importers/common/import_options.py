@@ -61,6 +61,7 @@ class ImportOptions:
         crop: part of a page or picture that is read: x0, y0, x1, y1 of two opposite corners, in the file's coordinates.
         y_axis: direction of y in the file, "up" or "down", if it differs from the format's.
         ceiling_height_m: ceiling height of rooms without one in the file.
+        plan: the file is a plan, although it looks like a photograph.
     """
 
     units: str | None = None
@@ -75,6 +76,7 @@ class ImportOptions:
     y_axis: str | None = None
     ceiling_height_m: float | None = None
     name: str | None = None
+    plan: bool = False
 
     def __post_init__(self) -> None:
         if self.units is not None:
@@ -154,6 +156,10 @@ def _parse(name: str, text: str) -> object:
         if not text.isascii() or not text.isdigit() or len(text) > 9:
             raise InvalidFloorPlanError(f"page is '{text[:50]}'; it must be a whole number from 1")
         return int(text)
+    if name == "plan":
+        if text.casefold() not in ("true", "false"):
+            raise InvalidFloorPlanError(f"plan is '{text[:50]}'; it must be true or false")
+        return text.casefold() == "true"
     if name in ("metres_per_pixel", "multiply", "ceiling_height_m"):
         return _number(name, text)
     return text

@@ -50,9 +50,12 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         builder.notes.append("the picture shows light lines on a dark ground and was inverted")
     tones = Tones.of(gray)
     if tones is not None and tones.is_photograph:
-        raise InvalidFloorPlanError(
-            "the picture is a photograph, not a floor plan: send it to be localised, or send a drawn or scanned plan"
-        )
+        if not options.plan:
+            raise InvalidFloorPlanError(
+                "the picture looks like a photograph, not like a floor plan: send it to be localised; if it is a plan, "
+                "set plan=true (--is-plan on the command line)"
+            )
+        builder.notes.append("the picture looks like a photograph and was read as a plan, because plan=true is set")
     if options.crop is not None:
         gray = blank_outside(gray, options.crop)
         warmth = None if warmth is None else blank_outside(warmth, options.crop)

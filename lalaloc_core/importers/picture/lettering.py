@@ -314,7 +314,8 @@ def _join_runs(runs: Sequence[_Run], texts: Sequence[Float[np.ndarray, "4"]]) ->
         level = [run for run in runs if y0 < run[2] < y1]
         left = [run for run in level if x0 - reach <= run[1] <= x0 + 0.5 * reach]
         right = [run for run in level if x1 - 0.5 * reach <= run[0] <= x1 + reach]
-        pairs = [(a, b) for a in left for b in right if abs(a[2] - b[2]) <= 2.0 and a is not b]
+        # Lines can be within reach of both sides of a high, narrow text; the left one ends first.
+        pairs = [(a, b) for a in left for b in right if abs(a[2] - b[2]) <= 2.0 and a[1] <= b[0]]
         if pairs:
             a, b = pairs[0]
             runs = [run for run in runs if run is not a and run is not b]
