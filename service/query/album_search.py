@@ -126,10 +126,13 @@ class AlbumSearch:
             held.close()
             held.enter_context(hold())
 
-        with ExitStack() as held:
-            held.enter_context(hold())
-            album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
-        self._memories.put(query.album_id, memory)
+        try:
+            with ExitStack() as held:
+                held.enter_context(hold())
+                album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
+        finally:
+            # The next attempt goes on from here.
+            self._memories.put(query.album_id, memory)
         before = {part.id: part.pin for part in query.photographs}
         return compose_outcome(
             album, ground, before, dropped, places.plan.camera_height_m, is_same_place=query.is_same_place
