@@ -303,6 +303,8 @@ class PinPage {
     const moved = this.rows.map(movedOf).filter((text) => text !== null);
     byId("moved").hidden = moved.length === 0;
     show(byId("moved-list"), ...moved.map((text) => h("li", {}, text)));
+    const warnings = this.album?.solution?.warnings ?? [];
+    show(byId("album-warnings"), ...warnings.map((text) => h("li", {}, plainWords(text))));
     byId("keys").hidden = this.rows.length === 0;
     this.drawExports();
   }

@@ -30,7 +30,7 @@ export function factsOf({ pin }: Row): string {
   if (pin === null) return "Waiting for its pin";
   const reason = pin.reason === "" ? "" : `: ${pin.reason}`;
   if (pin.place === null) return `Set aside${reason}`;
-  return `${pin.place.room}, ${pin.state === "corrected" ? "corrected" : percent(pin.confidence)}${reason}`;
+  return `${pin.place.room}, ${pin.state === "corrected" ? "corrected" : percent(pin.room_confidence)}${reason}`;
 }
 
 /** Return what a new revision of the plan changed about a pin; null if nothing. */

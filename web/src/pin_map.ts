@@ -24,7 +24,7 @@ export function pinOf(row: Row, radius: number, svg: SVGSVGElement, act: PinActi
     heading = place.heading_deg;
   const tip = `M${-0.8 * radius} ${-0.7 * radius}L0 ${-2.4 * radius}L${0.8 * radius} ${-0.7 * radius}Z`;
   const arrow = heading === null ? null : s("path", { class: "arrow", d: tip, transform: `rotate(${heading})` });
-  const label = `Photograph ${row.number}, ${place.room}, ${row.pin!.state}, ${percent(row.pin!.confidence)}`;
+  const label = `Photograph ${row.number}, ${place.room}, ${row.pin!.state}, ${percent(row.pin!.room_confidence)}`;
   const roles = act === null ? {} : { id: `pin-${row.number}`, tabindex: 0, role: "button", "aria-label": label };
   const pin = s(
     "g",
