@@ -1,4 +1,4 @@
-"""Plans from pictures and PDF pages in five drawing styles; `benchmarks/plan_pictures.py` measures more."""
+"""Plans from pictures and PDF pages in five drawing styles; `benchmarks/plans.py` measures more."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import shapely
 from PIL import Image, ImageDraw
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
-from benchmarks.plan_pictures import Score, intersection_over_union
+from benchmarks.plans import Score, intersection_over_union
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError

@@ -1,6 +1,6 @@
 """Importing drawn floor plans: rooms, doors and windows found in pictures, by style and by condition.
 
-`python -m benchmarks.plan_pictures` prints the figures of docs/results.md by style; `--conditions` those with noise,
+`python -m benchmarks.plans` prints the figures of docs/results.md by style; `--conditions` those with noise,
 shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that are estimated without any text;
 `--symbols` the rooms and the precision and recall of fixtures, drawn as symbols among furniture.
 """
