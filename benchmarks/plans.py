@@ -16,9 +16,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from benchmarks.harness import argument_parser, print_table_head, table_row
-from benchmarks.plan_drawing import STYLES, DrawnPlan, OpeningSymbol, Style, draw_plan
+from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
 from benchmarks.plan_symbols import FIXTURES
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
@@ -48,6 +49,34 @@ class Count:
         return 2.0 * self.matched / max(self.drawn + self.imported, 1)
 
 
+@dataclass(frozen=True)
+class Shapes:
+    """Rooms of plans, and lines of openings with their kinds, in metres."""
+
+    rooms: Sequence[BaseGeometry] = ()
+    openings: Sequence[tuple[str, BaseGeometry]] = ()
+
+    @classmethod
+    def of(cls, plans: Sequence[Mapping[str, Any]], factor: float = 1.0) -> Shapes:
+        """Return the shapes of documents in the native format, with all lengths multiplied by a factor."""
+
+        def scaled(shape: BaseGeometry) -> BaseGeometry:
+            return shapely.transform(shape, lambda points: factor * points)
+
+        rooms = [shapely.Polygon(room["polygon"], room.get("holes")) for plan in plans for room in plan["rooms"]]
+        openings = [(o["kind"], shapely.LineString(o["line"])) for plan in plans for o in plan.get("openings", [])]
+        return cls([scaled(room.buffer(0.0)) for room in rooms], [(kind, scaled(line)) for kind, line in openings])
+
+    @classmethod
+    def drawn(cls, drawn: DrawnPlan) -> Shapes:
+        """Return the rooms and openings that a drawing shows."""
+        return cls(drawn.rooms, [(o.kind, shapely.LineString([o.start, o.end])) for o in drawn.openings])
+
+    def lines(self, kind: str) -> list[BaseGeometry]:
+        """Return the openings of a kind."""
+        return [line for name, line in self.openings if name == kind]
+
+
 @dataclass
 class Score:
     """Counts of rooms, doors, windows and fixtures over plans, and the CPU time of their import."""
@@ -65,12 +94,12 @@ class Score:
             document = {"rooms": []}
         self.seconds += time.process_time() - began
         self.plans += 1
-        rooms = [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
-        self.counts["room"].add(len(drawn.rooms), len(rooms), _overlapping(drawn.rooms, rooms, _IOU))
+        truth, found = Shapes.drawn(drawn), Shapes.of([document])
+        rooms = _overlapping(truth.rooms, found.rooms, _IOU)
+        self.counts["room"].add(len(truth.rooms), len(found.rooms), rooms)
         for kind in ("door", "window"):
-            lines = [shapely.LineString(o["line"]) for o in document.get("openings", []) if o["kind"] == kind]
-            truth = [opening for opening in drawn.openings if opening.kind == kind]
-            self.counts[kind].add(len(truth), len(lines), _matches(truth, lines))
+            true, lines = truth.lines(kind), found.lines(kind)
+            self.counts[kind].add(len(true), len(lines), _matches(true, lines))
         for kind in FIXTURES:
             outlines = [shapely.Polygon(e["outline"]) for e in document.get("fixtures", []) if e["kind"] == kind]
             symbols = [symbol.outline for symbol in drawn.symbols if symbol.kind == kind]
@@ -85,20 +114,19 @@ class Score:
         return table_row(label, room.drawn, share, *scores, f"{per_plan:.1f} s")
 
 
-def intersection_over_union(a: shapely.Polygon, b: shapely.Polygon) -> float:
-    """Return the share of the area of two polygons that both cover."""
+def intersection_over_union(a: BaseGeometry, b: BaseGeometry) -> float:
+    """Return the share of the area of two shapes that both cover."""
     shared = shapely.intersection(a, b).area
     return shared / (a.area + b.area - shared)
 
 
-def _overlapping(shapes: Sequence[shapely.Polygon], others: Sequence[shapely.Polygon], least: float) -> int:
+def _overlapping(shapes: Sequence[BaseGeometry], others: Sequence[BaseGeometry], least: float) -> int:
     return sum(any(intersection_over_union(shape, other) >= least for other in others) for shape in shapes)
 
 
-def _matches(truth: Sequence[OpeningSymbol], imported: Sequence[shapely.LineString]) -> int:
+def _matches(truth: Sequence[BaseGeometry], imported: Sequence[BaseGeometry]) -> int:
     unmatched = list(imported)
-    for opening in truth:
-        line = shapely.LineString([opening.start, opening.end])
+    for line in truth:
         around = line.buffer(_APART_M, cap_style="flat")
         for candidate in unmatched:
             shared = shapely.intersection(around, candidate).length
