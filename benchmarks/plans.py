@@ -7,10 +7,11 @@ shadow, furniture and as JPEG of 150 dpi; `--scale` the errors of scales that ar
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -27,11 +28,13 @@ from lalaloc_core.importers import ImportOptions, import_plan
 _IOU, _SYMBOL_IOU = 0.9, 0.6
 # An imported opening matches when it overlaps the true one by half of the longer, at most this far (m) beside it.
 _OVERLAP, _APART_M = 0.5, 0.3
+# Number of lines that match others.
+Matches = Callable[[Sequence[BaseGeometry], Sequence[BaseGeometry]], int]
 Condition = Literal["clean", "noise, σ = 5", "shadow, 40 %", "noise and shadow", "furniture", "JPEG, 1:100 at 150 dpi"]
 _SIGMA, _DARKEST, _PIXELS_PER_M_AT_150_DPI = 5.0, 0.6, 0.01 * 150.0 / 0.0254
 
 
-@dataclass
+@dataclass(frozen=True)
 class Count:
     """Number of drawn things, of imported ones, and of those in both."""
 
@@ -39,9 +42,8 @@ class Count:
     imported: int = 0
     matched: int = 0
 
-    def add(self, drawn: int, imported: int, matched: int) -> None:
-        """Add the counts of a plan."""
-        self.drawn, self.imported, self.matched = self.drawn + drawn, self.imported + imported, self.matched + matched
+    def __add__(self, count: Count) -> Count:
+        return Count(self.drawn + count.drawn, self.imported + count.imported, self.matched + count.matched)
 
     @property
     def f1(self) -> float:
@@ -94,16 +96,14 @@ class Score:
             document = {"rooms": []}
         self.seconds += time.process_time() - began
         self.plans += 1
-        truth, found = Shapes.drawn(drawn), Shapes.of([document])
-        rooms = _overlapping(truth.rooms, found.rooms, _IOU)
-        self.counts["room"].add(len(truth.rooms), len(found.rooms), rooms)
-        for kind in ("door", "window"):
-            true, lines = truth.lines(kind), found.lines(kind)
-            self.counts[kind].add(len(true), len(lines), _matches(true, lines))
+        found = count_found(Shapes.drawn(drawn), Shapes.of([document]), _IOU, _matches)
+        for kind, count in found.items():
+            self.counts[kind] += count
         for kind in FIXTURES:
             outlines = [shapely.Polygon(e["outline"]) for e in document.get("fixtures", []) if e["kind"] == kind]
             symbols = [symbol.outline for symbol in drawn.symbols if symbol.kind == kind]
-            self.counts[kind].add(len(symbols), len(outlines), _overlapping(outlines, symbols, _SYMBOL_IOU))
+            matched = _overlapping(outlines, symbols, _SYMBOL_IOU)
+            self.counts[kind] += Count(len(symbols), len(outlines), matched)
         return document
 
     def row(self, label: str) -> str:
@@ -136,31 +136,33 @@ def _matches(truth: Sequence[BaseGeometry], imported: Sequence[BaseGeometry]) ->
     return len(imported) - len(unmatched)
 
 
-def measure(style: Style, seeds: range, *, has_symbols: bool = False) -> Score:
-    """Return the score of generated plans of a style."""
-    score = Score()
-    for seed in seeds:
-        drawn = draw_plan(style, seed, has_symbols=has_symbols)
-        score.add(drawn, _file(style, drawn))
-    return score
+def count_found(truth: Shapes, found: Shapes, least_iou: float, matches: Matches) -> dict[str, Count]:
+    """Return the counts of rooms, and of doors and windows of the right kind."""
+    rooms = _overlapping(truth.rooms, found.rooms, least_iou)
+    counts = {"room": Count(len(truth.rooms), len(found.rooms), rooms)}
+    for kind in ("door", "window"):
+        true, lines = truth.lines(kind), found.lines(kind)
+        counts[kind] = Count(len(true), len(lines), matches(true, lines))
+    return counts
 
 
 def _file(style: Style, drawn: DrawnPlan) -> bytes:
     return drawn.jpeg() if style == "scanned" else drawn.png()
 
 
-def measure_condition(condition: Condition, seeds: range) -> Score:
-    """Return the score of generated plans under a condition, over all styles that are no scans."""
-    score, is_jpeg = Score(), condition.startswith("JPEG")
-    pixels_per_m = _PIXELS_PER_M_AT_150_DPI if is_jpeg else None
-    for style in STYLES:
-        for seed in seeds if style != "scanned" else ():
-            drawn = draw_plan(style, seed, is_furnished=condition == "furniture", pixels_per_m=pixels_per_m)
-            if "shadow" in condition:
-                drawn = drawn.shaded(_DARKEST)
-            if "noise" in condition:
-                drawn = drawn.noisy(_SIGMA, seed)
-            score.add(drawn, drawn.jpeg() if is_jpeg else drawn.png())
+def measure(
+    styles: Sequence[Style], seeds: range, condition: Condition = "clean", *, has_symbols: bool = False
+) -> Score:
+    """Return the score of generated plans of some styles under a condition."""
+    score, pixels_per_m = Score(), _PIXELS_PER_M_AT_150_DPI if condition.startswith("JPEG") else None
+    for style, seed in itertools.product(styles, seeds):
+        is_furnished = condition == "furniture"
+        drawn = draw_plan(style, seed, is_furnished=is_furnished, has_symbols=has_symbols, pixels_per_m=pixels_per_m)
+        if "shadow" in condition:
+            drawn = drawn.shaded(_DARKEST)
+        if "noise" in condition:
+            drawn = drawn.noisy(_SIGMA, seed)
+        score.add(drawn, drawn.jpeg() if pixels_per_m else _file(style, drawn))
     return score
 
 
@@ -178,10 +180,8 @@ def _print_symbols(scores: Sequence[Score]) -> None:
     """Print the precision and the recall of fixtures, summed over styles."""
     print_table_head("fixture", "drawn", "imported", "precision", "recall")
     for name in (*FIXTURES, "all"):
-        total = Count()
-        for kind in FIXTURES if name == "all" else (name,):
-            for count in (score.counts[kind] for score in scores):
-                total.add(count.drawn, count.imported, count.matched)
+        kinds = FIXTURES if name == "all" else (name,)
+        total = sum((score.counts[kind] for score in scores for kind in kinds), Count())
         precision = f"{100.0 * total.matched / total.imported:.1f}%" if total.imported else "-"
         recall = f"{100.0 * total.matched / max(total.drawn, 1):.1f}%"
         print(table_row(name, total.drawn, total.imported, precision, recall))
@@ -224,13 +224,12 @@ def main() -> None:
     if options.scale:
         _print_scales({style: scale_errors(style, seeds) for style in STYLES})
         return
-    scores = _print_scores((style, measure(style, seeds, has_symbols=options.symbols)) for style in STYLES)
+    scores = _print_scores((style, measure((style,), seeds, has_symbols=options.symbols)) for style in STYLES)
     if options.symbols:
         _print_symbols(scores)
     if options.conditions:
-        # Four styles each.
         few = range(options.seed, options.seed + max(1, options.plans // 4))
-        _print_scores(((name, measure_condition(name, few)) for name in get_args(Condition)), "condition")
+        _print_scores(((name, measure(STYLES[:-1], few, name)) for name in get_args(Condition)), "condition")
 
 
 if __name__ == "__main__":
