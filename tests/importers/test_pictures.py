@@ -1,4 +1,4 @@
-"""Plans from pictures and PDF pages in five drawing styles; `benchmarks/plan_pictures.py` measures more."""
+"""Plans from pictures and PDF pages in five drawing styles; `benchmarks/plans.py` measures more."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import shapely
 from PIL import Image, ImageDraw
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
-from benchmarks.plan_pictures import Score, intersection_over_union
+from benchmarks.plans import TABLE, Count, Plan, Score, count_found, intersection_over_union, read_plan
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -47,6 +47,22 @@ def test_rooms_and_openings_are_found_in_every_style(drawn: dict[Style, DrawnPla
     assert score.counts["door"].f1 >= 0.8
     assert score.counts["window"].f1 >= 0.8
     assert f"| {style} | {len(plan.rooms)} | 100.0% |" in score.row(style)
+
+
+def test_table_of_plans_counts_right_shapes_of_the_right_kind():
+    def plan(end: float, kind: str, factor: float = 1.0) -> Plan:
+        """Return two rooms and two openings, read from a document that is smaller by a factor."""
+        corners = [np.array(shapely.box(x, 0, to, 3).exterior.coords) / factor for x, to in ((0, 4), (4.1, end))]
+        openings = [("door", [(4.05, 1), (4.05, 1.9)]), (kind, [(1, 0), (2, 0)])]
+        lines = [{"kind": name, "line": np.array(ends) / factor} for name, ends in openings]
+        return Plan.of([{"rooms": [{"polygon": ring} for ring in corners], "openings": lines}], 0.01, factor)
+
+    truth, found = plan(8.1, "window"), plan(6.1, "door", factor=2.0)
+    counts = count_found(truth, found, TABLE)
+    assert counts == {"room": Count(2, 2, 1), "door": Count(1, 2, 1), "window": Count(1, 0, 0)}
+    row = read_plan("empty", b"", truth, "given")
+    assert row["note"].startswith("refused: the file is empty")
+    assert (row["read"], row["room"], row["right scale"]) == (Count(1), Count(2), Count(1))
 
 
 @pytest.mark.slow

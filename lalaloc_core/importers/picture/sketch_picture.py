@@ -40,7 +40,7 @@ _OUTLINE_ADVANTAGE = 1.6
 # Smallest intersection over union of the same room in two readings.
 _SAME_ROOM = 0.9
 _SURE = 0.85
-# Share of drawn openings that are found and classified (benchmarks.plan_pictures).
+# Share of drawn openings that are found and classified (benchmarks.plans).
 _RECALL = 0.95
 # Gaps of twice this width are closed to find the drawn area; parts of it thinner than the walls and the clearance (m)
 # are no rooms. A smaller share covered by rooms gives a warning, with its largest parts.
