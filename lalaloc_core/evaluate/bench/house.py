@@ -22,9 +22,11 @@ from lalaloc_core.evaluate.calibrate.measured_errors import Spot
 from lalaloc_core.evaluate.runs.albums import RoomAlbum, RoomKey, album_entry
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.learn.data.folder import HeldoutScenes
 from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres
-from lalaloc_core.learn.data.views import ViewScenes
+from lalaloc_core.learn.data.synthetic.albums import two_views
+from lalaloc_core.learn.data.views import ViewScenes, encode_jpeg
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
@@ -34,8 +36,8 @@ from lalaloc_core.photograph import StatedCamera
 
 # Fields of view (degrees), and views of each sphere; those of turns.
 _FIELDS_DEG, _VIEWS, _TURN_DEG, _TURN_VIEWS = (60.0, 67.0, 80.0, 106.0), 8, 80.0, 3
-# Photographs of elsewhere that are added to the album: views of annotated rooms.
-_ELSEWHERE = 5
+# Photographs of elsewhere that are added to the album: views of annotated rooms, and their field of view (degrees).
+_ELSEWHERE, _ELSEWHERE_DEG = 5, 67.0
 
 
 def bench_house(setting: Setting) -> dict[str, Any]:
@@ -93,10 +95,11 @@ def house_albums(setting: Setting) -> dict[str, RoomAlbum]:
     heldout = HeldoutScenes(homes=1)
     foreign = _ground(model, {name: heldout.load(name).plan for name in heldout.scenes("test")})
     plain, walk = _photographs(model, folder), _photographs(model, folder, "--exif", "--walk")
-    outside = [
-        album_entry(model, f"elsewhere {path.stem}", path.read_bytes(), StatedCamera())
-        for path in ([] if setting.annotated is None else sorted(setting.annotated.glob("*.jpg"))[:_ELSEWHERE])
-    ]
+    others = [] if setting.annotated is None else AnnotatedPhotographs(setting.annotated).photographs[:_ELSEWHERE]
+    rng, outside = np.random.default_rng(0), list[AlbumPhotograph]()
+    for other in others:
+        (pixels, _), _ = two_views(other.photograph.image(512, 1024), _ELSEWHERE_DEG, rng)
+        outside.append(album_entry(model, f"elsewhere {other.name}", encode_jpeg(pixels), StatedCamera()))
     rooms: list[RoomKey] = [*plain.values(), *[None] * len(outside)]
     albums = {
         "album": RoomAlbum(own, list(plain), list(plain.values())),
