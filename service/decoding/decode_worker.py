@@ -61,7 +61,8 @@ class Decoding:
         """Decode a photograph as a picture to be shown within a width and height, a full sphere levelled."""
         if not is_sphere:
             return open_picture(content, max_size=max_size, limits=self.limits)
-        view = open_photograph(content, sphere_size=max_size[::-1], stated=stated, limits=self.limits)
+        width, height = max_size
+        view = open_photograph(content, sphere_size=(height, width), stated=stated, limits=self.limits)
         assert view.sphere is not None
         return view.sphere
 

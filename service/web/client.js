@@ -1,1 +1,1 @@
-import{a,b}from"./chunk-PAUOIMV7.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};
+import{a,c as b}from"./chunk-XRYW3VNC.js";import"./chunk-I7AUKTXE.js";export{b as Client,a as ServiceError};

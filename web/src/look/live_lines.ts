@@ -43,7 +43,11 @@ export function drawLive(
     context,
     lines.map(({ kind, points }) => ({
       kind,
-      pieces: throughCamera(points.map(([azimuth, elevation]): Point => [azimuth - middle, elevation]), tilted, size),
+      pieces: throughCamera(
+        points.map(([azimuth, elevation]): Point => [azimuth - middle, elevation]),
+        tilted,
+        size,
+      ),
     })),
   );
 }

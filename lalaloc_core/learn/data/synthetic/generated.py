@@ -205,7 +205,8 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
         "nadir_patch": bool(scene.exposure.nadir > 0.0),
         "sun_patch": _sees_sun(shot, scene.sun),
     }
-    return scene.facts | {fact for fact, true in holds.items() if true}
+    held: set[Fact] = {fact for fact, true in holds.items() if true}
+    return scene.facts | held
 
 
 def _has_stub(shot: Shot, opening: Opening) -> bool:
