@@ -42,7 +42,8 @@ class PinnedPhotograph:
         """Return the photograph as plain data."""
         head = {"number": self.number, "photograph": self.name, "sha256": self.id, "taken": self.taken or None}
         if self.pin is None:
-            return {**head, **_NOWHERE, "confidence": 0.0, "state": "set_aside", "reason": self.reason}
+            shares = dict.fromkeys(("room_confidence", "confidence", "within_1m"), 0.0)
+            return {**head, **_NOWHERE, **shares, "state": "set_aside", "reason": self.reason}
         fields = pin_document(self.pin)
         return {**head, **(fields.pop("place") or _NOWHERE), **fields}
 
