@@ -49,7 +49,7 @@ SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
 # The usual share of misread photographs counts like so many photographs; albums with more than the limit do not fit
 # their plan; and rounds of expectation maximisation.
-_SEEN_BEFORE, _MISFIT, _ROUNDS = 10.0, 0.5, 20
+_SEEN_BEFORE, _MISFIT, _ROUNDS = 10.0, 0.33, 20
 _MISFIT_WARNING = (
     "the photographs fit this plan badly: walls and openings of {:.0f} % of them agree with it no better than with "
     "other homes, so none is sure; check that it is the plan of this home, its scale, and that it draws the doors and "
