@@ -32,7 +32,7 @@ class DecodeJob(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Decoding:
-    """What a worker does.
+    """Work on uploaded files and drawings, a method for each kind.
 
     Attributes:
         sphere, patch: height and width (pixels) of full spheres, and patches of other photographs.

@@ -217,8 +217,10 @@ def _of_other_homes(
 
 def _room_means(log: Float[np.ndarray, "n k"], room_index: Int[np.ndarray, "n"], rooms: int) -> Float[np.ndarray, "r"]:
     """Return the log mean likelihood of every room; of the least likely one for rooms without poses."""
-    highest = log.max(axis=1)
-    by_pose = highest + np.log(np.exp(log - highest[:, None]).mean(axis=1))
+    highest, by_pose = log.max(axis=1), np.empty(len(log), np.float32)
+    for first in range(0, len(log), _PART):
+        part = slice(first, first + _PART)
+        by_pose[part] = highest[part] + np.log(np.exp(log[part] - highest[part, None]).mean(axis=1))
     total, count = log_sums(by_pose, room_index, rooms), np.bincount(room_index, minlength=rooms)
     mean = total - np.log(np.maximum(count, 1))
     return np.where(count > 0, mean, mean[count > 0].min())
