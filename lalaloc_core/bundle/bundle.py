@@ -85,16 +85,12 @@ class ObjectsManifest:
     Attributes:
         names: names of the objects, in the order of the network's outputs.
         shares: (objects, room types) share of each object that a room of each type accounts for.
-        floor: probability that is added to that of every type, since most photographs show none of the objects.
-        weight, recognition: the log likelihoods of types count w m^p times, with the summed probability m of all
-            objects: a wall without any of them tells no type.
+        floor: probability that every object has in photographs without it.
     """
 
     names: list[str]
     shares: list[list[float]]
     floor: float = 0.01
-    weight: float = 1.0
-    recognition: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the shape of `shares`."""

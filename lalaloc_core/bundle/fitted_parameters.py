@@ -97,17 +97,22 @@ class MatchingWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class AlbumWeights:
-    """Weights of what counts in albums only; `evaluate.bench.album_weights` measures `misread` and `pairs`.
+    """Weights of what counts in albums only, as `evaluate.bench.album_weights` fits them.
 
     Attributes:
         misread: share of photographs whose walls and openings are misread, before those of an album tell.
+        misfit: the same found in an album, above which its photographs do not fit the plan.
         pairs: weight of the log odds that two photographs are of one room.
         crowding: how much the number of photographs of a room keeps to what its size lets expect.
+        confidence: bias of the log odds that a room is right, weight of those by its share of the probability, and of
+            the share of misread photographs.
     """
 
     misread: float = 0.2
+    misfit: float = 0.3
     pairs: float = 0.25
-    crowding: float = 2.5
+    crowding: float = 3.2
+    confidence: tuple[float, float, float] = (1.458, 0.829, -7.323)
 
     def __post_init__(self) -> None:
         """Check the range of `misread`."""

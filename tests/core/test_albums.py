@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFilter
 
-from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.bundle import AlbumWeights, Bundle, default_bundle
 from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
 from lalaloc_core.evaluate.runs.albums import pin_figures
 from lalaloc_core.floorplan import FloorPlan
@@ -26,7 +26,7 @@ from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.links import pair_odds
 from lalaloc_core.localise.album.pins import Pin, PinPose, RoomShare, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
-from lalaloc_core.localise.album.solve import MAX_ROOMS, misread_share, solve_album
+from lalaloc_core.localise.album.solve import MAX_ROOMS, calibrated, misread_share, solve_album
 from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
@@ -299,6 +299,22 @@ def test_share_of_misread_photographs_is_found_in_the_album() -> None:
     assert misread_share([np.full(6, -4.0)] * 40, 0.2) > 0.5
     # Photographs that tell nothing leave it as it is.
     assert misread_share([np.zeros(6)] * 40, 0.2) == pytest.approx(0.2)
+
+
+def test_probabilities_of_rooms_are_calibrated_and_keep_their_order() -> None:
+    weights = replace(AlbumWeights(), confidence=(1.5, 0.8, -7.0))
+    share = np.array([[0.6, 0.3, 0.05, 0.05], [0.4, 0.2, 0.0, 0.4], [0.2, 0.1, 0.1, 0.6]])
+    fits, misfits = (calibrated(share, misread, weights) for misread in (0.1, 0.5))
+    for found in (fits, misfits):
+        np.testing.assert_array_equal(found[:, :3].argmax(axis=1), 0)
+        assert (found.sum(axis=1) <= 1.0 + 1e-9).all()
+        # Whether a photograph is set aside does not depend on how well the others fit.
+        np.testing.assert_array_equal(found[2], share[2])
+        assert found[1, 3] <= 0.4
+    log_odds = 1.5 + 0.8 * math.log(0.6 / 0.4) - 0.7
+    assert fits[0, 0] == pytest.approx(1.0 / (1.0 + math.exp(-log_odds)))
+    assert misfits[0, 0] < 0.2 < share[0, 0] < fits[0, 0]
+    np.testing.assert_allclose(calibrated(share, 0.3, replace(weights, confidence=(0.0, 1.0, 0.0))), share)
 
 
 def test_figures_of_pins_count_rooms_and_elsewhere() -> None:

@@ -21,7 +21,7 @@ from lalaloc_core.localise.belief import reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
-from lalaloc_core.localise.encode.view_encoder import outside_odds
+from lalaloc_core.localise.encode.view_encoder import objects_of_views, outside_odds
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost
 from lalaloc_core.localise.match.matching_cost import MatchingCost
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, PredictedRoomType, Query, SeenObject, SeenObjects
@@ -149,6 +149,21 @@ def test_views_of_one_spot_share_their_objects() -> None:
         assert turned[seen.name] == pytest.approx(seen.azimuth + math.radians(BED_DEG), abs=1e-6)
     shares = alone.room_type.shares()["bedroom"], both.room_type.shares()["bedroom"]
     assert shares[0] > shares[1] > 1.0 / len(ROOM_TYPES)
+
+
+def test_photograph_without_recognised_objects_tells_no_type() -> None:
+    manifest = bundle().manifest.objects
+    assert manifest is not None
+    azimuth = np.zeros(len(manifest.names))
+    # What the classifier gives every object in any photograph.
+    noise = np.full(len(manifest.names), manifest.floor)
+    alike = objects_of_views(manifest, [(noise, azimuth)]).room_type.log_probability[1:]
+    assert np.ptp(alike) < 1e-9
+    sure = np.where(np.array(manifest.names) == "stove", 0.5, noise)
+    log = objects_of_views(manifest, [(sure, azimuth)]).room_type.log_probability
+    ratio = math.exp(log[ROOM_TYPES.index("kitchen")] - log[ROOM_TYPES.index("bathroom")])
+    # By the other half of the probability, nothing was seen.
+    assert ratio == pytest.approx((0.51 + 0.49 * 15) / 0.51, rel=1e-6)
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640), (1280, 320), (200, 900)])

@@ -14,7 +14,9 @@ from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError, DatasetError
+from lalaloc_core.learn.data.annotated import GALLERY_ROOMS
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
+from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.photograph_targets import load_photographs
@@ -95,6 +97,21 @@ class TestReading:
         (rooms / "2005.json").write_text("{}")
         with pytest.raises(DatasetError, match=r"2005.*not a scene with poses"):
             PosedSpheres(rooms).load("2005")
+
+
+class TestGalleries:
+    def test_rooms_are_asked_for_among_similar_ones(self, rooms: Path) -> None:
+        dataset = open_dataset(rooms, "annotated")
+        (validating,) = dataset.scenes("validation")
+        assert validating == "2005-0"
+        assert "2005-0" not in dataset.scenes("train")
+        assert not dataset.scenes("test")
+        scene = dataset.load("2005-0")
+        assert len(scene.plan.rooms) == GALLERY_ROOMS
+        assert scene.plan.room_index_at(scene.cameras[0].position_m[None])[0] == scene.cameras[0].room_index
+
+    def test_rooms_are_posed_spheres_unless_galleries_are_asked_for(self, rooms: Path) -> None:
+        assert isinstance(open_dataset(rooms), PosedSpheres)
 
 
 class TestTargets:

@@ -1,9 +1,10 @@
 """Weights of the evidence in albums, measured together on albums of pictures by others and of generated homes.
 
-The temperature of walls and openings, the weight of recognised objects, the share of misread photographs, and that of
-pairs replace each other in part, so all combinations are tried. The sources are a furnished house, annotated and
-path-traced rooms, generated homes with and without furniture, and the house's photographs among others and in a foreign
-plan; they count alike, whatever the number of their albums. The score is the mean log probability of the right room.
+The temperature of walls and openings, the share of misread photographs, the weight of pairs, and that of the numbers of
+photographs by room replace each other in part, so all combinations are tried. The sources are a furnished house, alone
+and with photographs of elsewhere, annotated and path-traced rooms, and generated homes with and without furniture; they
+count alike, whatever the number of their albums. The score is the mean log probability of the right room. Albums in the
+plans of other homes are measured beside them: none of their pins should be sure.
 """
 
 from __future__ import annotations
@@ -15,100 +16,147 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import optimize
 
-from lalaloc_core.bundle import Bundle, Manifest
+from lalaloc_core.bundle import AlbumWeights, Bundle, Manifest
 from lalaloc_core.evaluate.bench.albums import galleries, home_album
 from lalaloc_core.evaluate.bench.house import house_albums
 from lalaloc_core.evaluate.bench.measured import Setting
-from lalaloc_core.evaluate.runs.albums import RoomAlbum
+from lalaloc_core.evaluate.runs.albums import RoomAlbum, pin_figures
 from lalaloc_core.localise.album.evidence import AlbumMemory
+from lalaloc_core.localise.album.solve import log_odds
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 
 # Most albums of a source.
-_MOST = 16
-_TEMPERATURES = (1.0, 0.5, 0.25, 0.125)
-_OBJECTS = ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (4.0, 2.0))
-_MISREAD, _PAIRS = (0.05, 0.2, 0.4), (0.25, 0.12, 0.06)
+_MOST = 8
+_TEMPERATURES, _MISREAD = (1.0, 0.5, 0.25), (0.1, 0.2)
+# Pairs draw photographs together, crowding apart.
+_PAIRS_CROWDING = ((0.12, 1.6), (0.12, 3.2), (0.25, 1.6), (0.25, 3.2), (0.25, 6.4), (0.5, 6.4))
+# Names of albums in the plans of other homes begin so; their weight beside a source of its own plans; ridge.
+_FOREIGN, _OTHERS, _RIDGE = "foreign", 0.11, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """Factor of the bundle's temperature of views, and fields of `ObjectsManifest` and of `AlbumWeights`."""
+    """Factor of the bundle's temperature of views, and fields of `AlbumWeights`; confidence is the share."""
 
     temperature: float
-    weight: float
-    recognition: float
     misread: float
     pairs: float
+    crowding: float
 
     def changed(self, manifest: Manifest) -> Manifest:
         """Return a manifest with these weights."""
-        view, objects = manifest.view, manifest.objects
+        view = manifest.view
         if view is not None:
             before = manifest.evidence_for(view=True)
             view = replace(view, evidence=replace(before, temperature=self.temperature * before.temperature))
-        if objects is not None:
-            objects = replace(objects, weight=self.weight, recognition=self.recognition)
-        album = replace(manifest.album, misread=self.misread, pairs=self.pairs)
-        return replace(manifest, view=view, objects=objects, album=album)
+        album = AlbumWeights(
+            misread=self.misread, misfit=1.0, pairs=self.pairs, crowding=self.crowding, confidence=(0.0, 1.0, 0.0)
+        )
+        return replace(manifest, view=view, album=album)
 
 
 Figures = dict[str, float]
 Rows = Mapping[Combination, Mapping[str, Figures]]
 
 
+class Solved(NamedTuple):
+    """Figures of an album, and for each of its pins the share of its room and whether that is right."""
+
+    figures: Figures
+    misread: float
+    pins: list[tuple[float, bool]]
+
+
 def bench_album_weights(setting: Setting) -> dict[str, Any]:
     """Measure all combinations of weights.
 
     Returns:
-        `rows`, the figures of every combination by source; `chosen`, the one with the best score; and `left_out`, by
-        source the one with the best score of the other sources.
+        `rows`, the figures of every combination by source; `chosen`, the one with the best score; `left_out`, by source
+        the one with the best score of the other sources; and `confidence` fitted to the pins of the chosen one, a tenth
+        of which are in the plans of other homes.
     """
-    figures: defaultdict[Combination, defaultdict[str, list[Figures]]] = defaultdict(lambda: defaultdict(list))
+    solved: defaultdict[Combination, defaultdict[str, list[Solved]]] = defaultdict(lambda: defaultdict(list))
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
-        for source, found in pool.map(partial(_pinned, setting.bundle), _albums(setting)):
-            for weights, row in found.items():
-                figures[weights][source].append(row)
-    rows = {weights: {source: _total(each) for source, each in row.items()} for weights, row in figures.items()}
-    sources = sorted({source for row in rows.values() for source in row})
+        for source, found in pool.map(partial(_solved, setting.bundle), _albums(setting)):
+            for weights, album in found.items():
+                solved[weights][source].append(album)
+    rows = {
+        weights: {source: _total([album.figures for album in albums]) for source, albums in row.items()}
+        for weights, row in solved.items()
+    }
+    sources = sorted({source for row in rows.values() for source in row if not source.startswith(_FOREIGN)})
+    chosen = _best(rows, sources)
+    without = {source: _best(rows, [each for each in sources if each != source]) for source in sources}
     return {
-        "chosen": _best(rows, sources),
-        "left_out": {source: _best(rows, [each for each in sources if each != source]) for source in sources},
+        "chosen": _row(chosen, rows[chosen]),
+        "left_out": {source: _row(weights, rows[weights]) for source, weights in without.items()},
+        "confidence": _fitted_confidence(solved[chosen]),
         "rows": [_row(weights, row) for weights, row in rows.items()],
     }
 
 
 def _albums(setting: Setting) -> Iterator[tuple[str, RoomAlbum]]:
-    for name, album in house_albums(setting).items():
+    houses = house_albums(setting)
+    for name, album in houses.items():
         yield ("house" if None not in album.rooms else name), album
     homes = range(min(setting.homes, _MOST))
     cases = {
-        **galleries(setting),
         "homes": (home_album(setting, home, split="validation") for home in homes),
         "empty_homes": (home_album(setting, home, split="validation", furniture="empty") for home in homes),
+        **galleries(setting),
     }
+    before: RoomAlbum | None = None
     for name, each in cases.items():
         for case in islice(each, _MOST):
-            yield name, case.with_rooms
+            album = case.with_rooms
+            yield name, album
+            if before is not None:
+                yield f"{_FOREIGN}_{name}", album.elsewhere(before)
+            before = album if name == "homes" else before
+    if before is not None and "album" in houses:
+        yield f"{_FOREIGN}_house", houses["album"].elsewhere(before)
 
 
-def _pinned(bundle: Bundle, named: tuple[str, RoomAlbum]) -> tuple[str, dict[Combination, Figures]]:
-    """Return the figures of an album by combination; its photographs are compared once for each temperature."""
+def _solved(bundle: Bundle, named: tuple[str, RoomAlbum]) -> tuple[str, dict[Combination, Solved]]:
+    """Return an album by combination; its photographs are compared once for each temperature."""
     source, album = named
     encoder = PhotographEncoder(bundle, threads=1)
-    found = dict[Combination, Figures]()
+    found = dict[Combination, Solved]()
     for temperature in _TEMPERATURES:
         memory = AlbumMemory()
-        for (weight, recognition), misread, pairs in product(_OBJECTS, _MISREAD, _PAIRS):
-            weights = Combination(
-                temperature=temperature, weight=weight, recognition=recognition, misread=misread, pairs=pairs
-            )
+        for misread, (pairs, crowding) in product(_MISREAD, _PAIRS_CROWDING):
+            weights = Combination(temperature=temperature, misread=misread, pairs=pairs, crowding=crowding)
             encoder.manifest = weights.changed(bundle.manifest)
-            found[weights] = album.figures(encoder, memory)
+            solved = album.solve(encoder, memory)
+            pins = [
+                (pin.confidence, (pin.pose.plan_id, pin.pose.room_id) == room)
+                for pin, room in zip(solved.pins, album.rooms, strict=True)
+                if pin.pose is not None
+            ]
+            found[weights] = Solved(pin_figures(solved.pins, album.rooms), solved.misread, pins)
     return source, found
+
+
+def _fitted_confidence(albums: Mapping[str, list[Solved]]) -> list[float]:
+    """Return `AlbumWeights.confidence` by logistic regression, in which sources count alike."""
+    rows, weights = [], []
+    for source, each in albums.items():
+        pins = [(1.0, share, album.misread, right) for album in each for share, right in album.pins]
+        rows += pins
+        weights += [(_OTHERS if source.startswith(_FOREIGN) else 1.0) / max(len(pins), 1)] * len(pins)
+    table, weight = np.array(rows), np.array(weights) / sum(weights)
+    features = np.stack([table[:, 0], log_odds(table[:, 1]), table[:, 2]], axis=1)
+    sign = np.where(table[:, 3] > 0.0, -1.0, 1.0)
+
+    def loss(factors: np.ndarray) -> float:
+        return float(weight @ np.logaddexp(0.0, sign * (features @ factors)) + _RIDGE * np.square(factors).sum())
+
+    return optimize.minimize(loss, np.array([0.0, 1.0, 0.0]), method="L-BFGS-B").x.tolist()
 
 
 def _total(albums: list[Figures]) -> Figures:
@@ -117,12 +165,11 @@ def _total(albums: list[Figures]) -> Figures:
     return total | {"mean_log_probability": float(np.mean([each["mean_log_probability"] for each in albums]))}
 
 
-def _best(rows: Rows, sources: list[str]) -> dict[str, Any]:
+def _best(rows: Rows, sources: list[str]) -> Combination:
     def score(weights: Combination) -> float:
         return float(np.mean([rows[weights][source]["mean_log_probability"] for source in sources]))
 
-    best = max(rows, key=score)
-    return _row(best, rows[best])
+    return max(rows, key=score)
 
 
 def _row(weights: Combination, figures: Mapping[str, Figures]) -> dict[str, Any]:

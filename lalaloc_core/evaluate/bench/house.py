@@ -104,7 +104,7 @@ def house_albums(setting: Setting) -> dict[str, RoomAlbum]:
     albums = {
         "album": RoomAlbum(own, list(plain), list(plain.values())),
         "album_walk": RoomAlbum(own, list(walk), list(walk.values())),
-        "album_in_foreign_plan": RoomAlbum(foreign, list(plain), [None] * len(plain)),
+        "foreign_house": RoomAlbum(foreign, list(plain), [None] * len(plain)),
     }
     return albums | ({"album_with_elsewhere": RoomAlbum(own, [*plain, *outside], rooms)} if outside else {})
 

@@ -19,7 +19,7 @@ from lalaloc_core.learn.data.views import ViewPhotograph, encode_jpeg
 from lalaloc_core.localise.album.entry import AlbumPhotograph, Correction, photograph_entry
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround
-from lalaloc_core.localise.album.pins import Pin, PinPose
+from lalaloc_core.localise.album.pins import Album, Pin, PinPose
 from lalaloc_core.localise.album.solve import solve_album
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel
@@ -100,9 +100,17 @@ class RoomAlbum(NamedTuple):
     photographs: list[AlbumPhotograph]
     rooms: list[RoomKey]
 
+    def solve(self, encoder: PhotographEncoder, memory: AlbumMemory) -> Album:
+        """Return the solved album."""
+        return solve_album(self.ground, encoder, self.photographs, memory=memory)
+
     def figures(self, encoder: PhotographEncoder, memory: AlbumMemory) -> dict[str, float]:
         """Return counts of pins, see `pin_figures`."""
-        return pin_figures(solve_album(self.ground, encoder, self.photographs, memory=memory).pins, self.rooms)
+        return pin_figures(self.solve(encoder, memory).pins, self.rooms)
+
+    def elsewhere(self, other: RoomAlbum) -> RoomAlbum:
+        """Return the photographs in the plan of another album."""
+        return RoomAlbum(other.ground, self.photographs, [None] * len(self.rooms))
 
 
 def pin_figures(pins: Sequence[Pin], truth: Sequence[RoomKey]) -> dict[str, float]:

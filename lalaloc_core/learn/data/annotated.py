@@ -18,9 +18,11 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, is_annotation, read_annotation
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, drawn_room, plan_of_rooms
+from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated, room_names
 from lalaloc_core.learn.dataset_names import GALLERIES
 from lalaloc_core.learn.synth.homes.plans import generate_home
 
+_ROOM_SPLITS: tuple[Split, ...] = ("train", "validation")
 _SCENE = re.compile(r"(?P<photograph>.+)-(?P<gallery>\d+)(?P<alternative>-alternative)?")
 
 
@@ -48,7 +50,7 @@ class GalleryKey:
 
 @dataclass(frozen=True)
 class AnnotatedPhotographs:
-    """Folder of annotated photographs; all are test scenes.
+    """Folder of annotated photographs, which are all test scenes, or of path-traced rooms, which have the other splits.
 
     A photograph with an alternative outline has each gallery twice, once per outline, with the same other rooms.
     Photographs of poor quality have no gallery, but their rooms occur in galleries of others.
@@ -67,6 +69,8 @@ class AnnotatedPhotographs:
     def photographs(self) -> tuple[AnnotatedPhotograph, ...]:
         """All photographs, sorted by name."""
         photographs = tuple(read_annotation(path) for path in annotation_files(self.root))
+        if room_names(self.root):
+            photographs += tuple(each for split in _ROOM_SPLITS for each in annotated(PosedSpheres(self.root), split))
         if not photographs:
             raise DatasetError("the folder has no annotated photographs", path=self.root)
         return photographs
@@ -82,8 +86,11 @@ class AnnotatedPhotographs:
         ]
 
     def scenes(self, split: Split) -> Sequence[str]:
-        """Return the names of the galleries; only the test split has some."""
-        return [key.scene for key in self.keys()] if split == "test" else []
+        """Return the names of the galleries: three of every annotated photograph, one of every path-traced room."""
+        if split == "test":
+            return [] if room_names(self.root) else [key.scene for key in self.keys()]
+        rooms = set(PosedSpheres(self.root).scenes(split) if room_names(self.root) else [])
+        return [key.scene for key in self.keys(1) if key.photograph in rooms]
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Build the gallery of a scene's name."""

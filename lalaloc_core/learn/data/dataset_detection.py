@@ -8,7 +8,7 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, annotation_files
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.data.folder import PLAN_FILE, OwnData
-from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres, is_posed
+from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres, is_posed, room_names
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.zind import DATA_FILE, PARTITION_FILE, Zind
 from lalaloc_core.learn.dataset_names import DATASET_FORMATS
@@ -29,7 +29,8 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
         found["ZInD"] = Zind(root)
     if next(root.glob(f"*/{PLAN_FILE}"), None) is not None:
         found["own data"] = OwnData(root)
-    if annotation_files(root):
+    # Path-traced rooms are posed spheres; as annotated photographs, each is asked for in a gallery of rooms.
+    if annotation_files(root) or (dataset_format == "annotated" and room_names(root)):
         found["annotated photographs"] = AnnotatedPhotographs(root)
     if is_posed(root):
         found["posed spheres"] = PosedSpheres(root)

@@ -116,6 +116,7 @@ class Album:
         scale: factor of the plan's lengths that fits the photographs best.
         compass_bias: azimuth of the compass's north in the plan minus that of true north, radians; the azimuth itself
             if the plan does not state north. None without photographs that have a compass heading.
+        misread: share of photographs whose walls and openings fit the plan no better than other homes.
         warnings: what was assumed or dropped for all photographs.
     """
 
@@ -124,6 +125,7 @@ class Album:
     camera_height_m: float | None = None
     scale: float = 1.0
     compass_bias: float | None = None
+    misread: float = 0.0
     warnings: tuple[str, ...] = ()
 
     @property

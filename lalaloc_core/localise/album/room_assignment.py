@@ -29,12 +29,13 @@ from scipy.sparse.csgraph import connected_components
 
 from lalaloc_core.localise.album.ground import AlbumGround
 
-# Chains of each temperature, and temperatures from 1 to the hottest.
-_LADDERS, _LEVELS, _HOTTEST = 2, 8, 4.0
+# Chains of each temperature, and temperatures from 1 to the hottest. Many short chains tell more within a time than few
+# long ones, as some optima are far from each other.
+_LADDERS, _LEVELS, _HOTTEST = 12, 4, 2.5
 _CHAINS = _LADDERS * _LEVELS
 # Sweeps over all photographs: those before counting, and those that are counted. Large albums have fewer, to bound the
 # time.
-_SETTLING, _COUNTED, _MAX_UPDATES = 40, 60, 3000
+_SETTLING, _COUNTED, _MAX_UPDATES = 40, 60, 2000
 _FEWEST = 12
 # Most successive photographs that move together.
 _LONGEST = 6

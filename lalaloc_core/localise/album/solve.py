@@ -16,6 +16,7 @@ from datetime import datetime
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.bundle import AlbumWeights
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.evidence import (
@@ -47,9 +48,9 @@ MAX_POSES, MAX_ROOMS = 65_536, 1000
 # Pins whose room is right with at least this probability are sure.
 SURE = 0.8
 _SUGGESTIONS, _ROOMS = 5, 8
-# The usual share of misread photographs counts like so many photographs; albums with more than the limit do not fit
-# their plan; and rounds of expectation maximisation.
-_SEEN_BEFORE, _MISFIT, _ROUNDS = 10.0, 0.33, 20
+# The usual share of misread photographs counts like so many photographs; rounds of expectation maximisation; and the
+# limit of the log odds that a room is right, either way.
+_SEEN_BEFORE, _ROUNDS, _MAX_LOG_ODDS = 10.0, 20, 6.0
 _MISFIT_WARNING = (
     "the photographs fit this plan badly: walls and openings of {:.0f} % of them agree with it no better than with "
     "other homes, so none is sure; check that it is the plan of this home, its scale, and that it draws the doors and "
@@ -91,16 +92,17 @@ def solve_album(
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
-    usual = encoder.manifest.album.misread
+    weights = encoder.manifest.album
     # What a person stated, and what is taken outside, does not tell how well the plan is read.
     telling = [
         state.rooms / state.photographs
         for each, state in zip(ordered, states, strict=True)
         if each.id not in constraints and _outside(each) <= 0.0
     ]
-    misread = misread_share(telling, usual)
+    misread = misread_share(telling, weights.misread)
     share = _room_shares(ground, encoder, ordered, memory, states, links, constraints, walk, misread, pause)
-    misfit = () if misread <= _MISFIT else (_MISFIT_WARNING.format(100.0 * misread),)
+    misfit = () if misread <= weights.misfit else (_MISFIT_WARNING.format(100.0 * misread),)
+    share = calibrated(share, misread, weights)
     pins = {
         each.id: _pin(ground, each, state, row, constraints.get(each.id), fits=not misfit)
         for each, state, row in zip(ordered, states, share, strict=True)
@@ -113,6 +115,7 @@ def solve_album(
         camera_height_m=height_m,
         scale=scale,
         compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
+        misread=misread,
         warnings=(*misfit, *(() if walk is None else walk.warnings)),
     )
 
@@ -129,6 +132,30 @@ def misread_share(rooms: Sequence[Float[np.ndarray, "r"]], usual: float) -> floa
         misread = 1.0 / (1.0 + np.exp(np.clip(math.log1p(-share) - math.log(share) + ratio, -50.0, 50.0)))
         share = (float(misread.sum()) + _SEEN_BEFORE * usual) / (len(ratio) + _SEEN_BEFORE)
     return share
+
+
+def calibrated(share: Float[np.ndarray, "n s"], misread: float, weights: AlbumWeights) -> Float[np.ndarray, "n s"]:
+    """Return the probabilities of rooms (the last is none of them), that of the best one as often right as it says.
+
+    The order stays; where the sum of a row is less than one, the rest is what the photographs cannot tell. Photographs
+    that are probably of none of the rooms keep their row.
+    """
+    each, best = np.arange(len(share)), share[:, :-1].argmax(axis=1)
+    top = share[each, best]
+    bias, by_share, by_misread = weights.confidence
+    confidence = 1.0 / (1.0 + np.exp(-bias - by_share * log_odds(top) - by_misread * misread))
+    left = (1.0 - confidence) / np.maximum(1.0 - top, 1e-9)
+    found = share * np.minimum(confidence / np.maximum(top, 1e-9), left)[:, None]
+    found[each, best] = confidence
+    found[:, -1] = share[:, -1] * np.minimum(left, 1.0)
+    return np.where(share[:, -1:] > 0.5, share, found)
+
+
+def log_odds(probability: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the log odds of probabilities, at most 6 either way."""
+    smallest = 1.0 / (1.0 + math.exp(_MAX_LOG_ODDS))
+    kept = np.clip(probability, smallest, 1.0 - smallest)
+    return np.log(kept / (1.0 - kept))
 
 
 def _check(ground: AlbumGround, photographs: Sequence[AlbumPhotograph]) -> None:

@@ -31,8 +31,9 @@ _BATCH = 4
 MIN_SEEN = 0.25
 VIEW_OUTPUTS = [*PROFILE_OUTPUTS, SHARE_OUTPUT, "seen", *STRUCTURE_OUTPUTS]
 OBJECT_OUTPUTS = ("object_probability", "object_azimuth")
-# Least probability of objects that are named, and a probability whose log is finite.
-_LEAST, _NEVER = 0.1, 1e-9
+# Least probability of objects that are named, a probability whose log is finite, and the largest one that a photograph
+# shows any object.
+_LEAST, _NEVER, _MOST_SEEN = 0.1, 1e-9, 0.98
 # Probability of all objects together, which are those of households, and the log likelihood ratio of outside to inside:
 # of 32 real photographs outside (12 of streets, façades and woods), and of 122 real and 220 rendered views of rooms.
 _HOUSEHOLD, _OUTSIDE = (0.02, 0.035, 0.05, 0.07, 0.09, 0.12, 0.2), (5.0, 4.2, 3.0, 1.5, 0.5, -1.5, -3.0)
@@ -177,15 +178,16 @@ def objects_of_views(
     """Return what the photographs of one spot show.
 
     `views` are the probabilities of the objects in each photograph, and their azimuths (radians) relative to the centre
-    of the first one.
+    of the first one. The likelihood of a type is a mixture: by each object that can be there, and 1 if none is, so that
+    a blank wall tells no type.
     """
     probability = np.stack([share for share, _ in views])
-    mean = probability.mean(axis=0)
-    weight = manifest.weight * min(float(mean.sum()), 1.0) ** manifest.recognition
-    log = weight * np.log(mean @ np.array(manifest.shares) + manifest.floor)
+    present = np.maximum(probability.mean(axis=0) - manifest.floor, 0.0)
+    types = np.array(manifest.shares).shape[1] - 1
+    likelihood = 1.0 - min(float(present.sum()), _MOST_SEEN) + types * present @ np.array(manifest.shares)
     # Objects are never those of the unknown type.
-    log[0] = math.log(_NEVER) + log[1:].max()
-    room_type = PredictedRoomType(log - np.logaddexp.reduce(log), np.full(len(log), 1.0 / (len(log) - 1)))
+    likelihood[0] = _NEVER
+    room_type = PredictedRoomType(np.log(likelihood / likelihood.sum()), np.full(types + 1, 1.0 / types))
     best = probability.argmax(axis=0)
     named = [number for number in np.argsort(-probability.max(axis=0)) if probability[best[number], number] >= _LEAST]
     objects = tuple(
