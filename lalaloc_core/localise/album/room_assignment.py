@@ -7,7 +7,7 @@ of a home is unlikely, as people photograph every room. How many are of none of 
 share of them has a beta distribution, so that the more there are, the more likely is another one.
 
 People mostly walk from room to room through doors, and photograph large rooms more often (`walk_of`,
-`expected_photographs`).
+`expected_shares`).
 
 Chains of several temperatures exchange their states (parallel tempering: Geyer, 1991); those of temperature 1 count.
 Beside single photographs, chains move all photographs of a room, or a run of them, to another room, and exchange two
@@ -48,8 +48,9 @@ _STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.05, 0.5, 4
 _JOINED_M = 0.4
 # Beta distribution of the share of photographs of none of the rooms: in most folders it is one in ten.
 _AWAY = 1.0, 9.0
-# Rooms smaller than this (m²) are often left out.
+# Rooms smaller than this (m²) are often left out, and those of these types mostly.
 _SMALL_M2, _SMALL_SHARE = 3.0, 0.5
+_RARE, _RARE_SHARE = {"closet", "storage", "garage"}, 0.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -336,14 +337,13 @@ def storeys_of(ground: AlbumGround) -> tuple[Int[np.ndarray, "_"], ...]:
     return tuple(np.flatnonzero(part == number) for number in largest)
 
 
-def expected_photographs(ground: AlbumGround, count: int) -> Float[np.ndarray, "r"] | None:
-    """Return the share of the photographs that each room has a priori.
-
-    Large rooms have more; None in plans with more rooms than photographs, which have no expectation.
-    """
-    area = np.array([room.area_m2 for room in ground.plan.rooms])
-    share = np.sqrt(area) * np.where(area < _SMALL_M2, _SMALL_SHARE, 1.0)
-    return None if count < len(area) else share / share.sum()
+def expected_shares(ground: AlbumGround) -> Float[np.ndarray, "r"]:
+    """Return the share of the photographs that each room has a priori: large rooms have more, closets few."""
+    rooms = ground.plan.rooms
+    area = np.array([room.area_m2 for room in rooms])
+    is_rare = np.array([bool(room.types) and _RARE.issuperset(room.types) for room in rooms])
+    share = np.sqrt(area) * np.where(is_rare, _RARE_SHARE, np.where(area < _SMALL_M2, _SMALL_SHARE, 1.0))
+    return share / share.sum()
 
 
 def _joined(ground: AlbumGround) -> Bool[np.ndarray, "r r"]:

@@ -30,13 +30,7 @@ from lalaloc_core.localise.album.evidence import (
 from lalaloc_core.localise.album.ground import AlbumGround, Constraint, constraint_of
 from lalaloc_core.localise.album.links import Found, find_links, pair_odds
 from lalaloc_core.localise.album.pins import Album, Pin, Suggestion
-from lalaloc_core.localise.album.room_assignment import (
-    RoomEvidence,
-    assign_rooms,
-    expected_photographs,
-    storeys_of,
-    walk_of,
-)
+from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms, expected_shares, storeys_of, walk_of
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
 from lalaloc_core.localise.album.walk_order import WalkOrder, walk_order
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
@@ -239,14 +233,18 @@ def _room_shares(
     order = np.arange(len(photographs)) if walk is None else walk.order
     follows = np.zeros(len(photographs), bool) if walk is None else walk.follows
     alone = alone[order]
-    # Without a photograph before it, each is of any room alike.
+    # Large rooms are photographed more often than closets; it counts by half, as numbers of photographs tell it too.
+    expected = expected_shares(ground)
+    alone[:, :rooms] += 0.5 * np.log(rooms * expected)
+    # Without a photograph before it, each is of any room.
     alone[~follows, :rooms] -= math.log(rooms)
     evidence = RoomEvidence(
         alone=alone,
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
         pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],
-        expected=expected_photographs(ground, len(photographs)),
+        # Albums of fewer photographs than rooms have no expectation.
+        expected=expected if len(photographs) >= rooms else None,
         crowding=weights.crowding,
         storeys=storeys_of(ground),
     )
