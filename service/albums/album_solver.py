@@ -201,11 +201,16 @@ class AlbumSolver:
         renew, album = self._store.album_jobs.renew, job.album
         while not progress.stopped:
             await asyncio.sleep(lease_s / _HEARTBEATS)
-            # During an outage no other replica can take the lease either.
-            with suppress(errors.StoreUnavailableError):
-                share = min(max(progress.share, 0.0), 1.0)
-                if not await self._reads.run(album.tenant, renew, album.id, self._owner, lease_s, share):
-                    progress.stopped = True
+            try:
+                # During an outage no other replica can take the lease either.
+                with suppress(errors.StoreUnavailableError):
+                    share = min(max(progress.share, 0.0), 1.0)
+                    if not await self._reads.run(album.tenant, renew, album.id, self._owner, lease_s, share):
+                        progress.stopped = True
+            except Exception:
+                # The next renewal may succeed, and nobody sees the end of this task.
+                fields = {"album": album.id}
+                logging.getLogger(LOGGER_NAME).exception("renewing a lease failed", extra={"fields": fields})
 
     async def _release(self, job: AlbumJob, *, failed: bool) -> None:
         release = self._store.album_jobs.release

@@ -6,6 +6,7 @@ import asyncio
 import csv
 import io
 import json
+import logging
 import threading
 from contextlib import nullcontext
 from functools import partial
@@ -26,7 +27,7 @@ from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
 from service.albums.album_solver import AlbumSolver
 from service.errors import UnanchoredPlanError
-from service.query import AlbumOutcome, album_search
+from service.query import AlbumOutcome, AlbumProgress, album_search
 from service.query.album_answers import compose_outcome
 from service.routes import album_photographs
 from service.schemas.albums import PinAnswer
@@ -34,6 +35,7 @@ from service.storage.album_rows import NewPhotograph
 from service.storage.store import Store
 from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import ALBUMS
+from service.telemetry import LOGGER_NAME
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
 from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, lines_of, upload, wait_for
@@ -629,6 +631,22 @@ def test_solve_of_a_deleted_album_does_not_fail(monkeypatch: pytest.MonkeyPatch)
     job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
     solver = solver_of(renew=lambda *_: False, release=lambda *_, **__: None)
     asyncio.run(solver._attempt(job))
+
+
+def test_heartbeat_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
+    renewals = iter([ValueError("damaged"), None])
+
+    def renew(*_: Any) -> bool:
+        if (error := next(renewals)) is not None:
+            raise error
+        return False
+
+    job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
+    progress = AlbumProgress()
+    asyncio.run(asyncio.wait_for(solver_of(renew=renew)._renew(job, progress), 10.0))
+    assert progress.stopped
+    assert "renewing a lease failed" in caplog.text
 
 
 def test_solver_goes_on_after_an_error() -> None:
