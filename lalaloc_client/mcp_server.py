@@ -2,12 +2,14 @@
 
 The tools call a LaLaLoc service, with the caller's key and within its limits. Over stdio the server runs on the
 caller's machine and reads files by their paths. Over streamable HTTP it reads none: files come as data URLs, and the
-caller's `Authorization` header goes to the service.
+caller's `Authorization` header goes to the service. Then it listens on a loopback address, and bounds what callers
+without a key can take: connections, their time, and the bytes of their requests.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import base64
 import binascii
 import dataclasses
@@ -20,9 +22,16 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import uvicorn
 from mcp.server.mcpserver import Context, Image, MCPServer
 from mcp.server.mcpserver.exceptions import ToolError
+from mcp.server.transport_security import TransportSecurityMiddleware, TransportSecuritySettings
 from pydantic import Field
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from lalaloc_client.asynchronous.client import AsyncClient
 from lalaloc_client.errors import ClientError, ConnectionFailedError, ProblemError
@@ -35,8 +44,15 @@ _INSTRUCTIONS = (
     "its confidence says, tell the user its warnings, and if it is not sure, ask what to do next."
 )
 _DATA, _BASE64, _BEARER = "data:", ";base64,", "Bearer "
-# Base64 of the service's largest files, in a request to this server.
-_MAX_BODY_BYTES = 2**28
+# Size of a request to this server, and of all requests in progress; they take six times that in memory.
+_MAX_BODY_BYTES, _MAX_RECEIVED_BYTES = 2**26, 2**27
+_MAX_CONNECTIONS = 64
+# Timeouts for the head of a request, for its body and for its answer; solving an album takes the longest.
+_HEAD_S, _BODY_S, _ANSWER_S = 15.0, 120.0, 900.0
+# Web pages of other sites can make their own names resolve to a loopback address, but not these.
+_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+_HOSTS = [f"{name}{port}" for name in _LOOPBACK for port in ("", ":*")]
+_SECURITY = TransportSecuritySettings(allowed_hosts=_HOSTS, allowed_origins=[f"http://{host}" for host in _HOSTS])
 _MAX_PHOTOGRAPHS, _MAX_LISTED, _MAX_PINNED = 64, 100, 500
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp"})
 # Photographs of one upload to an album, whose bytes a service limits together, and the longest wait for its solution.
@@ -61,7 +77,8 @@ def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool)
     """
     http_options(base_url, api_key, _TIMEOUT_S)
     tools = _Tools(base_url, api_key, reads_paths=reads_paths)
-    server: MCPServer[Any] = MCPServer("lalaloc", instructions=_INSTRUCTIONS)
+    # The tools never change, so nobody needs to hold a connection to hear of it.
+    server: MCPServer[Any] = MCPServer("lalaloc", instructions=_INSTRUCTIONS, subscriptions=False)
     for tool in (
         tools.import_plan,
         tools.list_plans,
@@ -72,6 +89,17 @@ def make_server(base_url: str, api_key: str | None = None, *, reads_paths: bool)
     ):
         server.add_tool(tool)
     return server
+
+
+def make_http_server(base_url: str, host: str, port: int) -> uvicorn.Server:
+    """Return a server over streamable HTTP; callers must bring keys of their own."""
+    app = make_server(base_url, reads_paths=False).streamable_http_app(
+        stateless_http=True, max_request_body_size=_MAX_BODY_BYTES, transport_security=_SECURITY
+    )
+    config = uvicorn.Config(_BoundedApp(app), host=host, port=port, http=_TimedProtocol, ws="none")
+    # The protocol bounds connections; this bounds requests, which can go on when their connections are closed.
+    config.limit_concurrency = _MAX_CONNECTIONS + 1
+    return uvicorn.Server(config)
 
 
 def main() -> int:
@@ -86,9 +114,7 @@ def main() -> int:
         if arguments.http is None:
             make_server(arguments.url, os.environ.get("LALALOC_API_KEY"), reads_paths=True).run("stdio")
             return 0
-        # Callers must bring keys of their own.
-        server, (host, port) = make_server(arguments.url, reads_paths=False), arguments.http
-        server.run("streamable-http", host=host, port=port, stateless_http=True, max_request_body_size=_MAX_BODY_BYTES)
+        make_http_server(arguments.url, *arguments.http).run()
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -99,7 +125,88 @@ def _address(text: str) -> tuple[str, int]:
     host, separator, port = text.rpartition(":")
     if not (separator and host and port.isdigit() and 0 < int(port) < 2**16):
         raise argparse.ArgumentTypeError(f"'{text}' is no address; write 127.0.0.1:8765")
+    if host not in _LOOPBACK:
+        raise argparse.ArgumentTypeError(
+            f"'{host}' is none of {', '.join(_LOOPBACK)}; to serve other machines, put a reverse proxy with TLS before "
+            "this server, or connect through an SSH tunnel"
+        )
     return host.strip("[]"), int(port)
+
+
+class _BoundedApp:
+    """App that refuses foreign hosts and origins before it reads a body, and bounds the bodies of all requests."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._security = TransportSecurityMiddleware(_SECURITY)
+        self._received_bytes = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request, or the start of the app."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        # The library checks them, too, but after it has read the body.
+        refusal = await self._security.validate_request(Request(scope))
+        if refusal is None and scope["method"] != "POST":
+            # Without sessions, a stream of events would stay open and empty.
+            refusal = Response(status_code=405, headers={"Allow": "POST"})
+        size = 0
+
+        async def counted() -> Message:
+            nonlocal size
+            message = await receive()
+            size += (count := len(message.get("body", b"")))
+            self._received_bytes += count
+            if self._received_bytes > _MAX_RECEIVED_BYTES:
+                limit = f"the limit of all requests in progress is {_MAX_RECEIVED_BYTES} bytes; try again later"
+                raise HTTPException(503, limit, {"Retry-After": "10"})
+            return message
+
+        try:
+            await (refusal or self._app)(scope, counted, send)
+        finally:
+            self._received_bytes -= size
+
+
+class _TimedProtocol(H11Protocol):
+    """Protocol that bounds connections, and the time of each head, body and answer.
+
+    The server itself ends connections that are idle after an answer, until the first byte of the next head.
+    """
+
+    _limit_s = 0.0
+    _end: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().connection_made(transport)
+        if len(self.connections) > _MAX_CONNECTIONS:
+            transport.abort()
+        self._time()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        self._time()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._time()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        if self._end is not None:
+            self._end.cancel()
+
+    def _time(self) -> None:
+        """Begin a new timeout if the connection waits for something else than before."""
+        cycle: Any = self.cycle
+        limit_s = _HEAD_S
+        if cycle is not None and not cycle.response_complete:
+            limit_s = _BODY_S if cycle.more_body else _ANSWER_S
+        if limit_s != self._limit_s:
+            if self._end is not None:
+                self._end.cancel()
+            self._limit_s, self._end = limit_s, self.loop.call_later(limit_s, self.transport.abort)
 
 
 class _Tools:

@@ -16,7 +16,7 @@ from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError
 
 _MCP_OPTIONS = """
 --url URL: address of the service (default: %(default)s)
---http HOST:PORT: serve streamable HTTP at /mcp instead of stdio; callers send their own keys (stdio: LALALOC_API_KEY)
+--http HOST:PORT: serve HTTP at /mcp of a loopback address, not stdio; callers send their keys (stdio: LALALOC_API_KEY)
 """
 # The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130

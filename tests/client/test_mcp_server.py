@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import base64
 import json
 import socket
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ import pytest
 from mcp.client.stdio import StdioServerParameters
 from mcp.client.streamable_http import streamable_http_client
 
+from lalaloc_client import mcp_server
 from lalaloc_core.bundle import default_bundle
 from service.storage import Store
 from tests.local_servers import free_port
@@ -200,3 +204,87 @@ async def _over_http(port: int, headers: dict[str, str], document: str, path: st
 def _listens(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.fixture
+def http_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Return the port of a server over HTTP with small limits."""
+    for name, limit in {"_MAX_BODY_BYTES": 3000, "_MAX_RECEIVED_BYTES": 4000, "_MAX_CONNECTIONS": 3}.items():
+        monkeypatch.setattr(mcp_server, name, limit)
+    port = free_port()
+    server = mcp_server.make_http_server(f"http://127.0.0.1:{port}", "127.0.0.1", port)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        wait_for(lambda: server.started)
+        yield port
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def _sent(port: int, text: str) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", port), timeout=20.0)
+    connection.sendall(text.encode())
+    return connection
+
+
+def _head(*lines: str, method: str = "POST", host: str = "127.0.0.1:8765") -> str:
+    stated = (f"{method} /mcp HTTP/1.1", f"Host: {host}", "Content-Type: application/json", *lines)
+    return "\r\n".join(stated) + "\r\n\r\n"
+
+
+@pytest.mark.parametrize(
+    ("request_text", "status"),
+    [
+        (_head("Content-Length: 9", host="rebound.example:8765"), b"421"),
+        (_head("Content-Length: 9", "Origin: https://page.example"), b"403"),
+        (_head("Content-Length: 9", "Origin: http://localhost.page.example:80"), b"403"),
+        (_head("Content-Length: 3001"), b"413"),
+        (_head("Transfer-Encoding: chunked") + f"bb9\r\n{'a' * 3001}\r\n", b"413"),
+        (_head(method="GET"), b"405"),
+    ],
+)
+def test_http_refuses_requests_before_their_bodies_end(http_port: int, request_text: str, status: bytes) -> None:
+    with _sent(http_port, request_text) as connection:
+        assert connection.recv(4096).split()[1] == status
+
+
+def test_http_bounds_the_bodies_of_all_requests_together(http_port: int) -> None:
+    half = _head("Content-Length: 3000") + "a" * 2500
+
+    def status(text: str) -> bytes:
+        with _sent(http_port, text) as connection:
+            return connection.recv(4096).split()[1]
+
+    with _sent(http_port, half):
+        assert status(half) == b"503"
+    # The body counts until the server notices the disconnect.
+    wait_for(lambda: status(half + "a" * 500) == b"406")
+
+
+@pytest.mark.parametrize(
+    "part", ["", "POST /mcp HT", _head(method="GET") + "POST /mcp HT", _head("Content-Length: 9") + "half"]
+)
+def test_http_ends_connections_that_send_no_whole_request(
+    http_port: int, part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("_HEAD_S", "_BODY_S"):
+        monkeypatch.setattr(mcp_server, name, 0.5)
+    with _sent(http_port, part) as connection, connection.makefile("rb") as answers:
+        assert answers.read().count(b"HTTP/1.1") == part.count("GET")
+
+
+def test_http_bounds_connections(http_port: int) -> None:
+    with ExitStack() as stack:
+        connections = [stack.enter_context(_sent(http_port, "")) for _ in range(4)]
+        assert connections[-1].recv(4096) == b""
+        connections[0].sendall(_head(method="GET").encode())
+        assert connections[0].recv(4096).split()[1] == b"405"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "[::]", "service.example"])
+def test_http_listens_on_loopback_addresses_only(host: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="reverse proxy with TLS"):
+        mcp_server._address(f"{host}:8765")
+    assert mcp_server._address("[::1]:8765") == ("::1", 8765)
