@@ -32,12 +32,26 @@ _AT_SHEET = re.compile(
 # Common scales of building drawings.
 _USUAL = {10, 20, 25, 33, 48, 50, 64, 75, 96, 100, 125, 150, 192, 200, 250, 300, 400, 500, 1000}
 # "4.20", "4,205 m", "420", "4200 mm".
-_METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{2,5})\s*(m|cm|mm|)")
+_METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{1,5})\s*(m|cm|mm|)")
 _IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″]?)?")
-# Sides of a room: "11'5\" x 12'9\"", "9 ft 6 in x 13 ft", "4.84m x 5.52m", "5,0x3,6".
-_FEET = r"(\d{1,2})\s*(?:['′’`]|ft\.?|feet)\s*-?,?\s*(?:(\d{1,2})\s*½?\s*(?:[\"″”]|''|in\b\.?)?)?"
-_METRES = r"(\d{1,2}[.,]\d{1,3})\s*m?()"
-_SIDES = [re.compile(rf"{side}\s*(?:[x×*]|by)\s*{side}", re.IGNORECASE) for side in (_FEET, _METRES)]
+# Sides of a room: "11'5\" x 12'9\"", "9 ft 6 in by 13 ft", "13' X 8'6", "4.84m (max) x 5.52m", "5,0x3,6", "425 x 385".
+# Small print loses marks: "117\"" is 11'7", and "6.28.4" is 6.2 x 8.4.
+_FEET = (
+    r"(\d{1,2}|\d{1,2}[.,]\d{1,2}(?=\s?['′’]))\s?(?:(?:['′’‘`´]|f(?:oo|ee)?t\b\.?)\s?[-,]?\s?)?"
+    r"(?:(1[01]|\d)(?!\d)\s?[¼½¾]?\s?(?:[\"″”“]|''|in(?:ch(?:es)?)?\b\.?)?)?(?!\s?[cm]?m\b)"
+)
+_METRES = r"(\d{1,2}[.,]\d{1,3}|\d{1,5})\s?(?:(mm|cm|m|м)(?:trs?|ts|et(?:re|er)s?)?\b\.?)?"
+_MAX = r"(?:\s?(?:\([^()]{1,15}\)|(?:max|min|[wldbht])\b\.?))?"
+_TIMES = rf"{_MAX}\s?(?:[x×х✕*]|by\b|par\b){_MAX}\s?"
+_JOINED = r"(?<=[.,]\d)(?=\d{1,2}[.,]\d\b)|(?<=[.,]\d\d)(?=\d{1,2}[.,]\d\d\b)"
+_IN_FEET, _IN_METRES = (
+    re.compile(rf"\(?(?<![\d.,]){side}(?:{times}){side}(?![.,]?\d){_MAX}\)?", re.IGNORECASE)
+    for side, times in ((_FEET, _TIMES), (_METRES, f"{_TIMES}|{_JOINED}"))
+)
+# Whole numbers without a mark are feet in this range; other ones are sides only if they are longer (m) than beds and
+# doors, whose sizes are written alike.
+_MARK_OF_FEET = re.compile(r"['′’‘`´\"″”“]|f(?:oo|ee)?t|(?<!m)in", re.IGNORECASE)
+_WHOLE_FEET, _LONGER_THAN_BEDS_M = {str(feet) for feet in range(5, 31)}, 2.2
 # Whole numbers without a unit are millimetres from here on, and centimetres or millimetres below it.
 _SURELY_MM = 1000
 _LENGTH_M = (0.2, 200.0)
@@ -49,12 +63,16 @@ _MAX_TEXTS, _MAX_LINES_PER_TEXT, _MAX_PIECES = 1000, 12, 60_000
 # Ratios within this share agree. So many dimensions of different lengths must agree, and twice as many as on any other
 # ratio.
 _AGREE, _MIN_AGREEING, _MIN_LENGTHS, _MARGIN = 0.01, 3, 2, 2
-# Area written in a room, and its range (m²). Lengths and areas that differ by larger shares are reported.
-_AREA = re.compile(r"(\d{1,4}(?:[.,]\d{1,2})?)\s*(m²|m2|qm|sqm|sq\.? ?m|sq\.? ?ft|sf)(?![a-z])", re.IGNORECASE)
+# Area written in a room, and its range (m²). Russian is read in Latin letters.
+_AREA = re.compile(
+    r"\(?(?:\b(?:ca|approx|a)\b\s?[.:=]?\s?|(?<![\d.,]))(\d{1,4}(?:[.,]\d{1,2})?)\s*"
+    r"([mм][²2]|qm|kvm|[kкκ][bв]\.? ?[mм]|sq\.? ?m(?:et(?:re|er)s?)?|(?:sq\.? ?(?:ft|feet)|sf|ft[²2]))(?![a-zа-я])\)?",
+    re.IGNORECASE,
+)
 _SQUARE_FOOT_M2, _AREA_M2 = 0.3048**2, (0.5, 2000.0)
-# Range of sides of rooms (m), and the difference of the logs of ratios of sides that are of one shape; inches of a
-# foot.
-_SIDE_M, _SAME_RATIO, _INCHES = (0.6, 40.0), 0.15, 12.0
+# Range of sides of rooms (m), difference of the logs of ratios of sides of one shape, and the share by which an area in
+# two units differs.
+_SIDE_M, _SAME_RATIO, _SAME_AREA = (0.6, 40.0), 0.15, 0.08
 # Rooms whose areas or sides must be written for a warning.
 _MIN_AREAS = 2
 _TOLERANCE, _AREA_TOLERANCE = 0.05, 0.25
@@ -122,6 +140,8 @@ def drawing_scale(
         if found:
             return checked(*found)
         hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
+        if sizes := [text for text in texts if _has_size(text)]:
+            hint += f" ({len(sizes)} texts such as '{sizes[0][:50]}' are sizes of rooms, but no two rooms have these)"
         raise InvalidFloorPlanError(
             f"{subject} gives no scale{hint}, and too few doors, stairs, areas or dimensions are found to estimate it: "
             "set scale (1:100), metres_per_pixel (metres per unit of the drawing) or known_distance (x0, y0, x1, y1, "
@@ -181,12 +201,12 @@ def _drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[floa
 def check_scale(
     metres_per_unit: float, source: str, measured: tuple[float, str] | None, builder: ReportBuilder
 ) -> None:
-    """Warn if a scale differs from that of the dimensions that are written in the drawing."""
+    """Warn if a scale differs from that of the sizes that are written in the drawing, `measured`."""
     if measured is not None and abs(metres_per_unit / measured[0] - 1.0) > _TOLERANCE:
         builder.scale_factor = measured[0] / metres_per_unit
         builder.warnings.append(
-            f"{measured[1]} give {measured[0]:.4g} m per unit, and the {source} gives {metres_per_unit:.4g}; check both"
-            f", or set multiply={builder.scale_factor:.3f} to believe the dimensions"
+            f"{measured[1]} give {measured[0]:.4g} m per unit, and {metres_per_unit:.4g} is used ({source}); check "
+            f"both, or set multiply={builder.scale_factor:.3f} to believe what is written"
         )
 
 
@@ -205,37 +225,39 @@ def reject_dimensions(dimensions: Sequence[Dimension], metres_per_unit: float, b
             )
 
 
-def check_areas(rooms: Sequence[SketchedRoom], texts: Sequence[Sequence[str]], builder: ReportBuilder) -> None:
-    """Compare the areas (m²) of rooms with those written in them, `texts` of every room."""
+def check_areas(
+    rooms: Sequence[SketchedRoom], texts: Sequence[Sequence[str]], outside: Sequence[str], builder: ReportBuilder
+) -> None:
+    """Compare the sizes of rooms with those written in them, `texts` of every room; `outside` are texts in no room."""
     areas = _written_areas([room.shape for room in rooms], texts)
     shares = {index: area_m2 / written_m2 for index, (written_m2, area_m2) in areas.items()}
     middle = float(np.median(list(shares.values()))) if shares else 1.0
-    builder.rejected_texts += [
+    agreeing = [index for index, share in shares.items() if abs(share / middle - 1.0) <= _AREA_TOLERANCE]
+    is_sure, length = len(agreeing) >= _MIN_AREAS, math.sqrt(middle)
+    # Without sizes that agree, the scale is believed.
+    usual, tolerance = (middle, _AREA_TOLERANCE) if is_sure else (1.0, 0.1)
+    against = [
         f"{areas[index][0]:.4g} m² was read as the area of a room of {areas[index][1]:.1f} m²"
         + (f" ('{rooms[index].name}')" if rooms[index].name else "")
         for index, share in shares.items()
-        if abs(share / middle - 1.0) > _AREA_TOLERANCE or (len(shares) < _MIN_AREAS and abs(share - 1.0) > 0.1)
+        if abs(share / usual - 1.0) > tolerance
     ]
-    if sum(abs(share / middle - 1.0) <= _AREA_TOLERANCE for share in shares.values()) < _MIN_AREAS:
+    builder.rejected_texts += against
+    for index, written in enumerate([*texts, outside]):
+        # Open rooms have the sizes of their parts; a single size that does not fit is a contradiction.
+        unused = [f"'{text[:50]}'" for text in written if index not in areas and _has_size(text)]
+        reason = "does not fit its room" if len(unused) == 1 else "is one of several in a room"
+        reason = reason if index < len(rooms) else "is in no room"
+        lines = [f"{text} was read as the size of a room, but {reason}" for text in unused]
+        builder.rejected_texts += lines
+        against += lines if len(lines) == 1 and index < len(rooms) else []
+    if not is_sure:
         return
-    length = math.sqrt(middle)
-    if abs(length - 1.0) > _TOLERANCE:
-        builder.scale_factor = 1.0 / length
-        builder.warnings.append(
-            f"the areas and sides written in {len(shares)} rooms are {1.0 / middle:.2f} times the plan's; if they are "
-            f"right, all lengths have to be multiplied by {1.0 / length:.3f}: check the scale, or set "
-            f"multiply={1.0 / length:.3f}"
-        )
-        return
-    builder.notes.append(f"the areas written in {len(shares)} rooms agree with the scale")
-    for index, share in shares.items():
-        if abs(share / middle - 1.0) > _AREA_TOLERANCE:
-            room = rooms[index]
-            name = f"room '{room.name}'" if room.name else "a room"
-            builder.unsure.append(
-                f"{name} has {room.shape.area:.1f} m², and {room.shape.area / share:.1f} m² are written in it; check "
-                "its walls"
-            )
+    builder.warnings += [f"{text}, against {len(agreeing)} sizes that agree; check its walls" for text in against]
+    if abs(length - 1.0) <= _TOLERANCE:
+        builder.notes.append(f"the areas written in {len(shares)} rooms agree with the scale")
+    measured = builder.metres_per_unit / length, f"the areas and sides written in {len(agreeing)} rooms"
+    check_scale(builder.metres_per_unit, builder.scale_source, measured, builder)
 
 
 def areas_of_rooms(
@@ -260,35 +282,58 @@ def texts_of_rooms(
 
 
 def _written_areas(shapes: Sequence[shapely.Polygon], texts: Sequence[Sequence[str]]) -> dict[int, tuple[float, float]]:
-    areas = [[area for text in written for area in _areas_m2(text)] for written in texts]
-    # A room with two areas is two rooms, or one of them is the area of the flat.
-    found = {index: (area[0], shapes[index].area) for index, area in enumerate(areas) if len(area) == 1}
-    sides = {index: [pair for text in written if (pair := sides_m(text))] for index, written in enumerate(texts)}
-    for index, pairs in sides.items():
-        # Sides are those of the box around a room, of about its shape.
-        box = side_lengths(shapes[index])
-        if len(pairs) == 1 and index not in found and box[0] > 0.0:
-            ratio = max(pairs[0]) / min(pairs[0]) / (box[1] / box[0])
-            if abs(math.log(ratio)) <= _SAME_RATIO:
-                found[index] = pairs[0][0] * pairs[0][1], box[0] * box[1]
+    """Return the area (m²) that is written in each room, and the room's; sides are those of the box around a room."""
+    found: dict[int, tuple[float, float]] = {}
+    for index, (shape, written) in enumerate(zip(shapes, texts, strict=True)):
+        areas = [area for text in written for area in _areas_m2(text)]
+        pairs = [pair for text in written if (pair := sides_m(text))]
+        short, long = side_lengths(shape)
+        like = [short > 0.0 and abs(math.log(max(a, b) / min(a, b) * short / long)) <= _SAME_RATIO for a, b in pairs]
+        sizes = areas or ([math.prod(pair) for pair in pairs] if all(like) else [])
+        # A room with several sizes is several rooms, or one is that of the flat; two can be one in two units.
+        if 1 <= len(sizes) <= 2 and max(sizes) <= (1.0 + _SAME_AREA) * min(sizes):
+            found[index] = float(np.mean(sizes)), shape.area if areas else short * long
     return found
 
 
 def sides_m(text: str) -> tuple[float, float] | None:
     """Return the two sides (m) of a room that a text states, such as 11'5" x 12'9", or "4.84m x 5.52m"."""
-    for pattern, unit in zip(_SIDES, ("ft", "m"), strict=True):
-        match = pattern.search(text)
-        if match is not None:
-            whole = [float(match[k].replace(",", ".")) + float(match[k + 1] or 0.0) / _INCHES for k in (1, 3)]
-            sides = whole[0] * METRES_PER_UNIT[unit], whole[1] * METRES_PER_UNIT[unit]
-            return sides if _SIDE_M[0] <= min(sides) and max(sides) <= _SIDE_M[1] else None
-    return None
+    sides: list[float] = []
+    match = _IN_FEET.search(text)
+    if match and (
+        _MARK_OF_FEET.search(match[0]) or ({match[2], match[4]} == {None} and {match[1], match[3]} <= _WHOLE_FEET)
+    ):
+        sides = [METRES_PER_UNIT["ft"] * (_number(match[k]) + int(match[k + 1] or 0) / 12) for k in (1, 3)]
+    elif match := _IN_METRES.search(text):
+        unit = (match[4] or match[2] or "").casefold().replace("м", "m")
+        values = [values_m(match[k] + unit) for k in (1, 3)]
+        # "850" is in millimetres beside "2100".
+        sides = [value_m[-1 if min(map(len, values)) == 1 else 0] for value_m in values if value_m]
+        if not unit and (match[1] + match[3]).isdigit() and max(sides, default=0.0) <= _LONGER_THAN_BEDS_M:
+            return None
+    is_room = len(sides) == 2 and _SIDE_M[0] <= min(sides) and max(sides) <= _SIDE_M[1]
+    return (sides[0], sides[1]) if is_room else None
+
+
+def _number(text: str) -> float:
+    return float(text.replace(",", "."))
+
+
+def without_sizes(text: str) -> str:
+    """Return a text without the area and the sides of a room that it states."""
+    for pattern in (_AREA, _IN_FEET, _IN_METRES) if sides_m(text) else (_AREA,):
+        text = pattern.sub("", text)
+    return text
+
+
+def _has_size(text: str) -> bool:
+    return bool(_areas_m2(text) or sides_m(text))
 
 
 def _areas_m2(text: str) -> tuple[float, ...]:
     """Return the areas (m²) that are written in a text."""
-    found = [(float(number.replace(",", ".")), unit) for number, unit in _AREA.findall(text)]
-    areas = [value * (_SQUARE_FOOT_M2 if unit.casefold().endswith(("ft", "sf")) else 1.0) for value, unit in found]
+    found = [(_number(number), unit) for number, unit in _AREA.findall(text)]
+    areas = [value * (_SQUARE_FOOT_M2 if "f" in unit.casefold() else 1.0) for value, unit in found]
     return tuple(area for area in areas if _AREA_M2[0] <= area <= _AREA_M2[1])
 
 
@@ -334,7 +379,7 @@ def values_m(text: str) -> tuple[float, ...]:
     if match := _IMPERIAL.fullmatch(text):
         values = [METRES_PER_UNIT["ft"] * int(match[1]) + METRES_PER_UNIT["in"] * int(match[2] or 0)]
     elif match := _METRIC.fullmatch(text):
-        number, unit = float(match[1].replace(",", ".")), match[2]
+        number, unit = _number(match[1]), match[2]
         if unit:
             values = [number * METRES_PER_UNIT[unit]]
         elif not match[1].isdigit():

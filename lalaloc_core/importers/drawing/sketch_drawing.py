@@ -7,7 +7,6 @@ passage without a symbol that is wider than a door are divided where their names
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -32,7 +31,7 @@ from lalaloc_core.importers.drawing.door_leaves import (
     with_half_open_doors,
     without_leaves,
 )
-from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, written_dimensions
+from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, without_sizes, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
 from lalaloc_core.importers.drawing.rooms_in_drawing import (
     GapFinder,
@@ -52,8 +51,6 @@ _MAX_OTHERS = 5
 _OPENING_M = (0.3, 8.0)
 # Distance from a wall at which a place is in the room beside it (m).
 _BESIDE_M = 0.15
-# Area written after a room's name.
-_SIZE = re.compile(r"\(?\d+(?:[.,]\d+)?\s*(?:m²|m2|qm|sqm|sq\.? ?ft|sf)(?![a-z])\)?", re.IGNORECASE)
 # Lines of walls nearer to a room's outline are its own walls.
 _OFF_WALL_M = 0.03
 # Parts of a trace by the roles of lines.
@@ -263,7 +260,7 @@ def name_rooms(
                 f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
                 "between them"
             )
-    check_areas(rooms, [[raw.text for raw in inside] for inside in texts], builder)
+    check_areas(rooms, [[raw.text for raw in inside] for inside in texts], [raw.text for raw in outside], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:
         builder.notes.append(f"{unnamed} rooms have no name in the file")
@@ -272,7 +269,7 @@ def name_rooms(
 
 def _names(letterings: Sequence[Lettering]) -> list[Lettering]:
     """Return the texts that are names, without the sizes beside them."""
-    texts = (replace(lettering, text=_SIZE.sub("", lettering.text).strip(" ,;:-\n\t")) for lettering in letterings)
+    texts = (replace(lettering, text=without_sizes(lettering.text).strip(" ,;:-\n\t")) for lettering in letterings)
     return [lettering for lettering in texts if _is_name(lettering.text)]
 
 

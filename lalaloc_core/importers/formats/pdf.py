@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -68,25 +69,24 @@ def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tu
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
     scan = _read_scan(found, builder, budget)
-    assumed = ReportBuilder()
     # A unit of a PDF is always a point.
     without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]
-    factor, source = drawing_scale(
+    factor, _ = builder.metres_per_unit, builder.scale_source = drawing_scale(
         without_units,
         "the PDF",
         drawings,
         budget.check_time,
         paper_m_per_unit=_METRES_PER_POINT,
         paper_m=max(found.size_pt) * _METRES_PER_POINT,
-        guess=lambda: assume_scale(_guess(found, scan, budget), assumed),
+        guess=lambda: assume_scale(_guess(found, scan, budget), builder),
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
     _remove_letters(found)
-    notes = list(builder.notes)
+    before = deepcopy(builder)
     sketch = _as_drawing(found, factor, builder, budget)
     if sketch is None or not sketch.rooms:
-        notes.append(f"page {options.page} was read as a picture")
-        builder = ReportBuilder("pdf", is_draft=True, notes=notes)
+        builder = before
+        builder.notes.append(f"page {options.page} was read as a picture")
         # Searchable scans contain text over the picture.
         letterings = found.drawing.scaled(factor, flip_y=False).letterings or scan.placed(factor)
         sketch = _as_picture(found, factor, builder, budget, letterings=letterings)
@@ -98,9 +98,6 @@ def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tu
         return x0 / factor, y0 / factor, x1 / factor, y1 / factor
 
     sketch = choose_storey(sketch, builder, in_points, is_chosen=True)
-    builder.metres_per_unit, builder.scale_source = factor, source
-    builder.scale_std, builder.scale_clues = assumed.scale_std, assumed.scale_clues
-    builder.warnings[:0] = assumed.warnings
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 
@@ -113,8 +110,8 @@ def _guess(found: PageContent, scan: PictureTexts, budget: Budget) -> ScaleGuess
 
     def measure(scale: float) -> Measures:
         # Symbols that are found by their size tell nothing about the scale.
-        sketch = _as_picture(found, scale, ReportBuilder(), budget, has_symbols=False)
         letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
+        sketch = _as_picture(found, scale, ReportBuilder(), budget, has_symbols=False, letterings=letterings)
         return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
 
     return guess_scale(measure, first_scale(0.9 * max(found.size_pt)), budget)
