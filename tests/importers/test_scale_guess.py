@@ -9,6 +9,9 @@ import shapely
 
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.sketch import SketchedRoom
+from lalaloc_core.importers.drawing.drawing_scale import check_areas, sides_m, without_sizes
 from lalaloc_core.importers.drawing.scale_guess import Measures, combine, guess_scale, tread_spacings
 from tests.importers.test_lettering import LIMITS, PrintedPlan
 from tests.strategies import present
@@ -58,6 +61,11 @@ def test_drawing_is_read_again_at_the_scale_that_was_found():
     assert abs(math.log(scales[1] / guess.metres_per_unit)) < 0.04
 
 
+def test_other_first_scales_are_tried_where_nothing_is_found():
+    guess = guess_scale(lambda scale: Measures(leaves=[84.0] * 4 if 0.009 < scale < 0.011 else []), 0.016, Budget())
+    assert present(guess).metres_per_unit == pytest.approx(0.01, rel=0.03)
+
+
 def test_estimate_ends_with_the_time_of_the_import():
     scales: list[float] = []
 
@@ -66,7 +74,6 @@ def test_estimate_ends_with_the_time_of_the_import():
         return Measures(leaves=[1.5 / scale] * 3)
 
     guess_scale(sketch, 0.02, Budget())
-    assert len(scales) == 4
     clock = iter(range(1000))
     budget = Budget(ImportLimits(max_import_s=10.0), lambda: float(next(clock)))
     guess_scale(sketch, 0.02, budget)
@@ -89,6 +96,50 @@ def test_written_areas_of_a_picture_give_its_scale():
     report = import_plan(page.file(), limits=LIMITS).report
     assert report.metres_per_unit * page.px_per_m == pytest.approx(1.0, abs=0.02)
     assert report.scale_source.startswith("estimated from the thickness of walls, 3 written areas (±")
+
+
+@pytest.mark.parametrize(
+    ("text", "sides"),
+    [
+        ("11'5\" x 12'9\"", (3.48, 3.89)), ("11’5” × 12’9”", (3.48, 3.89)), ("13' X 8'6", (3.96, 2.59)),
+        ("14'6″x 117\"", (4.42, 3.53)), ("12'-5\"w x 15'-0\"d", (3.78, 4.57)), ("Bed 2 9 ft 6 in by 13ft", (2.9, 3.96)),
+        ("13'2\" (4.01m) x 10' (3.05m)", (4.01, 3.05)), ("12 x 14", (3.66, 4.27)), ("10.5' x 12'", (3.2, 3.66)),
+        ("5.0x3.6", (5.0, 3.6)), ("4,84m х 5,52m", (4.84, 5.52)), ("4.49m (max) x 3m", (4.49, 3.0)),
+        ("6.28.4", (6.2, 8.4)), ("425 x 385", (4.25, 3.85)), ("3593x 900", (3.593, 0.9)),
+        ("3,48 x 3,89 (11'5 x 12'9)", (3.48, 3.89)), ("160 x 200", None),
+        ("850 x 2100", None), ("30 48", None), ("12.11.2024", None), ("88,5/2,01", None),
+    ],
+)  # fmt: skip
+def test_sides_of_rooms_are_read_as_agents_write_them(text: str, sides: tuple[float, float] | None):
+    assert sides_m(text) == (sides and pytest.approx(sides, abs=0.006))
+    assert sides is None or without_sizes(text).strip() in ("", "Bed 2")
+
+
+def test_sizes_that_contradict_the_others_or_the_scale_are_named():
+    rooms = [SketchedRoom(shapely.box(5.0 * k, 0.0, 5.0 * k + 4.0, 3.0), name) for k, name in enumerate("ABCD")]
+    texts = [["5.0 x 3.75"], ["18.75 m² / 202 sq ft"], ["28.5 m²"], ["5.0m x 7.9m"]]
+    builder = ReportBuilder(metres_per_unit=0.02, scale_source="option metres_per_pixel")
+    check_areas(rooms, texts, ["19' x 11'"], builder)
+    area, shape, scale = builder.warnings
+    assert area.startswith("28.5 m² was read as the area of a room of 12.0 m² ('C'), against 2 sizes that agree")
+    assert shape.startswith("'5.0m x 7.9m' was read as the size of a room, but does not fit its room")
+    assert scale.startswith("the areas and sides written in 2 rooms give 0.02501 m per unit, and 0.02 is used (option")
+    assert builder.scale_factor == pytest.approx(1.25, rel=0.01)
+    assert builder.rejected_texts[-1] == "'19' x 11'' was read as the size of a room, but is in no room"
+
+
+def test_written_sides_of_rooms_give_the_scale_of_a_picture_with_a_title():
+    page = PrintedPlan(margin_m=4.0, areas=False, dimensions=False)
+    page._text((4.6, 9.0), "12 EXAMPLE STREET, SAMPLE TOWN, TWO BEDROOMS, FOR ILLUSTRATION ONLY, NOT TO SCALE")
+    for middle, text in (
+        ((2.1, 2.9), "12'10\" x 19'8\""),
+        ((6.7, 4.4), "2.90m x 4.80m"),
+        ((6.7, 1.3), "3.75m x 6.20m"),
+    ):
+        page._text(middle, text)
+    report = import_plan(page.file(), limits=LIMITS).report
+    assert report.metres_per_unit * page.px_per_m == pytest.approx(1.0, abs=0.02)
+    assert any("23.25 m² was read as the area of a room of 13." in warning for warning in report.warnings)
 
 
 @pytest.mark.slow

@@ -43,8 +43,10 @@ _MISLEADS: Mapping[str, float] = {
 }  # fmt: skip
 _QUANTILES = (0.1587, 0.5, 0.8413)
 # A scale with a larger error is not used; so many parts of a kind must agree on it, within so many standard deviations.
-_MAX_STD, _MIN_PARTS, _AGREE_STDS, _AGREE = 0.1, 2, 3.0, 0.03
+_MAX_STD, _MIN_PARTS, _AGREE_STDS, _AGREE, _CONTRADICTS = 0.1, 2, 3.0, 0.03, 0.14
 _MAX_PASSES, _CONVERGED, _SHARE_OF_TIME = 4, 0.04, 0.4
+# First scales that are tried, relative to the likeliest.
+_FIRST_SHARES = (1.0, 1.6, 1.0 / 1.6)
 _NAMES: Mapping[str, tuple[str, str]] = {
     "leaf": ("door leaf", "door leaves"), "wall": ("thickness of walls", "thickness of walls"),
     "tread": ("stair", "stairs"), "fixture": ("fixture", "fixtures"), "area": ("written area", "written areas"),
@@ -110,28 +112,36 @@ def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budge
     """Return the scale that the sizes of parts agree on, None if they are too few or too different.
 
     `sketch` reads the drawing at a scale, in metres per unit, and returns the sizes of its parts; the first scale is
-    `start`. The guess takes at most a part of the import's time.
+    `start`, and others follow until one leads to a certain scale. The guess takes at most a part of the import's time.
     """
     trace, budget.trace = budget.trace, None
-    began_s, limit_s = budget.elapsed_s, _SHARE_OF_TIME * budget.limits.max_import_s
-    scale, guess = start, None
+    end_s = budget.elapsed_s + _SHARE_OF_TIME * budget.limits.max_import_s
     try:
-        for _ in range(_MAX_PASSES):
-            budget.check_time()
-            try:
-                measures = sketch(scale)
-            except InvalidFloorPlanError:
-                budget.check_time()
-                measures = Measures()
-            guess = combine(measures, scale)
-            if guess is None or abs(math.log(guess.metres_per_unit / scale)) <= _CONVERGED:
-                break
-            scale = guess.metres_per_unit
-            if budget.elapsed_s - began_s > limit_s:
-                break
+        for share in _FIRST_SHARES:
+            guess = _settle(sketch, share * start, end_s, budget)
+            if guess is not None or budget.elapsed_s > end_s:
+                return guess
     finally:
         budget.trace = trace
-    return guess if guess is not None and _is_certain(guess) else None
+    return None
+
+
+def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, budget: Budget) -> ScaleGuess | None:
+    """Return the last certain scale of those that parts have, each read at the scale before it; None without any."""
+    certain = None
+    for _ in range(_MAX_PASSES):
+        budget.check_time()
+        try:
+            measures = sketch(scale)
+        except InvalidFloorPlanError:
+            budget.check_time()
+            measures = Measures()
+        guess = combine(measures, scale)
+        certain = guess if guess is not None and _is_certain(guess) else certain
+        if guess is None or abs(math.log(guess.metres_per_unit / scale)) <= _CONVERGED or budget.elapsed_s > end_s:
+            break
+        scale = guess.metres_per_unit
+    return certain
 
 
 def combine(measures: Measures, around: float) -> ScaleGuess | None:
@@ -147,7 +157,8 @@ def combine(measures: Measures, around: float) -> ScaleGuess | None:
     agreeing = _agreeing(measures, math.exp(middle))
     for kind, (count, likelihood) in kinds.items():
         own, own_std = _middle(likelihood + prior, grid)
-        agrees = abs(own - middle) <= max(_AGREE_STDS * math.hypot(own_std, std), _AGREE)
+        limit = min(max(_AGREE_STDS * math.hypot(own_std, std), _AGREE), max(2.0 * own_std, _CONTRADICTS))
+        agrees = abs(own - middle) <= limit
         clues.append(ScaleClue(kind, agreeing.get(kind, count), math.exp(own), own_std, agrees))
     return ScaleGuess(math.exp(middle), std, tuple(clues))
 

@@ -27,7 +27,7 @@ from lalaloc_core.importers.drawing.drawing_scale import (
 from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Area
-from lalaloc_core.importers.picture.ink import blank_outside, inked_extent
+from lalaloc_core.importers.picture.ink import blank_outside, drawn_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
@@ -80,8 +80,11 @@ def _read_plan(
 
     def measure(metres_per_pixel: float) -> Measures:
         # Symbols that are found by their size tell nothing about the scale.
-        sketch = sketch_picture(gray, metres_per_pixel, ReportBuilder(), budget, warmth, has_symbols=False)
-        return measures_of(sketch, metres_per_pixel, texts.placed(metres_per_pixel), texts.drawing, dimensions)
+        placed = texts.placed(metres_per_pixel)
+        sketch = sketch_picture(
+            gray, metres_per_pixel, ReportBuilder(), budget, warmth, has_symbols=False, letterings=placed
+        )
+        return measures_of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
 
     factor, source = builder.metres_per_unit, builder.scale_source = drawing_scale(
         replace(options, units=None),
@@ -89,7 +92,7 @@ def _read_plan(
         [texts.drawing],
         paper_m_per_unit=paper_m_per_pixel,
         own=measured,
-        guess=lambda: assume_scale(guess_scale(measure, first_scale(inked_extent(gray)), budget), builder),
+        guess=lambda: assume_scale(guess_scale(measure, first_scale(drawn_extent(gray)), budget), builder),
     )
     check_scale(factor, source, measured, builder)
     reject_dimensions(dimensions, factor, builder)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 
@@ -24,6 +24,8 @@ _SKEW_PIXELS = 700
 _MIN_SIDE_PX = 64
 # Largest width of lines (m), and their smallest contrast: of 255, and as a multiple of the noise.
 _LINE_M, _FAINTEST, _OVER_NOISE = 0.07, 40.0, 8.0
+# Length of parts of a drawing and distance between them, as shares of its longest part; letters are shorter.
+_LARGE_PARTS, _NEAR_PARTS = 0.1, 0.04
 # Range of Otsu's threshold: pencil is ink, pale floors are not.
 _THRESHOLD = (95.0, 205.0)
 
@@ -119,13 +121,22 @@ def blank_outside(
     return blank
 
 
-def inked_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
-    """Return the longer side (pixels) of the part of a picture that has ink in most of its rows and columns."""
+def drawn_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
+    """Return the longer side (pixels) of the largest drawing in a picture, without titles and small print beside it."""
     ink = gray < min(float(np.median(gray)) - _FAINTEST, _THRESHOLD[1])
-    sides = [np.flatnonzero(ink.any(axis=axis)) for axis in (0, 1)]
-    # Speckles at the borders are no drawing.
-    spans = [np.percentile(side, (2, 98)) for side in sides if len(side)]
-    return float(max((last - first for first, last in spans), default=max(gray.shape)))
+    boxes = _boxes_of_parts(ink)
+    longest = int(boxes[:, 2:].max(initial=0))
+    near = round(_NEAR_PARTS * longest)
+    drawn = np.zeros_like(ink)
+    for x, y, width, height in boxes[boxes[:, 2:].max(axis=1) >= _LARGE_PARTS * longest]:
+        drawn[max(y - near, 0) : y + height + near, max(x - near, 0) : x + width + near] = True
+    return float(max(_boxes_of_parts(drawn)[:, 2:].max(initial=0) - 2 * near, longest) or max(gray.shape))
+
+
+def _boxes_of_parts(mask: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "n 4"]:
+    """Return the left column, top row, width and height of connected parts."""
+    _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return stats[1:, :4]
 
 
 def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:
