@@ -36,11 +36,12 @@ _METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{1,5})\s*(m|cm|mm|)")
 _IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″]?)?")
 # Sides of a room: "11'5\" x 12'9\"", "9 ft 6 in by 13 ft", "13' X 8'6", "4.84m (max) x 5.52m", "5,0x3,6", "425 x 385".
 # Small print loses marks: "117\"" is 11'7", and "6.28.4" is 6.2 x 8.4.
+_UNIT_ENDS = r"(?![^\W\dxх])\.?"
 _FEET = (
-    r"(\d{1,2}|\d{1,2}[.,]\d{1,2}(?=\s?['′’]))\s?(?:(?:['′’‘`´]|f(?:oo|ee)?t\b\.?)\s?[-,]?\s?)?"
-    r"(?:(1[01]|\d)(?!\d)\s?[¼½¾]?\s?(?:[\"″”“]|''|in(?:ch(?:es)?)?\b\.?)?)?(?!\s?[cm]?m\b)"
+    rf"(\d{{1,2}}|\d{{1,2}}[.,]\d{{1,2}}(?=\s?['′’]))\s?(?:(?:['′’‘`´]|f(?:oo|ee)?t{_UNIT_ENDS})\s?[-,]?\s?)?"
+    rf"(?:(1[01]|\d)(?!\d)\s?(?:[¼½¾]|\d/\d)?\s?(?:[\"″”“]|''|in(?:ch(?:es)?)?{_UNIT_ENDS})?)?(?!\s?[cm]?m\b)"
 )
-_METRES = r"(\d{1,2}[.,]\d{1,3}|\d{1,5})\s?(?:(mm|cm|m|м)(?:trs?|ts|et(?:re|er)s?)?\b\.?)?"
+_METRES = rf"(\d{{1,2}}[.,]\d{{1,3}}|\d{{1,5}})\s?(?:(mm|cm|m|м)(?:trs?|ts|et(?:re|er)s?)?{_UNIT_ENDS})?"
 _MAX = r"(?:\s?(?:\([^()]{1,15}\)|(?:max|min|[wldbht])\b\.?))?"
 _TIMES = rf"{_MAX}\s?(?:[x×х✕*]|by\b|par\b){_MAX}\s?"
 _JOINED = r"(?<=[.,]\d)(?=\d{1,2}[.,]\d\b)|(?<=[.,]\d\d)(?=\d{1,2}[.,]\d\d\b)"
@@ -65,7 +66,7 @@ _MAX_TEXTS, _MAX_LINES_PER_TEXT, _MAX_PIECES = 1000, 12, 60_000
 _AGREE, _MIN_AGREEING, _MIN_LENGTHS, _MARGIN = 0.01, 3, 2, 2
 # Area written in a room, and its range (m²). Russian is read in Latin letters.
 _AREA = re.compile(
-    r"\(?(?:\b(?:ca|approx|a)\b\s?[.:=]?\s?|(?<![\d.,]))(\d{1,4}(?:[.,]\d{1,2})?)\s*"
+    r"\(?(?:\b(?:ca|approx|a)\b\s?[.:=]?\s?|(?<![\d.,x×]))(\d{1,4}(?:[.,]\d{1,2})?)\s*"
     r"([mм][²2]|qm|kvm|[kкκ][bв]\.? ?[mм]|sq\.? ?m(?:et(?:re|er)s?)?|(?:sq\.? ?(?:ft|feet)|sf|ft[²2]))(?![a-zа-я])\)?",
     re.IGNORECASE,
 )

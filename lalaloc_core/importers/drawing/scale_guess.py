@@ -46,7 +46,7 @@ _QUANTILES = (0.1587, 0.5, 0.8413)
 _MAX_STD, _MIN_PARTS, _AGREE_STDS, _AGREE, _CONTRADICTS = 0.1, 2, 3.0, 0.03, 0.14
 _MAX_PASSES, _CONVERGED, _SHARE_OF_TIME = 4, 0.04, 0.4
 # First scales that are tried, relative to the likeliest.
-_FIRST_SHARES = (1.0, 1.6, 1.0 / 1.6)
+_FIRST_SHARES = (1.0, 1.6, 1.0 / 1.6, 2.56)
 _NAMES: Mapping[str, tuple[str, str]] = {
     "leaf": ("door leaf", "door leaves"), "wall": ("thickness of walls", "thickness of walls"),
     "tread": ("stair", "stairs"), "fixture": ("fixture", "fixtures"), "area": ("written area", "written areas"),
@@ -127,8 +127,8 @@ def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budge
 
 
 def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, budget: Budget) -> ScaleGuess | None:
-    """Return the last certain scale of those that parts have, each read at the scale before it; None without any."""
-    certain = None
+    """Return the scale at which parts have the sizes they were read with, None if it is uncertain."""
+    guess = None
     for _ in range(_MAX_PASSES):
         budget.check_time()
         try:
@@ -137,11 +137,10 @@ def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, bud
             budget.check_time()
             measures = Measures()
         guess = combine(measures, scale)
-        certain = guess if guess is not None and _is_certain(guess) else certain
         if guess is None or abs(math.log(guess.metres_per_unit / scale)) <= _CONVERGED or budget.elapsed_s > end_s:
             break
         scale = guess.metres_per_unit
-    return certain
+    return guess if guess is not None and _is_certain(guess) else None
 
 
 def combine(measures: Measures, around: float) -> ScaleGuess | None:
