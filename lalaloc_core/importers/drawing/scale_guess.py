@@ -156,7 +156,7 @@ def combine(measures: Measures, around: float) -> ScaleGuess | None:
     agreeing = _agreeing(measures, math.exp(middle))
     for kind, (count, likelihood) in kinds.items():
         own, own_std = _middle(likelihood + prior, grid)
-        limit = min(max(_AGREE_STDS * math.hypot(own_std, std), _AGREE), max(2.0 * own_std, _CONTRADICTS))
+        limit = min(max(_AGREE_STDS * math.hypot(own_std, std), _AGREE), max(1.8 * own_std, _CONTRADICTS))
         agrees = abs(own - middle) <= limit
         clues.append(ScaleClue(kind, agreeing.get(kind, count), math.exp(own), own_std, agrees))
     return ScaleGuess(math.exp(middle), std, tuple(clues))
