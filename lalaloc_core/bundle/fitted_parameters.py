@@ -112,7 +112,7 @@ class AlbumWeights:
     misfit: float = 0.3
     pairs: float = 0.25
     crowding: float = 3.2
-    confidence: tuple[float, float, float] = (1.458, 0.829, -7.323)
+    confidence: tuple[float, float, float] = (1.26, 0.794, -6.986)
 
     def __post_init__(self) -> None:
         """Check the range of `misread`."""

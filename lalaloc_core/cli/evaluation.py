@@ -106,9 +106,6 @@ class Calibrate:
     turns: Annotated[
         bool, "only fit the confidence of turns on the spot, on 2 turns of views and parts of them in each home"
     ] = False
-    rooms: Annotated[
-        Path | None, "folder of path-traced rooms, in galleries of which the confidence is fitted besides"
-    ] = None
     errors: Annotated[bool, "only measure the predictions' errors, for `plan check --localisability`"] = False
     out: Annotated[Path | None, "folder to store predictions in and to continue from"] = None
 

@@ -64,7 +64,6 @@ class CalibrationConfig:
             `openings_weight`, keep the others, and fit the doubt of headings.
         openings_weight: weight of openings relative to walls; None fits it.
         tail: scale of the errors of walls over the predicted one; None keeps the bundle's.
-        rooms: folder of path-traced rooms, whose training rooms are asked for in galleries besides.
         out: folder of the predictions, from which an interrupted calibration continues; None keeps none.
     """
 
@@ -75,7 +74,6 @@ class CalibrationConfig:
     keep_evidence: bool = False
     openings_weight: float | None = None
     tail: float | None = None
-    rooms: Path | None = None
     out: Path | None = None
 
 
@@ -108,9 +106,8 @@ def calibrate(folder: Path, config: CalibrationConfig) -> Bundle:
         bundle = store_matching_weights(bundle, with_heading_doubt(weights, known, searched), views=views)
     description = (
         f"{len(known.own)} {'views' if views else 'spheres'} of {config.homes} generated validation homes, all "
-        f"furniture levels; confidence besides on {len(known.disturbed)} disturbed ones"
-        f"{'' if config.rooms is None else ', path-traced rooms among them'}, and on {len(known.mismatched)} "
-        "photographs of others or of no room"
+        "furniture levels; confidence besides on the same disturbed, and on "
+        f"{len(known.mismatched)} photographs of others or of no room"
     )
     return store_confidence(bundle, known, searched, description, views=views)
 
@@ -144,22 +141,18 @@ class _Queries:
         own, disturbed, unopened, mismatched, foreign = (
             self.localise(name, known) for name in ("own", "disturbed", "unopened", "mismatched", "foreign")
         )
-        rooms = [] if self._config.rooms is None else self.localise("rooms", known)
-        return Answers(own=own, disturbed=[*disturbed, *unopened, *rooms], mismatched=[*mismatched, *foreign])
+        return Answers(own=own, disturbed=[*disturbed, *unopened], mismatched=[*mismatched, *foreign])
 
     def appearance(self, encoders: PhotographEncoder) -> tuple[tuple[float, ...], ...]:
         datasets = [build_dataset(self._run_info(name, True)) for name in ("own", "disturbed")]
         return fit_appearance(encoders, (data.load(name) for data in datasets for name in data.scenes("validation")))
 
     def _run_info(self, name: str, known: bool) -> RunInfo:
-        rooms = name == "rooms"
         return RunInfo(
-            label=f"calibration, {name}, heading {'known' if known else 'searched'}",
-            dataset="path-traced rooms in galleries" if rooms else "generated homes",
-            split="train" if rooms else "validation",
-            data=str(self._config.rooms) if rooms else None,
-            data_format="annotated" if rooms else None,
-            generated=self._generated.get(name),
+            label=f"calibration, {name} homes, heading {'known' if known else 'searched'}",
+            dataset="generated homes",
+            split="validation",
+            generated=self._generated[name],
             views={"per_camera": _VIEWS_PER_CAMERA} if self._config.views else None,
             heading_known=known,
             bundle=str(self._bundle),
