@@ -112,7 +112,7 @@ class AlbumWeights:
     misfit: float = 0.3
     pairs: float = 0.25
     crowding: float = 3.2
-    confidence: tuple[float, float, float] = (1.26, 0.794, -6.986)
+    confidence: tuple[float, float, float] = (1.017, 0.737, -5.441)
 
     def __post_init__(self) -> None:
         """Check the range of `misread`."""
