@@ -134,7 +134,7 @@ def report_pages(
 
 def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: int, notes: Sequence[str]) -> str:
     pins = [row.pin for row in rows if row.pin is not None]
-    parts = [_heading(shortened(title, 60), f"{plan.name}: {len(rows)} of {count} photographs")]
+    parts = [_heading(title, f"{plan.name}: {len(rows)} of {count} photographs")]
     foot = 120 + 30 * len(notes)
     box = (_MARGIN, _TOP + 10, _INNER, HEIGHT - _TOP - _MARGIN - foot)
     parts.append(plan_part(plan, box, pins_svg(plan, pins)))
@@ -153,7 +153,7 @@ def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: in
 def _room_page(plan: FloorPlan, members: Sequence[ReportRow], rows: Sequence[ReportRow]) -> str:
     room = members[0].room
     numbers = f"{len(members)} photograph{'s' if len(members) > 1 else ''}"
-    parts = [_heading(shortened(room, 60), f"{plan.name}, {numbers}")]
+    parts = [_heading(room, f"{plan.name}, {numbers}")]
     pins = [row.pin for row in members if row.pin is not None]
     parts.append(plan_part(plan, (_MARGIN, _TOP, _INNER, _PLAN), pins_svg(plan, pins)))
     width = (_INNER - (_COLUMNS - 1) * _GAP) / _COLUMNS
@@ -199,5 +199,8 @@ def _aside_page(rows: Sequence[ReportRow]) -> str:
 
 def _heading(text: str, under: str) -> str:
     rule = f'<path d="M{_MARGIN} {_TOP - 14}H{WIDTH - _MARGIN}" stroke="{RULE}" stroke-width="2"/>'
+    under = shortened(under, 50)
+    # Letters are about half as wide as high, bold ones 0.6 times; what is left of the line is the title's.
+    text = shortened(text, int((WIDTH - 2 * _MARGIN - 10 * len(under)) / 20) - 1)
     head = words(_MARGIN, _MARGIN + 24, text, 34, more='font-weight="bold"')
-    return head + words(WIDTH - _MARGIN, _MARGIN + 24, shortened(under, 50), 20, fill=MUTED, anchor="end") + rule
+    return head + words(WIDTH - _MARGIN, _MARGIN + 24, under, 20, fill=MUTED, anchor="end") + rule
