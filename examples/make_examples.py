@@ -8,14 +8,14 @@ docs/how-to/take-photographs.md: a usable sphere, a tilted one, and an incomplet
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
 
 from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import FloorPlan, OpeningFace
 from lalaloc_core.learn.data.views import cut_view
 from lalaloc_core.learn.synth.homes import Home, Opening, OpeningKind
 from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
@@ -29,19 +29,9 @@ HEIGHT, WIDTH = 512, 1024
 _SUPERSAMPLE = 2
 _JPEG_QUALITY = 90
 _MATERIALS_SEED = 7
-# Openings are drawn on the centre line of a wall; both faces of the wall are nearer than this.
-_WALL_REACH_M = 0.1
-
-
-@dataclass(frozen=True)
-class Hole:
-    """Door, passage or window between two points on the centre line of a wall (m)."""
-
-    kind: OpeningKind
-    start_m: tuple[float, float]
-    end_m: tuple[float, float]
-    sill_m: float = 0.0
-    head_m: float = 2.02
+# Doors that stand open in the pictures, by their number among the openings of the plan.
+_OPEN_DOORS = (0, 5)
+_KINDS: Mapping[str, OpeningKind] = {"door": "door_shut", "passage": "opening", "window": "window"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,25 +44,6 @@ class View:
     camera_height_m: float
     seed: int
 
-
-HOLES = (
-    Hole("door_open", (3.66, 4.25), (3.66, 5.1)),
-    Hole("opening", (5.46, 0.9), (5.46, 2.1), head_m=2.2),
-    Hole("door_shut", (6.2, 3.96), (7.05, 3.96)),
-    Hole("door_shut", (3.76, 5.38), (4.54, 5.38)),
-    Hole("door_shut", (5.5, 5.38), (6.25, 5.38)),
-    Hole("door_open", (6.9, 5.38), (7.7, 5.38)),
-    Hole("door_shut", (4.66, 8.05), (4.66, 8.8)),
-    Hole("door_shut", (9.4, 5.4), (9.4, 6.35)),
-    Hole("window", (0.8, 0.0), (2.6, 0.0), sill_m=0.05, head_m=2.25),
-    Hole("window", (3.4, 0.0), (4.7, 0.0), sill_m=0.85, head_m=2.25),
-    Hole("window", (0.0, 3.3), (0.0, 4.6), sill_m=0.85, head_m=2.25),
-    Hole("window", (6.4, 0.0), (8.2, 0.0), sill_m=1.0, head_m=2.25),
-    Hole("window", (9.4, 1.2), (9.4, 2.2), sill_m=1.0, head_m=2.25),
-    Hole("window", (1.7, 9.0), (3.5, 9.0), sill_m=0.8, head_m=2.25),
-    Hole("window", (0.0, 6.1), (0.0, 7.3), sill_m=0.8, head_m=2.25),
-    Hole("window", (7.4, 9.0), (8.7, 9.0), sill_m=0.8, head_m=2.25),
-)
 
 VIEWS = (
     View(file="living_room.jpg", position_m=(2.15, 2.3), heading_deg=30.0, camera_height_m=1.5, seed=15),
@@ -138,44 +109,29 @@ def _write_pictures() -> None:
 
 
 def example_home() -> Home:
-    """Return the example flat with its doors and windows."""
+    """Return the example flat with its doors and windows as the pictures show them."""
     plan = FloorPlan.from_json(PLAN_PATH.read_bytes())
-    return Home(plan, tuple(opening for hole in HOLES for opening in openings_of(plan, hole)))
+    return Home(plan, tuple(_opening(plan, face) for face in plan.opening_faces))
 
 
-def openings_of(plan: FloorPlan, hole: Hole) -> list[Opening]:
-    """Return the hole as an opening of each room beside it."""
-    sides = list(_walls_beside(plan, hole))
-    if not sides:
-        raise ValueError(f"no wall runs along {hole}; the limit is {_WALL_REACH_M:g} m to a wall")
-    rooms = [room for room, _, _, _ in sides]
-    return [
-        Opening(
-            room=room,
-            wall=wall,
-            start_m=start_m,
-            end_m=end_m,
-            sill_m=hole.sill_m,
-            head_m=hole.head_m,
-            kind=hole.kind,
-            neighbour=next((neighbour for neighbour in rooms if neighbour != room), -1),
-        )
-        for room, wall, start_m, end_m in sides
-    ]
-
-
-def _walls_beside(plan: FloorPlan, hole: Hole) -> Iterator[tuple[int, int, float, float]]:
-    """Yield room, wall, and the start and end along the wall (m) for every wall beside the hole."""
-    ends = np.array([hole.start_m, hole.end_m])
-    for room_index, room in enumerate(plan.rooms):
-        for wall_index, (x0, y0, x1, y1) in enumerate(room.walls_m):
-            length = math.hypot(x1 - x0, y1 - y0)
-            along = np.array([x1 - x0, y1 - y0]) / length
-            offset = ends - (x0, y0)
-            distance = np.abs(offset @ np.array([-along[1], along[0]]))
-            start, end = sorted(float(value) for value in offset @ along)
-            if distance.max() < _WALL_REACH_M and start >= 0.0 and end <= length:
-                yield room_index, wall_index, start, end
+def _opening(plan: FloorPlan, face: OpeningFace) -> Opening:
+    """Return an opening of the plan as seen from one of the rooms beside it."""
+    drawn = plan.openings[face.opening]
+    x0, y0, x1, y1 = plan.rooms[face.room].walls_m[face.wall]
+    length_m = math.hypot(x1 - x0, y1 - y0)
+    # The flat states the heights of all openings.
+    assert drawn.sill_m is not None
+    assert drawn.head_m is not None
+    return Opening(
+        room=face.room,
+        wall=face.wall,
+        start_m=face.start * length_m,
+        end_m=face.end * length_m,
+        sill_m=drawn.sill_m,
+        head_m=drawn.head_m,
+        kind="door_open" if face.opening in _OPEN_DOORS else _KINDS[drawn.kind],
+        neighbour=face.behind,
+    )
 
 
 def shot_of(home: Home, view: View) -> Shot:
