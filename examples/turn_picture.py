@@ -5,7 +5,6 @@ Run `python -m examples.turn_picture` after a change of the flat, the renderer o
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 
@@ -61,17 +60,11 @@ def _write(frames: Sequence[UInt8[np.ndarray, "h w 3"]], plans: Sequence[tuple[I
         left = _GAP + number * (half + _GAP)
         high = half * plan.height / plan.width
         parts.append(words(left, top + 26, f"{text}: confidence {100.0 * confidence:.0f} %", 20, fill=MUTED))
-        parts.append(image(_jpeg(plan), "jpeg", (left, top + _HEAD, half, high)))
+        parts.append(image(jpeg(np.asarray(plan.convert("RGB"))), "jpeg", (left, top + _HEAD, half, high)))
         below = max(below, top + _HEAD + high + _GAP)
     drawing = pixels(document(_WIDTH, round(below), "A turn on the spot and its place", parts))
     drawing.save(_PICTURE, quality=_QUALITY, optimize=True)
     print(_PICTURE)
-
-
-def _jpeg(picture: Image.Image) -> bytes:
-    content = io.BytesIO()
-    picture.convert("RGB").save(content, "JPEG", quality=95)
-    return content.getvalue()
 
 
 if __name__ == "__main__":
