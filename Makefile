@@ -81,7 +81,7 @@ openapi: $(STAMP) ## write openapi.yaml from the application
 docs: $(STAMP) ## write the generated parts of docs/
 	$(BIN)/python -m scripts.write_docs
 
-neighbours: $(STAMP) ## measure every route beside another tenant, write docs/reference/neighbours.md (about 14 minutes)
+neighbours: $(STAMP) ## measure every route beside another tenant, write docs/reference/neighbours.md (about 15 minutes)
 	-$(BIN)/python -m benchmarks.neighbours --json docs/neighbours.json
 	$(BIN)/python -m scripts.write_docs
 

@@ -6,6 +6,7 @@ an entry scales with a size, so that the benchmark sends the largest one and the
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 import math
@@ -17,8 +18,9 @@ from typing import Any
 from urllib.parse import urlencode
 
 import yaml
+from PIL import Image
 
-from benchmarks.harness import Answer, Caller, form, plain_picture
+from benchmarks.harness import Answer, Caller, form
 from examples.launch import ROOT
 from examples.truth import read_poses
 from lalaloc_core.floorplan import FloorPlan
@@ -142,6 +144,29 @@ def _diagonals_body(rooms: int) -> bytes:
 
 
 @cache
+def _combs_body(rooms: int) -> bytes:
+    """Return a plan of combs; every other one is transposed, so that its teeth cross those of its neighbours."""
+    tooth = ((0.01, 0.1), (0.01, 48.0), (0.02, 48.0), (0.02, 0.1))
+    teeth = [(k + x, y) for k in range(48) for x, y in tooth]
+    comb = [(0.0, 0.0), (0.0, 0.1), *teeth, (48.0, 0.1), (48.0, 0.0)]
+    rings = [[(x + 0.03 * k, y + 0.03 * k) for x, y in comb] for k in range(rooms)]
+    return _rooms_body([[(y, x) for x, y in ring] if k % 2 else ring for k, ring in enumerate(rings)])
+
+
+@cache
+def _slivers_body(rooms: int) -> bytes:
+    """Return a plan of corridors of millimetres; the bounding box of each, which is searched for poses, is a square."""
+    side, width = 19.9, 0.013
+    ring = [(0.0, 0.0), (width, 0.0), (width + side, side), (side, side)]
+    return _rooms_body([[(0.05 * k + x, y) for x, y in ring] for k in range(rooms)])
+
+
+def _rooms_body(rings: Sequence[Sequence[tuple[float, float]]]) -> bytes:
+    rooms = [{"polygon": [[round(x, 3), round(y, 3)] for x, y in ring]} for ring in rings]
+    return _body({"ceiling_height_m": 2.5, "rooms": rooms})
+
+
+@cache
 def _svg(kibibytes: int) -> bytes:
     """Return a drawing of one room with comments."""
     drawing = export_plan(FloorPlan.from_dict(home(0)), "svg")
@@ -149,17 +174,24 @@ def _svg(kibibytes: int) -> bytes:
     return drawing[:end] + kibibytes * (b"<!--" + 1017 * b"x" + b"-->") + drawing[end:]
 
 
+def _grey_jpeg(width: int, height: int) -> bytes:
+    """Return a grey progressive JPEG."""
+    buffer = io.BytesIO()
+    Image.new("L", (width, height), 90).save(buffer, "JPEG", progressive=True)
+    return buffer.getvalue()
+
+
 @cache
 def _jpeg(kilopixels: int) -> bytes:
-    """Return a grey progressive JPEG."""
+    """Return a grey progressive JPEG, twice as wide as high."""
     height = math.isqrt(500 * kilopixels)
-    return plain_picture(2 * height, height, "JPEG", "L", progressive=True)
+    return _grey_jpeg(2 * height, height)
 
 
 @cache
 def _scans(count: int) -> bytes:
     """Return a grey progressive JPEG of 98 megapixels with a number of scans."""
-    content = plain_picture(14_000, 7_000, "JPEG", "L", progressive=True)
+    content = _grey_jpeg(14_000, 7_000)
     begin = content.rindex(b"\xff\xc4", 0, content.rindex(b"\xff\xda"))
     return content[:-2] + (count - 6) * content[begin:-2] + content[-2:]
 
@@ -170,6 +202,13 @@ def _padded_picture(size: int) -> bytes:
     comment = b"\xff\xfe\xff\xff" + bytes(2**16 - 3)
     picture = _sphere()
     return picture[:2] + comment * max(size // len(comment), 0) + picture[2:]
+
+
+@cache
+def _commented_picture(count: int) -> bytes:
+    """Return the example photograph with empty comments."""
+    picture = _sphere()
+    return picture[:2] + b"\xff\xfe\0\2" * count + picture[2:]
 
 
 _names = itertools.count()
@@ -207,8 +246,13 @@ def _hall(area_m2: int) -> bytes:
     return _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": polygon}]})
 
 
-def _prepare_hall(caller: Caller, _stored: Stored, size: int) -> None:
-    caller.send("POST", "/floorplans", _hall(size))
+def _post_plan(content: Callable[[int], bytes]) -> Work:
+    """Return the work of storing a plan whose pose grid is prepared."""
+
+    def work(caller: Caller, _stored: Stored, size: int) -> None:
+        caller.send("POST", "/floorplans", content(size))
+
+    return work
 
 
 def _follow_events(caller: Caller, _stored: Stored, size: int) -> None:
@@ -345,6 +389,12 @@ def _many_parts(caller: Caller, _stored: Stored, size: int) -> None:
     caller.send("POST", "/localise", part * size, _EMPTY_FORM)
 
 
+def _nearly_ended_form(caller: Caller, _stored: Stored, size: int) -> None:
+    """Send a form with a file of lines that nearly end it."""
+    part = b'--b\r\nContent-Disposition: form-data; name="file"; filename="p"\r\n\r\n'
+    caller.send("POST", "/floorplans", part + b"\r\n--" * size, _EMPTY_FORM)
+
+
 def _partial_body(caller: Caller, _stored: Stored, size: int) -> None:
     """Send a part of a body, and wait for the service to give up."""
     head = f"POST /localise HTTP/1.1\r\nContent-Length: {size}\r\nContent-Type: {_EMPTY_FORM}"
@@ -414,7 +464,16 @@ LOADS = (
         refusals=_TOO_LONG,
     ),
     Load(("POST /floorplans",), "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
-    Load(("POST /floorplans",), "halls of 1,600 m², whose pose grids are prepared", _prepare_hall, 1_600),
+    Load(("POST /floorplans",), "halls of 1,600 m², whose pose grids are prepared", _post_plan(_hall), 1_600),
+    Load(("POST /floorplans",), "24 rooms, crossing combs", _post_and_delete(_combs_body), 24, refusals=_TOO_LONG),
+    Load(("POST /floorplans",), "500 slivers across a square", _post_plan(_slivers_body), 500, refusals=_TOO_LONG),
+    Load(
+        ("POST /floorplans",),
+        "JSON that is one string without an end",
+        _post_and_delete(lambda size: b'"' + b'\\"' * (size // 2)),
+        2_000_000,
+        refusals=_TOO_LONG,
+    ),
     Load((f"PUT {_PLAN}",), ROOMS_PLAN, _put_plan, 10_000),
     Load(("POST /venues", f"DELETE {_VENUE}"), "{homes} homes", _post_venue),
     Load(("POST /venues",), "file of 200 levels × 50 rooms", _post_levels, 10_000),
@@ -434,6 +493,13 @@ LOADS = (
         98_000,
     ),
     Load(("POST /localise",), "JPEG of 400 scans", _localise(_scans, floorplan_id="{plan}"), 400, refusals=_TOO_LONG),
+    Load(
+        ("POST /localise",),
+        "JPEG of 5 million empty comments",
+        _localise(_commented_picture, floorplan_id="{plan}"),
+        5_000_000,
+        refusals=_TOO_LONG,
+    ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
     Load(("POST /localise/sequence",), f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
     Load(("POST /localise/sequence",), "10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
@@ -456,6 +522,13 @@ LOADS = (
     ),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
+    Load(
+        ("POST /floorplans",),
+        "form of 500,000 lines that nearly end it",
+        _nearly_ended_form,
+        500_000,
+        refusals=_TOO_MANY_EVENTS | _TOO_LONG,
+    ),
     Load(("POST /localise",), "bodies that do not arrive", _partial_body, 100_000, connections=60, refusals=_TOO_LATE),
     Load((f"GET {_PLAN}/original",), "answers that are not read", _unread_answer, 2_048, connections=64),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
