@@ -1,10 +1,9 @@
-"""Set-up that benchmarks share: the service with the example plan, clients of load tests, health checks and memory."""
+"""Set-up that benchmarks share: the service with the example plan, clients of load tests, CPU time and memory."""
 
 from __future__ import annotations
 
 import argparse
 import http.client
-import io
 import itertools
 import json
 import math
@@ -28,7 +27,6 @@ from urllib.parse import urlsplit
 
 import httpx
 import psutil
-from PIL import Image
 
 from examples.launch import ROOT, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
@@ -37,7 +35,7 @@ _JSON = "application/json"
 _REQUEST_TIMEOUT_S, _PLAN_TIMEOUT_S, _IDLE_S = 600.0, 120.0, 5.0
 _SMALL_BUFFER = 4096
 _REFUSED = "refused"
-_KINDS = ("lpo", "vdr", _REFUSED)
+_STAGES = ("lpo", "vdr")
 # A position error above this is a wrong answer: the example photographs are located to a few centimetres.
 _MAX_ERROR_M = 0.5
 # Settings under which no request of a throughput test is refused.
@@ -59,13 +57,6 @@ def table_head(*names: str) -> str:
 
 def table_row(*cells: object) -> str:
     return f"| {' | '.join(map(str, cells))} |"
-
-
-def plain_picture(width: int, height: int, format: str, mode: str = "RGB", **options: Any) -> bytes:
-    """Return a picture of one grey in a file format."""
-    buffer = io.BytesIO()
-    Image.new(mode, (width, height), 90 if mode == "L" else (90, 90, 90)).save(buffer, format, **options)
-    return buffer.getvalue()
 
 
 @dataclass(frozen=True)
@@ -208,58 +199,20 @@ def example_query(number: int, plan_id: str) -> tuple[bytes, str]:
     return form(tuple(query["data"].items()), (("photo", query["files"]["photo"][1]),))
 
 
-@dataclass(frozen=True)
-class Requests:
-    """Durations (ms) of requests of one kind, and their rate."""
-
-    durations_ms: Sequence[float]
-    per_second: float
-
-    @property
-    def count(self) -> int:
-        return len(self.durations_ms)
-
-    def percentile_ms(self, percent: float) -> float:
-        """Return a percentile of the duration; NaN without requests."""
-        ordered = sorted(self.durations_ms)
-        return ordered[max(math.ceil(percent / 100.0 * self.count), 1) - 1] if ordered else math.nan
-
-    def percentiles_ms(self) -> dict[str, float]:
-        """Return median, 95th and 99th percentile."""
-        return {f"p{percent}": round(self.percentile_ms(percent), 1) for percent in (50, 95, 99)}
-
-    def figures(self) -> dict[str, Any]:
-        """Return number, rate and percentiles as plain data."""
-        rate = round(self.per_second, 1)
-        return {"count": self.count, "per_second": rate, "milliseconds": self.percentiles_ms()}
+def percentile(values: Sequence[float], percent: float) -> float:
+    """Return the percentile of the nearest rank; NaN without values."""
+    ordered = sorted(values)
+    return ordered[max(math.ceil(percent / 100.0 * len(ordered)), 1) - 1] if ordered else math.nan
 
 
 @dataclass(frozen=True)
 class LoadResult:
-    """Result of a load test: durations (ms) by stage of the answer, or of refusals with `Retry-After`; and failures."""
+    """Result of a load test: durations (ms) by stage of the answer, refusals with `Retry-After`, and failures."""
 
     durations_ms: Mapping[str, Sequence[float]]
+    refused: int
     failures: int
     seconds: float
-
-    @property
-    def stages(self) -> dict[str, int]:
-        """Number of answers by their stage."""
-        return {name: len(times) for name, times in self.durations_ms.items() if name != _REFUSED}
-
-    @property
-    def answered(self) -> Requests:
-        """Requests with an answer."""
-        return self._named(*self.stages)
-
-    @property
-    def refused(self) -> Requests:
-        """Requests refused with `Retry-After`."""
-        return self._named(_REFUSED)
-
-    def _named(self, *names: str) -> Requests:
-        times = [time_ms for name in names for time_ms in self.durations_ms.get(name, ())]
-        return Requests(times, len(times) / self.seconds)
 
 
 def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float) -> LoadResult:
@@ -290,7 +243,7 @@ def child_process(target: Callable[..., None], *arguments: Any) -> Iterator[Conn
 
 def _send_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, pipe: Connection) -> None:
     durations_ms: dict[str, list[float]] = defaultdict(list)
-    failures: Counter[str] = Counter()
+    others: Counter[str] = Counter()
     poses = read_poses()
     queries = {plan_id: [example_query(number, plan_id) for number in range(len(poses))] for plan_id in plan_ids}
     end = time.monotonic() + seconds
@@ -303,18 +256,19 @@ def _send_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, 
             begin = time.perf_counter()
             answer = caller.send("POST", "/localise", *queries[plan_ids[client % len(plan_ids)]][number % len(poses)])
             kind = _kind_of(answer, poses[number % len(poses)])
-            if kind in _KINDS:
+            if kind in _STAGES:
                 durations_ms[kind].append(1e3 * (time.perf_counter() - begin))
             else:
-                failures[kind] += 1
+                others[kind] += 1
             if kind == _REFUSED:
                 time.sleep(random.uniform(0.5, 1.5))
 
     with ThreadPoolExecutor(clients) as threads:
         list(threads.map(repeat, range(clients)))
-    for failure, count in failures.items():
+    refused = others.pop(_REFUSED, 0)
+    for failure, count in others.items():
         print(f"{count} times: {failure}", file=sys.stderr)
-    pipe.send(LoadResult(dict(durations_ms), failures.total(), seconds))
+    pipe.send(LoadResult(dict(durations_ms), refused, others.total(), seconds))
 
 
 def _kind_of(answer: Answer, pose: TruePose) -> str:
@@ -348,11 +302,6 @@ class Stopwatch:
         """Return the duration and the CPU time (s)."""
         wall_s = time.perf_counter() - self._wall
         return wall_s, cpu_s(self._process) - self._cpu
-
-
-def service_memory_mb(process: psutil.Process) -> float:
-    """Return the resident memory (MB) of a service and its workers."""
-    return sum(map(resident_mb, (process, *process.children(recursive=True))))
 
 
 def resident_mb(process: psutil.Process) -> float:

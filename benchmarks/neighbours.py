@@ -264,7 +264,7 @@ def _lower_priority() -> None:
 
 
 def _latency(durations_s: Sequence[float]) -> Latency:
-    p50_s, p99_s = statistics.median(durations_s), harness.Requests(durations_s, math.nan).percentile_ms(99)
+    p50_s, p99_s = statistics.median(durations_s), harness.percentile(durations_s, 99)
     return Latency(len(durations_s), durations_s.count(math.inf), 1e3 * p50_s, 1e3 * p99_s)
 
 

@@ -70,10 +70,11 @@ def main() -> int:
 
 
 def _row(result: harness.LoadResult, *cells: object) -> str:
-    answered, lpo = result.answered, result.stages.get("lpo", 0)
-    times = [f"{value:.0f} ms" for value in answered.percentiles_ms().values()]
-    share = f"{lpo / max(answered.count, 1):.0%}"
-    figures = (f"{answered.per_second:.1f}", *times, share, result.refused.count + result.failures)
+    answered = [time_ms for times_ms in result.durations_ms.values() for time_ms in times_ms]
+    times = [f"{harness.percentile(answered, percent):.0f} ms" for percent in (50, 95, 99)]
+    lpo = len(result.durations_ms.get("lpo", ()))
+    share = f"{lpo / max(len(answered), 1):.0%}"
+    figures = (f"{len(answered) / result.seconds:.1f}", *times, share, result.refused + result.failures)
     return harness.table_row(*cells, *figures)
 
 

@@ -1,4 +1,4 @@
-"""Sessions and albums of a service that is killed: real processes, on SQLite and PostgreSQL."""
+"""Plans, sessions and albums of a service that is killed: real processes, on SQLite and PostgreSQL."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import random
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -22,7 +23,7 @@ from service.storage.store import Store
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
 from tests.service import test_albums as albums
-from tests.service.conftest import upload, wait_for
+from tests.service.conftest import FLAT, upload, wait_for
 from tests.service.test_process import children
 from tests.service.test_sessions import begin, send
 from tests.service.test_stopping import running_service
@@ -119,6 +120,45 @@ def test_session_survives_kills_at_any_moment(
     # What the quota counts is what is stored.
     used = store.quota.account("default").used.sessions
     assert used >= len(record.state or b"") + len(record.pose or "")
+    store.close()
+
+
+@pytest.mark.slow
+def test_plans_that_are_sent_again_after_kills_are_stored_once(
+    tiny_bundle: Path, tmp_path: Path, settings: dict[str, str]
+) -> None:
+    rng, names, stored = random.Random(3), [f"plan-{number}" for number in range(80)], dict[str, str]()
+    interrupted = 0
+    for life in range(4):
+        with running_service(tiny_bundle, tmp_path / "data", **settings) as service, ThreadPoolExecutor(4) as threads:
+
+            def send_plan(name: str, client: httpx.Client = service.client) -> None:
+                while name not in stored:
+                    plan, headers = FLAT | {"name": name}, {"Idempotency-Key": name}
+                    answer = client.post("/floorplans", json=plan, headers=headers)
+                    if answer.status_code == 201:
+                        stored[name] = answer.json()["id"]
+                    else:
+                        # Claimed by a process that was killed, or too many at once.
+                        assert answer.status_code in (409, 503), answer.text
+                        sleep(0.2)
+
+            killer = threading.Timer(rng.uniform(0.05, 0.3), service.process.kill)
+            if life < 3:
+                killer.start()
+            faults = [sent.exception() for sent in [threads.submit(send_plan, name) for name in names]]
+            killer.cancel()
+            lost = [fault for fault in faults if fault is not None]
+            assert all(isinstance(fault, httpx.TransportError) for fault in lost), lost
+            assert life < 3 or not lost
+            interrupted += len(lost)
+    assert interrupted
+    store = Store(database_of(settings, tmp_path))
+    summaries = store.plans.list_plans("default", limit=1000)
+    assert sorted((summary.name, summary.id) for summary in summaries) == sorted(stored.items())
+    used = store.quota.account("default").used.plans
+    store.quota.recount()
+    assert store.quota.account("default").used.plans == used > 0
     store.close()
 
 
