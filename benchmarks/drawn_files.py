@@ -1,4 +1,4 @@
-"""Drawings of generated homes as files: SVG, DXF, PDF and PNG, in six styles, with words of twelve languages."""
+"""Drawings of generated homes as files: SVG, DXF and PDF, in five styles, with words of twelve languages."""
 
 from __future__ import annotations
 
@@ -17,16 +17,14 @@ import pypdfium2
 import pypdfium2.raw as pdfium
 import shapely
 from ezdxf.filemanagement import new as new_dxf
-from PIL import Image
 from shapely.geometry.base import BaseGeometry
 
-from benchmarks.plan_drawing import Model, OpeningSymbol, door_leaves, encoded, hatch_lines, scan
-from lalaloc_core.draw import rasterise
+from benchmarks.plan_drawing import Model, OpeningSymbol, door_leaves, hatch_lines
 from lalaloc_core.draw.canvas import font_file
 
-FileStyle = Literal["outlined", "filled", "hatched", "furnished", "painted over", "scanned"]
+FileStyle = Literal["outlined", "filled", "hatched", "furnished", "painted over"]
 FILE_STYLES: tuple[FileStyle, ...] = get_args(FileStyle)
-FileFormat = Literal["png", "svg", "dxf", "pdf"]
+FileFormat = Literal["svg", "dxf", "pdf"]
 FILE_FORMATS: tuple[FileFormat, ...] = get_args(FileFormat)
 Layer = Literal["wall", "door", "window", "furniture", "room"]
 
@@ -35,11 +33,9 @@ _KINDS = ("bedroom", "kitchen", "bathroom", "living room", "corridor", "closet",
 _WORDS = tomllib.loads(Path(__file__).with_name("drawn_words.toml").read_text(encoding="utf-8"))
 LANGUAGES = tuple(_WORDS)
 _LAYERS: tuple[Layer, ...] = get_args(Layer)
-# Length on paper at 1:100, points per metre, resolution of pictures, and pens (m).
-_PAPER_MM, _POINTS, _PIXELS_PER_M = 10.0, 72.0 / 2.54, 80
+# Length on paper at 1:100, points per metre, and pens (m).
+_PAPER_MM, _POINTS = 10.0, 72.0 / 2.54
 _THICK_PEN, _THIN_PEN, _TEXT_M, _HATCH_M = 0.025, 0.012, 0.2, 0.1
-# Options of files of pictures, on paper at 1:100.
-_PAPER: dict[str, Any] = {"resolution": _PIXELS_PER_M * 2.54, "quality": 70}
 _SHADES = ("#faf0dc", "#e2f0fa", "#e8f6e4", "#fae8ee")
 
 
@@ -68,23 +64,11 @@ class HomeDrawing:
         return _WORDS[self.language]["layers"].split(",")[_LAYERS.index(layer)]
 
 
-def draw_file(
-    format: FileFormat, style: FileStyle, drawing: HomeDrawing, seed: int
-) -> tuple[bytes, dict[str, str]] | None:
-    """Return the file of a drawing, and the import options with what a user knows of its scale.
-
-    None for a style that a format does not have: SVG and DXF are not scanned.
-    """
-    known = {"metres_per_pixel": str(1.0 / _PIXELS_PER_M)} if format == "png" else {"scale": "1:100"}
-    if style == "scanned":
-        picture = scan(_picture(drawing), 2.0 if seed % 2 else -2.0, np.random.default_rng(seed))
-        kind = {"png": "JPEG", "pdf": "PDF"}.get(format)
-        return None if kind is None else (encoded(picture, kind, **_PAPER), known)
-    if format == "png":
-        return encoded(_picture(drawing), "PNG", **_PAPER), known
-    if format == "svg":
-        return svg(drawing).encode(), known
-    return (dxf(drawing), {}) if format == "dxf" else (pdf(drawing), known)
+def draw_file(format: FileFormat, drawing: HomeDrawing) -> tuple[bytes, dict[str, str]]:
+    """Return the file of a drawing, and the import options with what a user knows of its scale."""
+    if format == "dxf":
+        return dxf(drawing), {}
+    return svg(drawing).encode() if format == "svg" else pdf(drawing), {"scale": "1:100"}
 
 
 def draw_home(model: Model, style: FileStyle, language: str, rng: np.random.Generator) -> HomeDrawing:
@@ -95,14 +79,14 @@ def draw_home(model: Model, style: FileStyle, language: str, rng: np.random.Gene
         kind = next((kind for kind in _KINDS if name.startswith(kind)), None)
         place = shapely.maximum_inscribed_circle(room, 0.05).coords[0]
         drawing.names.append((words[kind] + name[len(kind) :] if kind else name, place[0], place[1]))
-    if style in ("furnished", "scanned"):
-        _furnish(drawing, model, rng, coloured=style == "furnished")
+    if style == "furnished":
+        _furnish(drawing, model, rng)
     if style == "painted over":
         walls = shapely.union_all([model.walls, *(opening.cut for opening in model.openings)]).buffer(0.002)
     else:
         walls = model.walls
     parts = [part for part in shapely.get_parts(walls) if part.area > 1e-3]
-    solid = style in ("filled", "scanned", "painted over", "furnished")
+    solid = style in ("filled", "painted over", "furnished")
     tone = "#505050" if style == "furnished" else "#000000"
     for part in parts:
         drawing.marks.append(Mark("wall", part, tone if solid else None, 0.0 if solid else _THICK_PEN))
@@ -137,11 +121,10 @@ def _opening(opening: OpeningSymbol, *, painted: bool) -> list[Mark]:
     return marks
 
 
-def _furnish(drawing: HomeDrawing, model: Model, rng: np.random.Generator, *, coloured: bool) -> None:
+def _furnish(drawing: HomeDrawing, model: Model, rng: np.random.Generator) -> None:
     swings = [opening.shape.buffer(math.dist(opening.start, opening.end)) for opening in model.openings]
     for number, room in enumerate(model.rooms):
-        if coloured:
-            drawing.marks.append(Mark("furniture", room, _SHADES[number % len(_SHADES)]))
+        drawing.marks.append(Mark("furniture", room, _SHADES[number % len(_SHADES)]))
         x0, y0, x1, y1 = room.bounds
         taken: list[BaseGeometry] = list(swings)
         for _ in range(8):
@@ -150,7 +133,7 @@ def _furnish(drawing: HomeDrawing, model: Model, rng: np.random.Generator, *, co
             piece = shapely.box(x, y, x + width, y + depth)
             if room.buffer(-0.05).contains(piece) and not any(piece.intersects(area) for area in taken):
                 taken.append(piece.buffer(0.15))
-                drawing.marks.append(Mark("furniture", piece, "#ffffff" if coloured else None, _THIN_PEN))
+                drawing.marks.append(Mark("furniture", piece, "#ffffff", _THIN_PEN))
                 inner = piece.buffer(-0.08, join_style="mitre")
                 drawing.marks.append(Mark("furniture", inner, None, _THIN_PEN))
 
@@ -272,11 +255,3 @@ def _pdf_path(mark: Mark) -> Any:
     fill = pdfium.FPDF_FILLMODE_NONE if mark.fill is None else pdfium.FPDF_FILLMODE_ALTERNATE
     pdfium.FPDFPath_SetDrawMode(path, fill, mark.pen_m > 0.0)
     return path
-
-
-def _picture(drawing: HomeDrawing) -> np.ndarray:
-    width, height = drawing.size_m
-    pixels = f'width="{round(_PIXELS_PER_M * width)}" height="{round(_PIXELS_PER_M * height)}"'
-    text = svg(drawing)
-    sized = text.replace(text[text.index("width=") : text.index(" viewBox")], pixels, 1)
-    return np.asarray(Image.open(io.BytesIO(rasterise(sized))).convert("RGB"))
