@@ -7,8 +7,7 @@ The plans are random homes of two rooms and the example flat. They are uploaded 
 venue. All example photographs are localised in the venue, whose answer must name the flat. The pages of the venue must
 list every plan once and in order. Then the flat is removed from the venue, added again, replaced and deleted: each
 time, the first query must be answered by the new state. At last the service is killed and started again. Prints a
-Markdown table, and exits with 1 when something was not as expected. `--json` writes all figures, with the processor
-time of the service and its workers, which other work on the machine hardly changes.
+Markdown table, and exits with 1 when something was not as expected.
 """
 
 from __future__ import annotations
@@ -17,7 +16,8 @@ import json
 import random
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -33,7 +33,6 @@ from lalaloc_client import Client, VenuePlan
 
 _CLIENTS, _PAGE, _ROUNDS, _FILE = 4, 500, 3, 200
 _TIMEOUT_S = 7200.0
-_Report = dict[str, Any]
 
 
 def random_home(number: int) -> dict[str, Any]:
@@ -78,63 +77,53 @@ def wait_until_ready(client: httpx.Client, venue_id: str) -> dict[str, Any]:
     return venue
 
 
-def _times(watch: harness.Stopwatch) -> dict[str, float]:
-    """Return the times (ms) of a service since a stopwatch was made."""
-    wall_s, cpu_s = watch.times_s()
-    return {"wall_ms": round(1e3 * wall_s), "cpu_ms": round(1e3 * cpu_s)}
-
-
 class _Venue:
-    """Venue of the benchmark, and its client."""
+    """Venue of the benchmark with the plan that the photographs show, and its client."""
 
-    def __init__(self, service: harness.Service, client: httpx.Client, venue_id: str) -> None:
-        self._service, self._client, self._id = service, client, venue_id
+    def __init__(self, plan_id: str, client: httpx.Client, venue_id: str) -> None:
+        self._plan_id, self._client, self._id = plan_id, client, venue_id
 
-    def localise(self, pose: TruePose, *, heading: bool) -> tuple[dict[str, Any], dict[str, float]]:
-        """Localise an example photograph, with or without its heading; return the answer and the times."""
-        query, watch = harness.query_of(pose, venue_id=self._id), harness.Stopwatch(self._service.process)
+    def localise(self, pose: TruePose, *, heading: bool) -> tuple[dict[str, Any], float]:
+        """Localise an example photograph, with or without its heading; return the answer and the duration (s)."""
+        query, begin = harness.query_of(pose, venue_id=self._id), time.perf_counter()
         if not heading:
             del query["data"]["heading_deg"]
         answer = self._client.post("/localise", **query).raise_for_status().json()
-        return answer, _times(watch)
+        return answer, time.perf_counter() - begin
 
-    def queries(self) -> _Report:
+    def queries(self, *, heading: bool) -> tuple[str, bool]:
         """Localise all example photographs several times; return the median times, and whether all were right."""
-        report: _Report = {"right": True}
-        for name, heading in (("heading_known", True), ("heading_unknown", False)):
-            found = [self.localise(pose, heading=heading) for _ in range(_ROUNDS) for pose in read_poses()]
-            report["right"] &= all(answer["floorplan_id"] == self._service.plan_id for answer, _ in found)
-            # The first ones read plans from the database.
-            later = found[len(read_poses()) :]
-            p50 = {key: float(np.median([times[key] for _, times in later])) for key in ("wall_ms", "cpu_ms")}
-            index_ms = np.median([answer["timings_ms"].get("shortlist", 0.0) for answer, _ in later])
-            report[name] = {"first": found[0][1], "p50": p50, "index_ms": round(float(index_ms), 1)}
-        return report
+        found = [self.localise(pose, heading=heading) for _ in range(_ROUNDS) for pose in read_poses()]
+        right = all(answer["floorplan_id"] == self._plan_id for answer, _ in found)
+        # The first ones read plans from the database.
+        later = found[len(read_poses()) :]
+        p50_ms = 1e3 * float(np.median([seconds for _, seconds in later]))
+        index_ms = float(np.median([answer["timings_ms"].get("shortlist", 0.0) for answer, _ in later]))
+        return f"{p50_ms:.0f}; {index_ms:.0f} ms", right
 
-    def changes(self) -> Iterator[tuple[str, _Report]]:
-        """Remove, add, replace, delete and upload the plan that the photographs show."""
-        path, own = f"/venues/{self._id}", f"/floorplans/{self._service.plan_id}"
-        yield "removed", self._change("PATCH", path, {"remove": [self._service.plan_id]}, is_found=False)
-        yield "added", self.add(self._service.plan_id)
-        yield "replaced", self._change("PUT", own, random_home(0), is_found=False)
-        yield "replaced again", self._change("PUT", own, json.loads(PLAN_PATH.read_text()), is_found=True)
-        yield "deleted", self._change("DELETE", own, None, is_found=False)
+    def changes(self) -> Iterator[tuple[float, bool]]:
+        """Remove, add, replace, replace again and delete the plan that the photographs show."""
+        path, own = f"/venues/{self._id}", f"/floorplans/{self._plan_id}"
+        yield self._change("PATCH", path, {"remove": [self._plan_id]}, is_found=False)
+        yield self.add(self._plan_id)
+        yield self._change("PUT", own, random_home(0), is_found=False)
+        yield self._change("PUT", own, json.loads(PLAN_PATH.read_text()), is_found=True)
+        yield self._change("DELETE", own, None, is_found=False)
 
-    def add(self, plan_id: str) -> _Report:
+    def add(self, plan_id: str) -> tuple[float, bool]:
         """Add a plan that the photographs show."""
         member = {"plans": [{"floorplan_id": plan_id, "level": 0}]}
         return self._change("PATCH", f"/venues/{self._id}", member, is_found=True, plan_id=plan_id)
 
     def _change(
         self, method: str, path: str, document: Mapping[str, Any] | None, *, is_found: bool, plan_id: str = ""
-    ) -> _Report:
-        """Change a plan; return the times until a query was answered, and whether its answer was as it should be."""
-        watch = harness.Stopwatch(self._service.process)
+    ) -> tuple[float, bool]:
+        """Change a plan; return the time until a query was answered (s), and whether its answer was as it should be."""
+        begin = time.perf_counter()
         self._client.request(method, path, json=document).raise_for_status()
-        request = _times(watch)
         answer, _ = self.localise(read_poses()[0], heading=True)
-        right = (answer["floorplan_id"] == (plan_id or self._service.plan_id)) == is_found
-        return {"request": request, "until_answered": _times(watch), "right": right}
+        right = (answer["floorplan_id"] == (plan_id or self._plan_id)) == is_found
+        return time.perf_counter() - begin, right
 
 
 @contextmanager
@@ -149,79 +138,57 @@ def _running(data: str, plans: int, checkout: Path) -> Iterator[tuple[harness.Se
         yield service, client
 
 
-def measure(plans: int, checkout: Path) -> _Report:
-    """Return the figures of a venue in the service of a checkout."""
-    report: _Report = {"checkout": checkout.name, "plans": plans}
+# Aims by figure.
+_AIMS = {
+    "until ready": "≤ 30 s",
+    "query, heading known, p50; index alone": "≤ 150 ms",
+    "query, heading unknown, p50; index alone": "≤ 150 ms",
+    "resident memory, ready; after queries": "≤ 500 MB",
+    "slowest change of one plan, until it is searched rightly": "≤ 1 s",
+    "first query after a kill": "–",
+    "all as expected": "yes",
+}
+
+
+def measure(plans: int, checkout: Path) -> tuple[dict[str, str], bool]:
+    """Return the figures of a venue in the service of a checkout by name, and whether all was as expected."""
     with tempfile.TemporaryDirectory() as data:
         with _running(data, plans, checkout) as (service, client):
-
-            def resident_mb() -> int:
-                return round(harness.resident_mb(service.process))
-
-            resident = report["resident_mb"] = {"empty": resident_mb()}
-            service = replace(service, plan_id=harness.upload_example_plan(service.url))
-            watch = harness.Stopwatch(service.process)
-            venue_id = make_venue(service, plans - 1)
-            report["uploaded"] = _times(watch)
+            plan_id = harness.upload_example_plan(service.url)
+            begin = time.perf_counter()
+            venue_id = make_venue(replace(service, plan_id=plan_id), plans - 1)
             ready = wait_until_ready(client, venue_id)
-            report["until_ready"], resident["ready"] = _times(watch), resident_mb()
+            ready_s, ready_mb = time.perf_counter() - begin, harness.resident_mb(service.process)
             with Client(service.url) as paging:
                 listed = [(plan.level, plan.floorplan_id) for plan in paging.venue_plans(venue_id, page_size=_PAGE)]
-            venue = _Venue(service, client, venue_id)
-            report["queries"] = venue.queries()
-            resident["localised"] = resident_mb()
-            report["changes"] = dict(venue.changes())
+            venue = _Venue(plan_id, client, venue_id)
+            known, is_known_right = venue.queries(heading=True)
+            unknown, is_unknown_right = venue.queries(heading=False)
+            localised_mb = harness.resident_mb(service.process)
+            changes = list(venue.changes())
             again = harness.upload_example_plan(service.url)
-            report["changes"]["uploaded"] = venue.add(again)
+            changes.append(venue.add(again))
             service.process.kill()
-        with _running(data, plans, checkout) as (service, client):
-            answer, times = _Venue(service, client, venue_id).localise(read_poses()[0], heading=True)
-            report["after_kill"] = times
-            resident["after_kill"] = round(harness.resident_mb(service.process))
-    report["expected"] = {
+        with _running(data, plans, checkout) as (_, client):
+            answer, after_kill_s = _Venue(again, client, venue_id).localise(read_poses()[0], heading=True)
+    expected = {
         "all plans are ready": ready["plans_ready"] == plans,
         "pages list every plan once, in order": listed == sorted(set(listed)) and len(listed) == plans,
-        "answers name the right plan": report["queries"]["right"],
-        "changes take effect": all(change["right"] for change in report["changes"].values()),
+        "answers name the right plan": is_known_right and is_unknown_right,
+        "changes take effect": all(right for _, right in changes),
         "the state outlives a crash": answer["floorplan_id"] == again,
     }
-    return report
-
-
-def _seconds(times: Mapping[str, float]) -> str:
-    return f"{times['wall_ms'] / 1e3:.2f} s"
-
-
-def _query(figures: Mapping[str, Any]) -> str:
-    return f"{figures['p50']['wall_ms']:.0f}; {figures['index_ms']:.0f} ms"
-
-
-def _slowest_change(report: _Report) -> str:
-    return _seconds(max((c["until_answered"] for c in report["changes"].values()), key=lambda times: times["wall_ms"]))
-
-
-def _as_expected(report: _Report) -> str:
-    return "yes" if all(report["expected"].values()) else f"no: {json.dumps(report['expected'])}"
-
-
-# Figure, aim, and the cell of a report.
-_ROWS: Sequence[tuple[str, str, Callable[[_Report], str]]] = (
-    ("until ready", "≤ 30 s", lambda report: _seconds(report["until_ready"])),
-    ("query, heading known, p50; index alone", "≤ 150 ms", lambda report: _query(report["queries"]["heading_known"])),
-    (
-        "query, heading unknown, p50; index alone",
-        "≤ 150 ms",
-        lambda report: _query(report["queries"]["heading_unknown"]),
-    ),
-    (
-        "resident memory, ready; after queries",
-        "≤ 500 MB",
-        lambda report: f"{report['resident_mb']['ready']}; {report['resident_mb']['localised']} MB",
-    ),
-    ("slowest change of one plan, until it is searched rightly", "≤ 1 s", _slowest_change),
-    ("first query after a kill", "–", lambda report: _seconds(report["after_kill"])),
-    ("all as expected", "yes", _as_expected),
-)
+    as_expected = all(expected.values())
+    figures = (
+        f"{ready_s:.2f} s",
+        known,
+        unknown,
+        f"{ready_mb:.0f}; {localised_mb:.0f} MB",
+        f"{max(seconds for seconds, _ in changes):.2f} s",
+        f"{after_kill_s:.2f} s",
+        "yes" if as_expected else f"no: {json.dumps(expected)}",
+    )
+    return dict(zip(_AIMS, figures, strict=True)), as_expected
 
 
 def main() -> int:
@@ -229,19 +196,16 @@ def main() -> int:
     parser = harness.argument_parser(__doc__)
     parser.add_argument("checkouts", nargs="+", type=Path, help="folders, the one before first")
     parser.add_argument("--plans", type=int, nargs="+", default=[10_000], help="plans of each venue")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
-    folders = [folder.resolve() for folder in options.checkouts]
-    reports = []
+    folders, is_wrong = [folder.resolve() for folder in options.checkouts], False
     harness.print_table_head("figure", "aim", *(folder.name for folder in folders))
     for plans in options.plans:
         found = [measure(plans, folder) for folder in folders]
-        reports += found
-        for name, aim, cell in _ROWS:
-            print(harness.table_row(f"{plans:,} plans over HTTP: {name}", aim, *map(cell, found)), flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(reports, indent=2) + "\n", encoding="utf-8")
-    return int(not all(all(report["expected"].values()) for report in reports))
+        for name, aim in _AIMS.items():
+            cells = (figures[name] for figures, _ in found)
+            print(harness.table_row(f"{plans:,} plans over HTTP: {name}", aim, *cells), flush=True)
+        is_wrong |= not all(as_expected for _, as_expected in found)
+    return int(is_wrong)
 
 
 if __name__ == "__main__":
