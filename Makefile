@@ -13,7 +13,7 @@ STAMP := $(VENV)/.everything
 comma := ,
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo serve check test test-all ray lint types openapi docs neighbours site client web lock notice audit digests clean
+.PHONY: help setup develop demo serve serve-lan check test test-all ray lint types openapi docs neighbours site client web lock notice audit digests clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -33,10 +33,18 @@ $(STAMP): pyproject.toml requirements.lock torch.lock scripts/setup.sh scripts/i
 demo: $(SERVING) ## localise the example photographs over HTTP, write demo.png
 	@$(BIN)/python -m examples.demo
 
-# Answers are kept for a day, so that links to them can be shared; photographs never are.
+# Answers are kept for a day, so that links to them can be shared; photographs never are. The shell becomes the service, so
+# that signals reach it.
+define serve
+@LALALOC_KEEP_ANSWERS_S=$${LALALOC_KEEP_ANSWERS_S:-86400} LALALOC_LOG_LEVEL=$${LALALOC_LOG_LEVEL:-warning} \
+	exec $(BIN)/lalaloc-service serve --example --port $(PORT) $(1)
+endef
+
 serve: $(SERVING) ## run the service at http://127.0.0.1:8000 (or PORT=...) with the example plan, data in ./data
-	@LALALOC_KEEP_ANSWERS_S=$${LALALOC_KEEP_ANSWERS_S:-86400} LALALOC_LOG_LEVEL=$${LALALOC_LOG_LEVEL:-warning} \
-		$(BIN)/lalaloc-service serve --example --port $(PORT)
+	$(call serve)
+
+serve-lan: $(SERVING) ## the same for phones in this network: with TLS, and a link with an API key
+	$(call serve,--lan)
 
 # Three processes with one thread each keep two cores busy, as many tests wait; each takes whole files, whose tests share
 # services. Browsers keep a core busy each, so their tests are last, two at a time; they run even if others fail.

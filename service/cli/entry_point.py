@@ -11,7 +11,7 @@ import socket
 import sys
 import uuid
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -52,6 +52,11 @@ def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)")
     parser.add_argument("--example", action="store_true", help="store the example plan, unless there are plans already")
+    parser.add_argument(
+        "--lan",
+        action="store_true",
+        help="let phones of this network in: listen on all addresses, with TLS and an API key that ends with this run",
+    )
 
 
 def serve(arguments: argparse.Namespace) -> int:
@@ -61,19 +66,29 @@ def serve(arguments: argparse.Namespace) -> int:
         ConfigError: an invalid setting, or a public address without keys.
     """
     settings = Settings.load()
+    if arguments.lan:
+        settings = settings.with_values(api_keys=True)
     limit_arenas(usable_cores())
-    with _listener(arguments.host, arguments.port) as listener:
+    with ExitStack() as cleanup:
+        listener = cleanup.enter_context(_listener("0.0.0.0" if arguments.lan else arguments.host, arguments.port))
         host, port = listener.getsockname()[:2]
         check_address(host, settings)
         _check_parts(settings, example=arguments.example)
+        certificate, text = None, f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        if arguments.lan:
+            # Imported late, because only this needs cryptography.
+            from service.cli.lan_access import NOTICE, lan_access
+
+            link, certificate = cleanup.enter_context(lan_access(settings.data_dir, port))
+            text = f"{link}\n{NOTICE}"
         # The socket is bound, so clients can connect now; they are answered after the start.
-        print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
+        print(text, flush=True)
         # Imported late, because it takes a second that help and keys do not need.
         from service.app import create_app
         from service.http.server import Server, server_config
 
         app = create_app(settings)
-        Server(server_config(app, settings), app, settings).run(sockets=[listener])
+        Server(server_config(app, settings, certificate), app, settings).run(sockets=[listener])
     return 0
 
 

@@ -13,6 +13,7 @@ import os
 import resource
 import socket
 import threading
+from pathlib import Path
 from time import monotonic
 from types import FrameType
 
@@ -38,13 +39,14 @@ _PER_DATABASE_CONNECTION = 3
 _MIN_CONNECTIONS = 16
 
 
-def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
-    """Return the server's configuration."""
+def server_config(app: FastAPI, settings: Settings, certificate: Path | None = None) -> uvicorn.Config:
+    """Return the server's configuration, with TLS by a file with a certificate and its key, if any."""
     config = uvicorn.Config(
         app,
         # Not uvloop, even if it is installed, as with the extra `ray`.
         loop="asyncio",
         ws="none",
+        ssl_certfile=certificate,
         log_level="warning",
         # By default uvicorn trusts `X-Forwarded-For` of all clients on this machine.
         proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,

@@ -7,18 +7,22 @@ import os
 import random
 import shutil
 import signal
+import ssl
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep
 
 import httpx
 import pytest
 
-from service.settings import CONSTANTS, PREFIX
+from service.cli.lan_access import lan_addresses, lan_certificate
+from service.settings import CONSTANTS, PREFIX, Settings
+from service.storage import open_store
 from tests.local_servers import free_port
 from tests.service.conftest import assert_problem, localise, upload, wait_for
 from tests.service.test_localise import HALL
@@ -228,6 +232,35 @@ def test_module_prints_its_address(tiny_bundle: Path, tmp_path: Path) -> None:
     finally:
         process.terminate()
         process.wait(10.0)
+
+
+def test_certificate_is_kept_while_it_is_for_the_address(tmp_path: Path) -> None:
+    path = lan_certificate(tmp_path, ["192.0.2.7", "10.0.0.2"])
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    first = path.read_bytes()
+    assert lan_certificate(tmp_path, ["10.0.0.2"]).read_bytes() == first
+    assert lan_certificate(tmp_path, ["10.0.0.3"]).read_bytes() != first
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not lan_addresses(), reason="this machine is in no network")
+def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "service", "--port", "0", "--example", "--lan"]
+    environment = environment_of(tiny_bundle, tmp_path, WORKERS="0")
+    process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        url, _, key = process.stdout.readline().strip().partition("/#key=")
+        context = ssl.create_default_context(cafile=str(tmp_path / "lan-certificate.pem"))
+        with httpx.Client(base_url=url, verify=context, timeout=120.0, trust_env=False) as client:
+            assert client.get("/floorplans").status_code == 401
+            client.headers["Authorization"] = f"Bearer {key}"
+            assert client.get("/floorplans").json()["floorplans"][0]["name"] == "Example flat"
+    finally:
+        process.terminate()
+        process.wait(30.0)
+    with closing(open_store(Settings(data_dir=tmp_path))) as store:
+        assert [run.revoked_at is None for run in store.keys.list_keys()] == [False]
 
 
 @pytest.mark.slow

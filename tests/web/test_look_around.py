@@ -225,14 +225,21 @@ def test_page_without_https_takes_a_film_and_says_why(phone: Visit, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_link_for_the_phone_opens_the_same_plan_and_has_no_key(desktop: Visit) -> None:
-    plan_id = upload(desktop.client, FLAT | {"name": "Flat on a phone"})
-    page = desktop.open(f"/#plan={plan_id}")
+def test_link_for_the_phone_has_the_key_of_the_pages_link_only(desktop: Visit) -> None:
+    plan_id, own = upload(desktop.client, FLAT | {"name": "Flat on a phone"}), str(desktop.client.base_url).rstrip("/")
+    page, lan = desktop.open(f"/#plan={plan_id}"), "https://10.0.0.7"
+    page.get_by_role("button", name="On a phone").click()
+    expect(page.locator("#phone-dialog")).to_contain_text("make serve-lan")
+    expect(page.get_by_role("img", name="QR code")).to_have_count(0)
+    # The service at an address in the network.
+    page.route(f"{lan}/**", lambda route: route.fulfill(response=route.fetch(url=route.request.url.replace(lan, own))))
+    page.goto(f"{lan}/#plan={plan_id}&key=lalaloc_run")
     expect(page.locator("#plan-name")).to_have_text("Flat on a phone")
+    assert "lalaloc_run" not in page.url
     page.evaluate("sessionStorage.setItem('lalaloc-key', 'lalaloc_secret')")
     page.get_by_role("button", name="On a phone").click()
     link = page.locator("#phone-dialog a")
-    assert (link.get_attribute("href") or "").endswith(f"/#plan={plan_id}")
+    assert link.get_attribute("href") == f"{lan}/#plan={plan_id}&key=lalaloc_run"
     expect(page.get_by_role("img", name="QR code")).to_be_visible()
     assert "secret" not in page.locator("#phone-dialog").inner_html()
     assert desktop.client.get("/").headers["Permissions-Policy"].startswith("camera=(self), microphone=()")

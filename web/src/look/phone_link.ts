@@ -1,14 +1,14 @@
-/** QR code that opens the plan on a phone. The link holds the plan's id, never a key: the phone asks for one. */
+/** QR code that opens the plan on a phone. The link has the plan's id, and a key only if the page's own link had it. */
 
 import { encode } from "uqr";
 
+import { key } from "../api";
 import { button, h, s, show } from "../dom";
 
 export class PhoneLink {
   private readonly code = h("div", { class: "qr" });
   private readonly link = h("a", {});
   private readonly warning = h("p", { class: "hint" });
-  private readonly close = button("Close", () => this.dialog.close());
   private readonly dialog = h(
     "dialog",
     { id: "phone-dialog", "aria-labelledby": "phone-title" },
@@ -16,7 +16,7 @@ export class PhoneLink {
     this.code,
     h("p", {}, this.link),
     this.warning,
-    h("div", { class: "ask" }, this.close),
+    h("div", { class: "ask" }, button("Close", () => this.dialog.close())),
   );
 
   constructor() {
@@ -24,7 +24,7 @@ export class PhoneLink {
   }
 
   open(planId: string): void {
-    const address = `${location.origin}${location.pathname}#plan=${planId}`,
+    const address = `${location.origin}${location.pathname}#plan=${planId}${key.inLinks()}`,
       { data, size } = encode(address, { border: 2 });
     const dark = data.flatMap((row, y) => row.flatMap((isDark, x) => (isDark ? [`M${x} ${y}h1v1h-1z`] : [])));
     show(
@@ -37,11 +37,11 @@ export class PhoneLink {
       ),
     );
     this.link.href = this.link.textContent = address;
-    const isLocal = ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
-    this.warning.textContent = isLocal
-      ? "This address is of this computer alone: open the page by its name in the network."
+    this.code.hidden = this.link.hidden = ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
+    this.warning.textContent = this.link.hidden
+      ? "Phones cannot reach this address: run `make serve-lan` (`lalaloc-service serve --lan`) and open its link."
       : location.protocol === "https:"
-        ? "The phone asks for an API key if the service needs one."
+        ? "The phone asks for an API key if the service needs one and the link has none."
         : "Without HTTPS, phones do not allow the camera; a film can be chosen instead.";
     this.dialog.showModal();
   }
