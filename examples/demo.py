@@ -25,6 +25,7 @@ from examples.launch import ROOT, ServiceFailedError, running_service
 from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, ClientError, Localisation, QueryOptions
 from lalaloc_core.draw.canvas import MUTED, document, image, pixels, words
+from lalaloc_core.shown_text import probability_text
 
 _PLAN_TIMEOUT_S = 120.0
 # Long timeouts prevent a fallback to a coarser stage on a busy machine. Messages of the log would interrupt the table,
@@ -138,7 +139,7 @@ _HEADER = (
 def _line(truth: TruePose, label: str, localisation: Localisation) -> str:
     x_m, y_m = localisation.position.x_m, localisation.position.y_m
     error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
-    confidence = "-" if localisation.confidence is None else f"{localisation.confidence:.2f}"
+    confidence = "-" if localisation.confidence is None else probability_text(localisation.confidence)
     return (
         f"{truth.file:<16} {label:<8} {f'{truth.x_m:.2f}, {truth.y_m:.2f}':>12} {f'{x_m:.2f}, {y_m:.2f}':>12} "
         f"{error_m:>8.3f} {localisation.heading_deg:>12.1f} {confidence:>10} {localisation.room:<12} "
@@ -179,7 +180,7 @@ def _sentence(label: str, truth: TruePose, localisation: Localisation) -> str:
     x_m, y_m = localisation.position.x_m, localisation.position.y_m
     error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
     turn_deg = (localisation.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
-    confidence = "" if localisation.confidence is None else f", confidence {localisation.confidence:.2f}"
+    confidence = "" if localisation.confidence is None else f", confidence {probability_text(localisation.confidence)}"
     return (
         f"{label}: {localisation.room} ({x_m:.2f}, {y_m:.2f}) m, error {error_m:.2f} m and {turn_deg:+.1f}°{confidence}"
     )

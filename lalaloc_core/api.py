@@ -437,7 +437,10 @@ def _pinned_album(
     """Return the album with its pins and notes on unreadable files and copies."""
     pins = {pin.photograph_id: pin for pin in album.pins}
     photographs = [row if row.id is None else replace(row, pin=pins[row.id]) for row in rows]
-    notes = [f"'{row.name}' is set aside: {row.reason}" for row in photographs if row.id is None]
+    unread, notes = [row for row in photographs if row.id is None], []
+    for reason in dict.fromkeys(row.reason for row in unread):
+        names = [f"'{row.name}'" for row in unread if row.reason == reason]
+        notes.append(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} set aside: {reason}")
     copies = sum(row.id is not None for row in photographs) - len(pins)
     if copies:
         notes.append(f"copies of other files, which have the same pin: {copies}")

@@ -1,4 +1,4 @@
-"""Names of files and rooms in what people open: documents, tables and terminals."""
+"""Names of files and rooms, and probabilities, in what people open: documents, tables and terminals."""
 
 from __future__ import annotations
 
@@ -18,3 +18,8 @@ def printable(name: str) -> str:
 def no_formula(text: str) -> str:
     """Return text that a spreadsheet does not take for a formula."""
     return f"'{text}" if _FORMULA.intersection((text[:1], text.lstrip()[:1])) else text
+
+
+def probability_text(probability: float, decimals: int = 1) -> str:
+    """Return a probability in percent; from 99.5 % on "> 99 %", as no estimate is that sure."""
+    return "> 99 %" if probability >= 0.995 else f"{100.0 * probability:.{decimals}f} %"

@@ -18,7 +18,6 @@ from PIL import Image
 import lalaloc_client
 from examples.launch import running_service
 from lalaloc_core.cli import main
-from lalaloc_core.cli import main as lalaloc
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import read_annotation
 from scripts.write_docs import documents
@@ -71,7 +70,7 @@ def test_modules_in_commands_exist() -> None:
 def test_options_in_commands_exist(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
         # `plan` and `lab` have subcommands.
-        lalaloc([*command[1 : 3 if command[1] in ("plan", "lab") else 2], "--help"])
+        main([*command[1 : 3 if command[1] in ("plan", "lab") else 2], "--help"])
     assert exit_info.value.code == 0
     output = capsys.readouterr().out
     assert [word for word in command[2:] if word.startswith("--") and word not in output] == []

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
-from lalaloc_core.cli.options import BUNDLE, TURN, add_options
-from lalaloc_core.cli.plan_files import check_picture_name, write_picture
-from lalaloc_core.cli.printing import print_json
+from lalaloc_core.cli.options import BUNDLE, TURN, add_options, check_sources
+from lalaloc_core.cli.plan_files import check_picture_name, write_file, write_picture
+from lalaloc_core.cli.printing import print_json, print_warnings
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.files import atomic_write
 
 if TYPE_CHECKING:
     from lalaloc_core.bundle import Manifest
@@ -54,8 +52,7 @@ def _encode(arguments: argparse.Namespace) -> None:
     from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
     from lalaloc_core.photograph import open_photograph
 
-    if bool(arguments.photographs) == (arguments.turn is not None):
-        raise InvalidInputError("photographs and --turn exclude each other; give one or more photographs, or --turn")
+    check_sources(arguments)
     if arguments.out is not None and len(arguments.photographs) > 1:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
     stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
@@ -86,8 +83,8 @@ def _encode_turn(
         warnings = overlap_warnings(angles, min(photograph.hfov.value for photograph in photographs))
     else:
         warnings = film.warnings
-    for warning in dict.fromkeys([*warnings, *(text for photograph in photographs for text in photograph.warnings)]):
-        print(f"warning: {arguments.turn}: {warning}", file=sys.stderr)
+    texts = [*warnings, *(text for photograph in photographs for text in photograph.warnings)]
+    print_warnings((str(arguments.turn), text) for text in texts)
     out = arguments.out or arguments.turn.with_suffix(".features")
     try:
         out.mkdir(exist_ok=True)
@@ -101,10 +98,7 @@ def _encode_turn(
 
 
 def _write(out: Path, content: bytes) -> None:
-    try:
-        atomic_write(out, content)
-    except OSError as error:
-        raise InvalidInputError(f"'{out}' cannot be written: {error.strerror}") from error
+    write_file(out, content)
     print(f"{out}: {len(content)} bytes")
 
 

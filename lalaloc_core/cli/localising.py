@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.answer_files import FILES, check_file_options, write_files
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
-from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, PLAN, TURN, add_options, heading, tolerance
+from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, PLAN, TURN, add_options, check_sources, heading, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
-from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
+from lalaloc_core.shown_text import probability_text
 
 if TYPE_CHECKING:
     from lalaloc_core.api import LaLaLoc
@@ -65,8 +66,7 @@ def _localise(arguments: argparse.Namespace) -> None:
 
     if arguments.heading_tolerance is not None and arguments.heading is None:
         raise InvalidInputError("--heading-tolerance needs --heading, which is missing")
-    if bool(arguments.photographs) == (arguments.turn is not None):
-        raise InvalidInputError("photographs and --turn exclude each other; give one or more photographs, or --turn")
+    check_sources(arguments)
     if arguments.turn is not None and arguments.heading is not None:
         raise InvalidInputError("--heading does not go with --turn, whose headings are searched; leave it out")
     if arguments.out is not None:
@@ -76,7 +76,7 @@ def _localise(arguments: argparse.Namespace) -> None:
         check_height_m(plan, arguments.camera_height)
     check_file_options(arguments, plan)
     stated, several = stated_camera(arguments), len(arguments.photographs) > 1
-    documents, rows, places = [], [], []
+    documents, rows, places, warnings = [], [], [], []
     model = LaLaLoc(arguments.bundle)
     find = _answers if arguments.turn is None else _turn_answers
     for number, (path, answer, document) in enumerate(find(arguments, model, plan, stated)):
@@ -84,14 +84,14 @@ def _localise(arguments: argparse.Namespace) -> None:
         if answer is None:
             print(f"error: {document['error']}", file=sys.stderr)
             continue
-        for warning in _remarks(answer):
-            print(f"warning: {path}: {warning}", file=sys.stderr)
+        warnings += [(str(path), text) for text in document["warnings"]]
         drawn = drawn_answer(answer)
         rows.append(_row(document, drawn))
         places.append((path.stem, drawn.camera))
         if arguments.out is not None:
             out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
             _draw(drawn, path, out, arguments, stated, path.name if several else None)
+    print_warnings(warnings)
     write_files(arguments, plan, documents, places)
     if arguments.json:
         print_json(documents, JSON_DECIMALS)
@@ -166,7 +166,7 @@ def _row(document: dict[str, Any], drawn: DrawnAnswer) -> tuple[str, ...]:
         *pose_cells(document),
         "-" if covariance is None else f"{100 * ellipse_m(covariance)[0]:.0f} cm",
         f"{drawn.camera_height_m:.2f}",
-        "-" if drawn.confidence is None else f"{100 * drawn.confidence:.1f} %",
+        "-" if drawn.confidence is None else probability_text(drawn.confidence),
     )
 
 

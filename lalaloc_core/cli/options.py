@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.files import default_bundle
 
 _Number = TypeVar("_Number", int, float)
@@ -55,3 +56,11 @@ def add_options(parser: argparse.ArgumentParser, text: str, **more: Mapping[str,
     if BUNDLE in text:
         # The path of the shipped model depends on the working folder.
         parser.set_defaults(bundle=default_bundle())
+
+
+def check_sources(arguments: argparse.Namespace) -> None:
+    """Refuse a command without photographs and without --turn, and one with both."""
+    if not arguments.photographs and arguments.turn is None:
+        raise InvalidInputError("no photograph is given: give one or more photographs, or --turn with a film or folder")
+    if arguments.photographs and arguments.turn is not None:
+        raise InvalidInputError("photographs and --turn exclude each other: leave one of them out")

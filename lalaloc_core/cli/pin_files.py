@@ -14,7 +14,7 @@ import numpy as np
 from lalaloc_core.cli.answer_files import EarthPlace, csv_text, place_feature, place_on_earth
 from lalaloc_core.cli.plan_files import write_file
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.shown_text import no_formula
+from lalaloc_core.shown_text import no_formula, probability_text
 
 if TYPE_CHECKING:
     from lalaloc_core.draw.pins import ReportRow
@@ -113,7 +113,7 @@ def _report_row(plan_ids: Sequence[str], path: Path, entry: dict[str, Any]) -> R
         pin=pin,
         room=entry["room"] or "",
         room_key=f"{entry['plan']}/{entry['room_id']}",
-        note=entry["reason"] if pin is None else f"{100.0 * entry['confidence']:.0f} % sure of the room",
+        note=entry["reason"] if pin is None else f"{probability_text(entry['confidence'], 0)} sure of the room",
         picture=partial(_thumbnail, path),
     )
 

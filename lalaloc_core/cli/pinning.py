@@ -14,7 +14,7 @@ from lalaloc_core.cli.options import BUNDLE, PLAN, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
 from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.shown_text import printable
+from lalaloc_core.shown_text import printable, probability_text
 
 _OPTIONS = f"""
 {PLAN}
@@ -143,6 +143,6 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
         f"{entry['position']['x_m']:.2f}",
         f"{entry['position']['y_m']:.2f}",
         "-" if heading is None else f"{heading:.0f}",
-        f"{100.0 * entry['confidence']:.0f} %",
+        probability_text(entry["confidence"], 0),
         entry["state"].replace("_", " "),
     )

@@ -1,13 +1,16 @@
-"""Output of commands: tables and JSON."""
+"""Output of commands: tables, JSON and warnings."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+import sys
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 # Decimals of printed poses: micrometres, and mm² of covariances.
 JSON_DECIMALS = 6
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def print_json(value: Any, decimals: int | None = None) -> None:
@@ -40,3 +43,13 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
             for index, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
         print("  ".join([first, *others]).rstrip())
+
+
+def print_warnings(warnings: Iterable[tuple[str, str]]) -> None:
+    """Print warnings, by names and texts, to standard error, each cause once: its texts differ in numbers only."""
+    causes: dict[str, list[tuple[str, str]]] = {}
+    for name, text in warnings:
+        causes.setdefault(_NUMBER.sub("#", text), []).append((name, text))
+    for (name, text), *others in causes.values():
+        more = len({other for other, _ in others} - {name})
+        print(f"warning: {name}{f' and {more} more' if more else ''}: {text}", file=sys.stderr)

@@ -14,6 +14,7 @@ from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_file, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
+from lalaloc_core.shown_text import probability_text
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
@@ -82,7 +83,7 @@ def _track(arguments: argparse.Namespace) -> None:
         print_json(documents, JSON_DECIMALS)
     else:
         rows = [
-            (Path(pose["photograph"]).name, pose["mode"], *pose_cells(pose), f"{100.0 * pose['probability']:.1f} %")
+            (Path(pose["photograph"]).name, pose["mode"], *pose_cells(pose), probability_text(pose["probability"]))
             for pose in documents
             if "error" not in pose
         ]

@@ -19,6 +19,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.answers.documents import Answer
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, probability_map
 from lalaloc_core.photograph import Photograph
+from lalaloc_core.shown_text import probability_text
 
 Picture = Literal["both", "plan", "photograph"]
 
@@ -187,7 +188,7 @@ def _marks(answer: DrawnAnswer) -> str:
 def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
     parts, row = [], y + 18
     if answer.confidence is not None:
-        parts.append(words(x, row + 30, f"{100 * answer.confidence:.1f} %", 46, more='font-weight="bold"'))
+        parts.append(words(x, row + 30, probability_text(answer.confidence), 46, more='font-weight="bold"'))
         parts.append(words(x, row + 60, f"within 1 m: {confidence_words(answer.confidence)}", 18, fill=MUTED))
         row += 96
     circle = f'<circle cx="{x + 11:.1f}" cy="{row - 6:.1f}" r="9" fill="{FOUND}"/>'
@@ -201,7 +202,7 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
     parts.append(words(x, row, "Other places" if rivals else "No other place", 18, more='font-weight="bold"'))
     for number, rival in enumerate(rivals, start=2):
         row += 34
-        share = "" if rival.probability is None else f"{100 * rival.probability:.1f} %"
+        share = "" if rival.probability is None else probability_text(rival.probability)
         parts.append(
             f'<circle cx="{x + 11:.1f}" cy="{row - 6:.1f}" r="11" fill="#fff" stroke="{FOUND}" stroke-width="2"/>'
             + words(x + 11, row - 1, str(number), 13, anchor="middle")

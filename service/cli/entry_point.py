@@ -52,11 +52,7 @@ def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     parser.add_argument("--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)")
     parser.add_argument("--example", action="store_true", help="store the example plan, unless there are plans already")
-    parser.add_argument(
-        "--lan",
-        action="store_true",
-        help="let phones of this network in: listen on all addresses, with TLS and an API key that ends with this run",
-    )
+    parser.add_argument("--lan", action="store_true", help="let phones of this network in, over TLS with an API key")
 
 
 def serve(arguments: argparse.Namespace) -> int:

@@ -19,6 +19,7 @@ from PIL import ExifTags, Image
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
+from lalaloc_core.cli.printing import print_warnings
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import jpeg, sphere, take
 
@@ -165,6 +166,11 @@ def test_many_photographs_give_a_table_places_on_earth_and_a_map(
         assert feature["geometry"]["coordinates"] == pytest.approx([13.4, 52.5], abs=1e-3)
     drawn = Path(files[2]).read_text()
     assert (drawn.count('class="camera"'), "kitchen" in drawn, "=1+1" in drawn) == (2, True, True)
+
+
+def test_warnings_are_told_once_by_cause(capsys: pytest.CaptureFixture[str]) -> None:
+    print_warnings([("a.jpg", "60° ± 8°"), ("a.jpg", "no lens"), ("b.jpg", "61.5° ± 9°"), ("b.jpg", "62° ± 9°")])
+    assert capsys.readouterr().err == "warning: a.jpg and 1 more: 60° ± 8°\nwarning: a.jpg: no lens\n"
 
 
 @pytest.mark.parametrize(

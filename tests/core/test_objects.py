@@ -17,7 +17,7 @@ from lalaloc_core.bundle import Bundle, MatchingWeights, default_bundle
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import reason_for
+from lalaloc_core.localise.belief import Confidence, is_outside, reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
@@ -87,6 +87,7 @@ def test_low_confidence_of_a_photograph_without_household_objects_has_its_reason
     assert room.outside < 0.0
     assert outside_odds(np.full(63, 0.0005)) > 3.0
     outside = replace(room, outside=3.0)
+    assert [is_outside(Confidence(fit, 0.3, 0.3, ()), outside) for fit in (0.9, 0.99)] == [True, False]
     assert "façade or a garden" in str(reason_for(0.3, 0.2, outside, is_warned=True))
     assert reason_for(0.8, 0.2, outside, is_warned=False) is None
     assert reason_for(0.05, 0.2, room, is_warned=True) is None

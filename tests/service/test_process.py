@@ -8,7 +8,6 @@ import random
 import shutil
 import signal
 import ssl
-import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from time import monotonic, sleep
 import httpx
 import pytest
 
-from service.cli.lan_access import lan_addresses, lan_certificate
+from service.cli.lan_access import lan_address, lan_certificate
 from service.settings import CONSTANTS, PREFIX, Settings
 from service.storage import open_store
 from tests.local_servers import free_port
@@ -35,16 +34,9 @@ def environment_of(bundle: Path, data_dir: Path, **settings: str) -> dict[str, s
     given = {"BUNDLE": str(bundle), "DATA_DIR": str(data_dir), "ONNX_THREADS": "1"} | settings
     changed = {name: float(given.pop(name.upper())) for name in CONSTANTS if name.upper() in given}
     clean = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
-    return (
-        clean
-        | {PREFIX + name: value for name, value in given.items()}
-        | {
-            "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'service' / 'with_constants'}"
-            if changed
-            else str(ROOT),
-            "TEST_CONSTANTS": json.dumps(changed),
-        }
-    )
+    constants = f"{os.pathsep}{ROOT / 'tests' / 'service' / 'with_constants'}" if changed else ""
+    own = {"PYTHONPATH": f"{ROOT}{constants}", "TEST_CONSTANTS": json.dumps(changed)}
+    return clean | {PREFIX + name: value for name, value in given.items()} | own
 
 
 @contextmanager
@@ -234,16 +226,17 @@ def test_module_prints_its_address(tiny_bundle: Path, tmp_path: Path) -> None:
         process.wait(10.0)
 
 
-def test_certificate_is_kept_while_it_is_for_the_address(tmp_path: Path) -> None:
-    path = lan_certificate(tmp_path, ["192.0.2.7", "10.0.0.2"])
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+def test_certificate_is_kept_until_it_is_old(tmp_path: Path) -> None:
+    path = lan_certificate(tmp_path, "192.0.2.7")
+    assert path.stat().st_mode & 0o777 == 0o600
     first = path.read_bytes()
-    assert lan_certificate(tmp_path, ["10.0.0.2"]).read_bytes() == first
-    assert lan_certificate(tmp_path, ["10.0.0.3"]).read_bytes() != first
+    assert lan_certificate(tmp_path, "192.0.2.7").read_bytes() == first
+    os.utime(path, (0.0, 0.0))
+    assert lan_certificate(tmp_path, "192.0.2.7").read_bytes() != first
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not lan_addresses(), reason="this machine is in no network")
+@pytest.mark.skipif(lan_address() is None, reason="this machine is in no network")
 def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "service", "--port", "0", "--example", "--lan"]
     environment = environment_of(tiny_bundle, tmp_path, WORKERS="0")
@@ -251,7 +244,8 @@ def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp
     try:
         assert process.stdout is not None
         url, _, key = process.stdout.readline().strip().partition("/#key=")
-        context = ssl.create_default_context(cafile=str(tmp_path / "lan-certificate.pem"))
+        [certificate] = tmp_path.glob("lan-certificate-*.pem")
+        context = ssl.create_default_context(cafile=str(certificate))
         with httpx.Client(base_url=url, verify=context, timeout=120.0, trust_env=False) as client:
             assert client.get("/floorplans").status_code == 401
             client.headers["Authorization"] = f"Bearer {key}"

@@ -283,13 +283,12 @@ export class Plans {
 
   private draw(): void {
     const entries = this.found.map((plan) => {
-      const state =
-        plan.status === "preparing"
-          ? `preparing, ${Math.round(100 * plan.progress)} %`
-          : plan.status === "failed"
-            ? "failed"
-            : "";
-      const facts = [`${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}`, `${plan.area_m2.toFixed(0)} m²`, state];
+      const done = Math.round(100 * plan.progress);
+      const state = { preparing: `preparing, ${done} %`, failed: "failed", ready: "" }[plan.status];
+      const isAlone = this.found.filter(({ name }) => name === plan.name).length === 1;
+      const date = new Date(plan.updated_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
+      const size = `${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}, ${plan.area_m2.toFixed(0)} m²`;
+      const facts = [size, state, isAlone ? "" : `stored ${date}`];
       const isChosen = plan.id === this.current?.id;
       const choose = planButton(plan.name, facts.filter(Boolean).join(", "), isChosen, () => this.pick(plan.id));
       const remove = button("×", () => void this.remove(plan), {

@@ -26,6 +26,7 @@ from lalaloc_core.localise.belief import (
     Confidence,
     advice_for,
     information_bits,
+    is_outside,
     photograph_heading,
     pose_uncertainty,
     reason_for,
@@ -181,7 +182,8 @@ def _told(
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
     sure = found.posterior.position if confidence is None else confidence.position
     seen, step = found.query.objects, None
-    if bundle is not None and confidence is not None:
+    can_turn = not is_outside(confidence, seen)
+    if bundle is not None and confidence is not None and can_turn:
         field = spot.photograph.hfov.value
         known = known_of(found, confidence, arcs=spot.arcs, field=field, rooms_known=ground.rooms_known)
         step = step_after(ground.plan, bundle.manifest, known, step_m=ground.grid.step_m)
@@ -200,7 +202,7 @@ def _told(
         information_bits=bits,
         ruled_out=1.0 - 2.0**-bits,
         relative_heading=relative_heading,
-        advice=advice_for(spot.arcs, sure),
+        advice=advice_for(spot.arcs, sure) if can_turn else None,
         next_step=step,
         room_types=None if seen is None else seen.room_type.shares(),
         objects=objects,

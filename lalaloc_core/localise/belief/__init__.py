@@ -12,6 +12,7 @@ from lalaloc_core.localise.belief.confidence import (
     advice_for,
     confidence_of,
     information_bits,
+    is_outside,
     marginal_information,
     pose_uncertainty,
     reason_for,

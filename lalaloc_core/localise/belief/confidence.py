@@ -244,6 +244,13 @@ def advice_for(arcs: list[tuple[float, float]], confidence: float) -> str | None
     )
 
 
+def is_outside(confidence: Confidence | None, objects: SeenObjects | None) -> bool:
+    """Return whether a photograph was probably taken outside, by its fit and, as in albums, by what it shows."""
+    if objects is None or objects.outside <= 0.0:
+        return False
+    return confidence is None or confidence.elsewhere * math.exp(objects.outside) >= confidence.fit
+
+
 def reason_for(confidence: float, elsewhere: float, objects: SeenObjects | None, *, is_warned: bool) -> str | None:
     """Return why an answer's confidence is low; None where it is not, or where a warning tells already.
 

@@ -18,6 +18,7 @@ from lalaloc_core.localise.belief import Confidence
 from lalaloc_core.localise.localisability.next_step import Known, NextStep, StepKind, next_step
 from lalaloc_core.localise.localisability.predicted_localisability import STEP_M, Localisability
 from lalaloc_core.localise.search.pipeline import Localisation
+from lalaloc_core.shown_text import probability_text
 
 _TITLES: dict[Photograph, str] = {
     "sphere": "a sphere",
@@ -206,4 +207,4 @@ def words_of(plan: FloorPlan, step: NextStep) -> str:
     else:
         names = list(dict.fromkeys(plan.rooms[index].name for index in step.rooms))
         what = f"choose the room: {', '.join(names[:-1])} or {names[-1]}"
-    return f"{what}; the expected confidence is then {100 * step.confidence:.0f} %"
+    return f"{what}; the expected confidence is then {probability_text(step.confidence, 0)}"
