@@ -146,6 +146,8 @@ def test_image_copies_existing_files() -> None:
 def test_image_and_compose_use_known_settings() -> None:
     named = set(re.findall(r"\bLALALOC_[A-Z_]+", DOCKERFILE)) | set(COMPOSE["environment"])
     assert named <= SETTINGS
+    # The folders are the image's.
+    assert SETTINGS - COMPOSE["environment"].keys() == {"LALALOC_BUNDLE", "LALALOC_DATA_DIR"}
     (port,) = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, re.MULTILINE)
     assert f'"--port", "{port}"' in DOCKERFILE
     assert f"http://127.0.0.1:{port}/readyz" in DOCKERFILE
@@ -172,6 +174,8 @@ def test_proxy_and_replicas_match() -> None:
     assert [published.split(":")[-1] for published in REPLICAS["proxy"]["ports"]] == [listens]
     for service in replicas.values():
         assert {name for name in service["environment"] if name.startswith("LALALOC_")} <= SETTINGS
+        without_keys = {"LALALOC_PUBLISHED_ON", "LALALOC_ALLOW_ANONYMOUS", "LALALOC_ALLOWED_HOSTS"}
+        assert COMPOSE["environment"].keys() - service["environment"].keys() == without_keys
         assert service["build"] == COMPOSE["build"]
         assert service["environment"]["LALALOC_API_KEYS"] == "on"
 
