@@ -244,8 +244,7 @@ def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp
     try:
         assert process.stdout is not None
         url, _, key = process.stdout.readline().strip().partition("/#key=")
-        [certificate] = tmp_path.glob("lan-certificate-*.pem")
-        context = ssl.create_default_context(cafile=str(certificate))
+        context = ssl.create_default_context(cafile=str(next(tmp_path.glob("lan-certificate-*.pem"))))
         with httpx.Client(base_url=url, verify=context, timeout=120.0, trust_env=False) as client:
             assert client.get("/floorplans").status_code == 401
             client.headers["Authorization"] = f"Bearer {key}"
