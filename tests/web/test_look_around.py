@@ -228,10 +228,10 @@ def test_page_without_https_takes_a_film_and_says_why(phone: Visit, tmp_path: Pa
 def test_link_for_the_phone_has_the_key_of_the_pages_link_only(desktop: Visit) -> None:
     plan_id, own = upload(desktop.client, FLAT | {"name": "Flat on a phone"}), str(desktop.client.base_url).rstrip("/")
     page, lan = desktop.open(f"/#plan={plan_id}"), "https://10.0.0.7"
+    expect(page.locator("#plan-name")).to_have_text("Flat on a phone")
     page.get_by_role("button", name="On a phone").click()
     expect(page.locator("#phone-dialog")).to_contain_text("make serve-lan")
     expect(page.get_by_role("img", name="QR code")).to_have_count(0)
-    # The service at an address in the network.
     page.route(f"{lan}/**", lambda route: route.fulfill(response=route.fetch(url=route.request.url.replace(lan, own))))
     page.goto(f"{lan}/#plan={plan_id}&key=lalaloc_run")
     expect(page.locator("#plan-name")).to_have_text("Flat on a phone")
