@@ -1,4 +1,4 @@
-"""Pool of worker processes, bounded in memory and time, that decode photographs and rasterise drawings.
+"""Pools of worker processes, bounded in memory and time, that decode photographs and rasterise drawings.
 
 A picture that crashes its worker is tried once more; one that exceeds the time limit is not. Other jobs are not
 affected. No client keeps all workers busy.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from service import errors
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import DecodeJob, Decoding, run_decoder
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
+from service.query_context import QueryContext
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.uploaded_file import UploadedFile
@@ -35,6 +35,29 @@ _HELP = "docs/how-to/take-photographs.md"
 _QUEUE = 32
 # Films that can wait, and the CPU time (s) of finding the angles of a film's frames.
 _FILM_QUEUE, _FILM_MARGIN_S = 4, 40.0
+# Largest turn whose angles take no longer than decoding a photograph; those of more are found where films are read.
+_SHORT_TURN = 10
+# Faults of files that a worker could not read, by task and reason; the limit is of CPU time.
+_FAULTS = {
+    "photograph": {
+        "poisoned": "the photograph crashed the decoder twice: save it anew or smaller",
+        "stalled": "decoding the photograph took more than {:g} s of CPU time (decode_stall_s): save it anew, or send "
+        "a smaller one",
+        "fault": "the photograph is damaged: save it anew",
+    },
+    "turn": {
+        "poisoned": "finding the angles of the photographs crashed the decoder twice: send their relative_heading_deg",
+        "stalled": "finding the angles of the photographs took more than {:g} s of CPU time: send fewer photographs, "
+        "or their relative_heading_deg",
+        "fault": "the angles of the photographs cannot be found: send their relative_heading_deg",
+    },
+    "film": {
+        "poisoned": "the film crashed the decoder twice: export it anew",
+        "stalled": "reading the film took more than {:g} s of CPU time (max_film_cpu_s): send a film with fewer "
+        "pixels, or a shorter one",
+        "fault": "the film is damaged: export it anew",
+    },
+}
 
 
 class Decoder:
@@ -91,61 +114,61 @@ class Decoder:
         self,
         content: bytes | UploadedFile | Photograph,
         stated: StatedCamera,
-        deadline: float,
-        client: str = "",
+        context: QueryContext,
         *,
         purpose: Purpose = "single",
     ) -> Photograph:
         """Decode an uploaded photograph for the encoders; one that is encoded already is returned as it is.
-
-        The deadline is a time (`monotonic`).
 
         Raises:
             InvalidPhotographError: see `open_photograph`; or the file stalled a worker, or crashed two.
         """
         if isinstance(content, Photograph):
             return content
-        return await self._run_job(DecodeJob("photograph", (content, stated, purpose)), deadline, client)
+        return await self._run_job(DecodeJob("photograph", (content, stated, purpose)), context)
 
-    async def film(self, content: bytes | UploadedFile, stated: StatedCamera, deadline: float, client: str) -> Film:
-        """Read a film of a turn; the first one starts the workers."""
-        with self._lock:
-            if not self._films_started:
-                self._films.start()
-                self._films_started = True
-        return await self._run_job(DecodeJob("film", (content, stated)), deadline, client)
+    async def film(self, content: bytes | UploadedFile, stated: StatedCamera, context: QueryContext) -> Film:
+        """Read a film of a turn."""
+        return await self._run_job(DecodeJob("film", (content, stated)), context)
 
     async def level_turn(
-        self, photographs: Sequence[Photograph], deadline: float, client: str = ""
+        self, photographs: Sequence[Photograph], context: QueryContext
     ) -> tuple[list[Photograph], list[TurnAngles]]:
         """Return photographs of one spot, decoded for a turn, with the angles that their overlap tells."""
-        return await self._run_job(DecodeJob("turn", (photographs,)), deadline, client)
+        return await self._run_job(DecodeJob("turn", (photographs,)), context)
 
     async def picture(
         self,
         content: bytes | UploadedFile,
         stated: StatedCamera,
-        deadline: float,
-        client: str,
+        context: QueryContext,
         *,
         is_sphere: bool,
         max_size: tuple[int, int],
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Decode a photograph to show: upright within `max_size` (width, height), spheres level and of that size."""
-        return await self._run_job(DecodeJob("picture", (content, stated, is_sphere, max_size)), deadline, client)
+        return await self._run_job(DecodeJob("picture", (content, stated, is_sphere, max_size)), context)
 
-    async def rasterise(self, svg: str, deadline: float, client: str = "") -> bytes:
-        """Return a drawing as a PNG file, by a deadline (`monotonic`)."""
-        return await self._run_job(DecodeJob("drawing", (svg,)), deadline, client)
+    async def rasterise(self, svg: str, context: QueryContext) -> bytes:
+        """Return a drawing as a PNG file."""
+        return await self._run_job(DecodeJob("drawing", (svg,)), context)
 
-    async def _run_job(self, job: DecodeJob, deadline: float, client: str) -> Any:
+    async def _run_job(self, job: DecodeJob, context: QueryContext) -> Any:
+        pool = self._started_films() if _is_long(job) else self._pool
         try:
-            pool = self._films if job.task == "film" else self._pool
-            return await pool.run_job(job, max(deadline - monotonic(), 0.0), client)
+            return await pool.run_job(job, max(context.left_s, 0.0), context.client)
         except JobLostError as error:
-            raise self._error(error, job) from error
+            raise self._error(error, job, context) from error
         except (InvalidPhotographError, InvalidFilmError) as error:
             raise type(error)(f"{error}; see {_HELP}") from error
+
+    def _started_films(self) -> WorkerPool[DecodeJob, Any]:
+        """Return the pool of films, whose workers the first long job starts."""
+        with self._lock:
+            if not self._films_started:
+                self._films.start()
+                self._films_started = True
+        return self._films
 
     def close(self) -> None:
         """End all workers and wait for them."""
@@ -155,39 +178,28 @@ class Decoder:
                 self._films.close()
             self._films_started = True
 
-    def _error(self, lost: JobLostError, job: DecodeJob) -> Exception:
+    def _error(self, lost: JobLostError, job: DecodeJob, context: QueryContext) -> Exception:
         """Return the service's error for a lost job."""
-        if job.task == "drawing" and lost.reason in ("poisoned", "fault"):
-            return errors.DrawingFailedError(lost.reason)
-        if job.task == "drawing" and lost.reason == "stalled":
-            # Drawings have a bounded size, so the machine is slow.
-            return errors.DeadlineExceededError(self._settings.decode.stall_s)
-        if job.task == "film" and (fault := self._film_fault(lost)) is not None:
-            return InvalidFilmError(fault)
+        stall_s = self._film_stall_s if _is_long(job) else self._settings.decode.stall_s
         match lost.reason:
-            case "poisoned":
-                return InvalidPhotographError("the photograph crashed the decoder twice: save it anew or smaller")
-            case "stalled":
-                return InvalidPhotographError(
-                    f"decoding the photograph took more than {self._settings.decode.stall_s:g} s of CPU time "
-                    "(decode_stall_s): save it anew, or send a smaller one"
-                )
-            case "fault":
-                return InvalidPhotographError("the photograph is damaged: save it anew")
+            case "stalled" if job.task == "drawing":
+                # Drawings have a bounded size, so the machine is slow.
+                return errors.DeadlineExceededError(stall_s)
+            case "poisoned" | "fault" if job.task == "drawing":
+                return errors.DrawingFailedError(lost.reason)
+            case "poisoned" | "stalled" | "fault":
+                kind = InvalidFilmError if job.task == "film" else InvalidPhotographError
+                return kind(_FAULTS.get(job.task, _FAULTS["photograph"])[lost.reason].format(stall_s))
             case "queue-full":
-                return errors.OverloadedError(_QUEUE)
+                return errors.OverloadedError(_FILM_QUEUE if _is_long(job) else _QUEUE)
             case "not-ready" | "stopped":
                 return errors.DecoderNotReadyError()
             case "closing":
                 return errors.StoppingError()
             case "deadline" | "died":
-                return errors.DeadlineExceededError(self._settings.requests.request_deadline_s)
+                return errors.DeadlineExceededError(context.limit_s)
 
-    def _film_fault(self, lost: JobLostError) -> str | None:
-        """Return the fault of a film that a worker could not read; None if the film is not to blame."""
-        return {
-            "poisoned": "the film crashed the decoder twice: export it anew",
-            "stalled": f"reading the film took more than {self._film_stall_s:g} s of CPU time "
-            "(max_film_cpu_s): send a film with fewer pixels, or a shorter one",
-            "fault": "the film is damaged: export it anew",
-        }.get(lost.reason)
+
+def _is_long(job: DecodeJob) -> bool:
+    """Return whether a job can take as long as a film."""
+    return job.task == "film" or (job.task == "turn" and len(job.arguments[0]) > _SHORT_TURN)

@@ -56,9 +56,7 @@ class AlbumSearch:
         """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
         content, document, context = query.content, query.document, query.context
         with context.clock.stage("decode"):
-            view = await self._parts.decoder.decode(
-                content, document.stated_camera, context.deadline, context.client, purpose="album"
-            )
+            view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
         if view.sphere is not None and not encodes_spheres(self._parts.bundle.manifest):
             raise InvalidPhotographError("the photograph is a full sphere, of which the model gives no features")
 

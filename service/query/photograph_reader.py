@@ -52,9 +52,7 @@ class PhotographReader:
 
         async def decode(index: int) -> Photograph:
             with _named(index, contents):
-                return await self._decoder.decode(
-                    contents[index], stated, context.deadline, context.client, purpose=purpose
-                )
+                return await self._decoder.decode(contents[index], stated, context, purpose=purpose)
 
         photographs: list[Photograph] = []
         for first in range(0, len(contents), _BESIDE):
@@ -76,18 +74,17 @@ class PhotographReader:
             photographs = await self._decode_all(contents, stated, context, purpose="turn")
             if any(photograph.overview is None for photograph in photographs):
                 # Patches of the others are not cut yet.
-                decode = partial(self._decoder.decode, deadline=context.deadline, client=context.client)
                 each = zip(photographs, contents, strict=True)
                 return [
-                    photograph if photograph.overview is None else await decode(content, stated)
+                    photograph if photograph.overview is None else await self._decoder.decode(content, stated, context)
                     for photograph, content in each
                 ], None
-            return await self._decoder.level_turn(photographs, context.deadline, context.client)
+            return await self._decoder.level_turn(photographs, context)
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, context: QueryContext) -> Film:
         """Read a film of a turn."""
         with context.clock.stage("decode"):
-            return await self._decoder.film(content, stated, context.deadline, context.client)
+            return await self._decoder.film(content, stated, context)
 
     def known_heading(
         self, form: LocaliseForm | StatedHeading | PhotographForm, north: float | None, photograph: Photograph

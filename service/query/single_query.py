@@ -109,8 +109,7 @@ class SingleSearch:
             picture = await self._parts.decoder.picture(
                 query.content,
                 query.form.stated_camera,
-                context.deadline,
-                context.client,
+                context,
                 is_sphere=composed.evidence.photograph.is_sphere,
                 max_size=PHOTOGRAPH_SIZE,
             )
@@ -121,5 +120,5 @@ class SingleSearch:
 
         svg = await self._parts.executor.compute(context, draw)
         if query.as_png:
-            return await self._parts.decoder.rasterise(svg, context.deadline, context.client)
+            return await self._parts.decoder.rasterise(svg, context)
         return svg.encode()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +110,16 @@ def test_python_client_sends_films(client: httpx.Client, flat: str, film: bytes,
     view = found.poses[1].view
     assert view is not None
     assert view.relative_heading is not None
+
+
+def test_angles_of_many_photographs_are_found_beside_the_decoders(
+    start_app: StartApp, tiny_view_bundle: Path, tmp_path: Path
+) -> None:
+    photographs = [("photo", jpeg(frame)) for frame in turn(12, 30.0)]
+    with start_app(tmp_path, bundle=tiny_view_bundle) as client:
+        plan_id, processes = upload(client), list[list[str]]()
+        for count in (3, 12):
+            answer = send(client, plan_id, *photographs[:count]).json()
+            assert len(answer["poses"]) == count
+            processes.append([child.name for child in multiprocessing.active_children() if "-film-" in child.name])
+        assert processes == [[], ["lalaloc-film-0"]]
