@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -41,7 +40,6 @@ _NO_SCANS = STYLES[:-1]
 # the table of `--data`, when their middles are near (m).
 _OVERLAP, _APART_M, _NEAR_M, _SCALE_ERROR, _MAX_CELL = 0.5, 0.3, 0.4, 0.05, 160
 _FAULTS_OF_PHOTOGRAPHS = ("film", "photo", "pin", "turn")
-_CROP = re.compile(r"crop=((?:-?\d+,){3}-?\d+)")
 
 
 @dataclass(frozen=True)
@@ -248,16 +246,12 @@ def read_plan(name: str, content: bytes, truth: Plan, scale: str) -> dict[str, A
 
 
 def _import(content: bytes, truth: Plan, metres_per_pixel: float | None) -> Plan:
-    """Import a plan, with the storeys beside the one that is read first, and return it at its true scale.
+    """Import a plan, with all storeys that are drawn beside each other, and return it at its true scale.
 
     The clock stands still, so that no limit of time makes the result depend on the machine.
     """
-    read = partial(import_plans, content, clock=lambda: 0.0)
-    plans = list(read(ImportOptions(metres_per_pixel=metres_per_pixel)))
+    plans = import_plans(content, ImportOptions(metres_per_pixel=metres_per_pixel), clock=lambda: 0.0)
     scale = plans[0].report.metres_per_unit
-    for crop in _CROP.findall(" ".join(plans[0].report.warnings))[1:] if truth.storeys else []:
-        with suppress(InvalidInputError):
-            plans += read(ImportOptions.from_text({"metres_per_pixel": str(scale), "crop": crop}))
     return Plan.of([plan.document for plan in plans], scale, (truth.metres_per_pixel or scale) / scale)
 
 

@@ -73,8 +73,10 @@ def _progress_line(name: str) -> Iterator[OnStep | None]:
 
 
 def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
-    """Read the only plan in a file."""
-    plan, *others = read_plans(file, arguments)
+    """Read the only plan in a file, or the largest of storeys that are drawn beside each other."""
+    from lalaloc_core.importers import without_storeys_beside
+
+    plan, *others = without_storeys_beside(read_plans(file, arguments))
     if others:
         raise InvalidFloorPlanError(f"the file has {1 + len(others)} levels; choose one with --level")
     return plan

@@ -62,7 +62,12 @@ def add_commands(commands: Any) -> None:
 def _import(arguments: argparse.Namespace) -> None:
     if arguments.all_levels and arguments.out is None:
         raise InvalidInputError("--all-levels needs a folder for the plans; add --out FOLDER")
-    plans = _read_traced(arguments) if arguments.debug else read_plans(arguments.file, arguments)
+    from lalaloc_core.importers import without_storeys_beside
+
+    plans: Sequence[ImportedPlan] = (
+        _read_traced(arguments) if arguments.debug else read_plans(arguments.file, arguments)
+    )
+    plans = plans if arguments.all_levels else without_storeys_beside(plans)
     # Write before printing: a reader such as `head` may close the pipe.
     written = [] if arguments.out is None else _write_plans(plans, _files(plans, arguments))
     for plan in plans:

@@ -32,4 +32,5 @@ from lalaloc_core.importers.importing import (
     import_plan,
     import_plans,
     is_json,
+    without_storeys_beside,
 )

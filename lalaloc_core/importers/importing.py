@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import Any, Literal, get_args
@@ -148,9 +148,9 @@ _FORMATS = (
     _format("svg", "SVG", "image/svg+xml", "svg", f"units scale layers y_axis crop {_SCALE}", magic=_xml("svg")),
     _format("ifc", "IFC", "application/x-step", "ifc", "level", magic=re.compile(_START + rb"ISO-10303-21"),
             extra="ifc"),
-    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop plan {_SCALE}",
+    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop plan level {_SCALE}",
             magic=re.compile(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff")),
-    _format("pdf", "PDF", "application/pdf", "pdf", f"scale page crop {_SCALE}",
+    _format("pdf", "PDF", "application/pdf", "pdf", f"scale page crop level {_SCALE}",
             magic=re.compile(rb".{0,1019}%PDF-", re.DOTALL)),
 )  # fmt: skip
 FORMATS: Mapping[str, Format] = {record.name: record for record in _FORMATS}
@@ -226,16 +226,24 @@ def import_plan(
     building: str | None = None,
     on_step: OnStep | None = None,
 ) -> ImportedPlan:
-    """Return the only plan in a file; `building` names it if the file does not, `on_step` is as for `import_plans`.
+    """Return the only plan in a file, or the largest of storeys that are drawn beside each other.
+
+    `building` names it if the file does not, `on_step` is as for `import_plans`.
 
     Raises:
         InvalidFloorPlanError: the file is invalid or exceeds a limit.
         SeveralLevelsError: the file has several storeys and the option `level` is not set.
     """
-    plans = import_plans(content, options, limits, building=building, on_step=on_step)
+    plans = without_storeys_beside(import_plans(content, options, limits, building=building, on_step=on_step))
     if len(plans) > 1:
         raise SeveralLevelsError([plan.level.name for plan in plans if plan.level is not None])
     return next(iter(plans))
+
+
+def without_storeys_beside(plans: Sequence[ImportedPlan]) -> Sequence[ImportedPlan]:
+    """Return the largest of storeys that are drawn beside each other, whose report names all; else all plans."""
+    largest = next(iter(plans[0].report.levels), None)
+    return [plan for plan in plans if plan.level is not None and plan.level.name == largest] or plans
 
 
 def import_if_native(

@@ -139,6 +139,11 @@ class ImportReport(ResponseModel):
     rejected_texts: list[str] = Field(
         default=[], description="Texts that were read as areas or dimensions and not believed, with the reason."
     )
+    levels: list[str] = Field(
+        default=[],
+        description="Levels that are drawn beside each other in the file, the largest first; the plan is one of them. "
+        "Empty for a single one.",
+    )
 
 
 class ImportLine(BaseModel, frozen=True):

@@ -1,4 +1,4 @@
-"""Parts of pages and pictures: one of several storeys that are drawn side by side."""
+"""Parts of pages and pictures: storeys that are drawn beside each other, and their titles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image, ImageDraw
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import ImportOptions, import_plan
+from lalaloc_core.importers import ImportOptions, import_plan, import_plans
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
+from lalaloc_core.importers.drawing.storeys_beside import assemble_storeys, title_of
+from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from tests.importers.conftest import dxf_file, shapes
 from tests.painted import picture_file
 
@@ -30,7 +35,7 @@ def test_largest_of_several_storeys_is_read_and_the_others_are_named():
     plan = import_plan(picture_file(_storeys()), ImportOptions(metres_per_pixel=SCALE))
     assert len(plan.document["rooms"]) == 2
     (warning,) = (warning for warning in plan.report.warnings if "storeys seem to be drawn" in warning)
-    assert "only the first was read" in warning
+    assert "this plan is 'Storey 1'" in warning
     crop = warning.split("m² at crop=")[2].split(";")[0]
     other = import_plan(
         picture_file(_storeys()), ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop})
@@ -39,6 +44,44 @@ def test_largest_of_several_storeys_is_read_and_the_others_are_named():
     assert room.area == pytest.approx(15.6, abs=0.5)
     # Coordinates stay those of the whole picture.
     assert room.bounds[0] == pytest.approx(510 * SCALE, abs=0.05)
+
+
+def test_every_storey_of_a_picture_is_a_level():
+    options = {"metres_per_pixel": str(SCALE)}
+    left, right = import_plans(picture_file(_storeys()), ImportOptions.from_text(options), building="House")
+    assert (left.document["name"], right.document["name"]) == ("House – Storey 1", "House – Storey 2")
+    assert left.report.levels == right.report.levels == ("Storey 1", "Storey 2")
+    chosen = import_plan(picture_file(_storeys()), ImportOptions.from_text({**options, "level": "Storey 2"}))
+    assert chosen.document["rooms"] == right.document["rooms"]
+
+
+@pytest.mark.parametrize(("gap_px", "count"), [(24, 2), (6, 1)])
+def test_storeys_are_apart_where_no_wall_joins_them(gap_px: int, count: int):
+    page = Image.new("L", (400, 500), 255)
+    pen = ImageDraw.Draw(page)
+    for top in (20, 240 + gap_px):
+        pen.rectangle((40, top, 355, top + 220), outline=0, width=10)
+    assert len(import_plans(picture_file(page), ImportOptions(metres_per_pixel=SCALE))) == count
+
+
+def test_storeys_have_the_levels_of_their_titles():
+    rooms = [SketchedRoom(shapely.box(0.0, y, 6.0, y + 4.0)) for y in (0.0, 6.0, 12.0)]
+    texts = {"FIRST FLOOR": (-3.0, 2.0), "Ground floor": (-3.0, 8.0), "Loft": (3.0, 14.0), "Garage": (-3.0, 14.0)}
+    letterings = [Lettering(text, position) for text, position in texts.items()]
+    plans = assemble_storeys(
+        Sketch(rooms=rooms), letterings, ReportBuilder("picture"), ImportOptions(), Budget(), lambda box: box
+    )
+    found = [(plan.level.name, plan.level.number) for plan in plans if plan.level is not None]
+    assert sorted(found, key=str) == [("FIRST FLOOR", 1.0), ("Ground floor", 0.0), ("Storey 1", None)]
+
+
+@pytest.mark.parametrize(("text", "number"), [
+    ("Second Floor", 2), ("1st floor", 1), ("Level 2", 2), ("2. Obergeschoss", 2), ("1. UG", -1), ("EG", 0), ("Lower level", -1),
+    ("Living room", None), ("950 SF", None), ("2", None), ("First aid", None), ("12 m", None),
+])  # fmt: skip
+def test_titles_of_storeys(text: str, number: int | None):
+    level = title_of(text)
+    assert (None if level is None else level.number) == number
 
 
 def test_crop_of_a_scanned_page_is_in_points_from_its_lower_left_corner():

@@ -19,7 +19,7 @@ const FIELDS: [string, string, string][] = [
   ["ceiling_height_m", "Ceiling, m", "2.5"],
 ];
 // The other fields do not apply to pictures.
-const OF_PICTURES = ["metres_per_pixel", "scale", "multiply", "crop", "ceiling_height_m"];
+const OF_PICTURES = ["metres_per_pixel", "scale", "multiply", "crop", "level", "ceiling_height_m"];
 const PICTURES = /^image\/(png|jpeg)$/;
 
 // Endings of files that can be read, perhaps with other options.
@@ -79,8 +79,9 @@ export class ImportForm {
   }
 
   /**
-   * Show the form for a file, open if the file cannot be read without it; `levels` are those to choose from, and
-   * `factor` multiplies all lengths if the areas or dimensions written in the file are right.
+   * Show the form for a file, open if the file cannot be read without it; `levels` are those to choose from, of which
+   * the largest was read if the form is not needed, and `factor` multiplies all lengths if the areas or dimensions
+   * written in the file are right.
    */
   ask(file: File, isNeeded: boolean, levels: string[] = [], factor: number | null = null): void {
     const isPicture = PICTURES.test(file.type);
@@ -114,7 +115,8 @@ export class ImportForm {
     const ask = h(
       "div",
       { class: "ask" },
-      levels.length === 0 ? again : whole,
+      levels.length > 0 && whole,
+      !(isNeeded && levels.length > 0) && again,
       factor !== null &&
         button(`Apply × ${factor.toFixed(3)} to all lengths`, () => this.multiply(factor), {
           id: "import-multiply",
@@ -125,14 +127,16 @@ export class ImportForm {
     const fields = h("div", { class: "fields" }, ...shown);
     const choices = levels.map((name) => button(name, () => this.sendLevel(name)));
     const items = choices.map((choice) => h("li", {}, choice));
+    const list = levels.length > 0 ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...items)] : [];
     show(
       byId("import-form"),
       h(
         "details",
-        { open: isNeeded || factor !== null },
+        { open: isNeeded || factor !== null || levels.length > 0 },
         h("summary", {}, heading),
-        ...(levels.length > 0
-          ? [h("ul", { class: "levels", "aria-label": "Levels" }, ...items), ask]
+        ...list,
+        ...(isNeeded && levels.length > 0
+          ? [ask]
           : isPicture
             ? [
                 this.picture.element,

@@ -202,7 +202,7 @@ export class Plans {
         this.actions.picked();
         this.take(plan);
         if (isCertain(plan)) this.importing.close();
-        else this.importing.ask(file, false, [], plan.import_report?.scale_factor ?? null);
+        else this.importing.ask(file, false, plan.import_report?.levels, plan.import_report?.scale_factor);
       }
       await this.load();
       say(`“${plan.name}” is stored.`);

@@ -71,6 +71,7 @@ class ImportReport:
         scale_factor: factor for all lengths by which they agree with the areas or dimensions that are written; None
             without a contradiction.
         rejected_texts: texts that were read as areas or dimensions and not believed, with the reason.
+        levels: levels that are drawn beside each other in the file, the largest first; empty for a single one.
     """
 
     format: str
@@ -88,6 +89,7 @@ class ImportReport:
     scale_clues: tuple[ScaleClue, ...] = ()
     scale_factor: float | None = None
     rejected_texts: tuple[str, ...] = ()
+    levels: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
@@ -113,6 +115,7 @@ class ReportBuilder:
     scale_clues: tuple[ScaleClue, ...] = ()
     scale_factor: float | None = None
     rejected_texts: list[str] = field(default_factory=list)
+    levels: tuple[str, ...] = ()
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
@@ -12,9 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import mentions_roof
 
 OpeningKind = Literal["door", "window", "passage"]
@@ -24,14 +22,6 @@ T = TypeVar("T")
 ROOM_HEIGHT_M = (0.5, 20.0)
 _MAX_NAMED_LEVELS = 12
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
-# Rooms farther apart (m) are of different drawings; smaller ones, by their share of the largest, are outbuildings.
-_APART_M, _SHARE, _MIN_M2 = 1.0, 0.3, 12.0
-# Margin (m) around the rooms of a part, for its walls.
-_MARGIN_M = 0.5
-_REACH_M = 0.6
-_MAX_NAMED = 6
-
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +93,7 @@ class Sketch:
         recall: share of drawn openings that the importer finds.
         kinds: kinds of openings that the source can hold.
         drawn: box around the drawn walls, if rooms were found between them.
+        walls: drawn walls of a picture, which tell apart the storeys that are drawn beside each other.
         leaves_m: widths of the leaves of doors that swing in gaps of walls.
         wall_m: usual thickness of the walls, 0 if unknown.
     """
@@ -119,6 +110,7 @@ class Sketch:
     recall: float = 0.95
     kinds: tuple[OpeningKind, ...] = ("door", "window", "passage")
     drawn: BaseGeometry | None = None
+    walls: BaseGeometry | None = None
     fixtures: list[SketchedFixture] = field(default_factory=list)
     leaves_m: list[float] = field(default_factory=list)
     wall_m: float = 0.0
@@ -145,53 +137,3 @@ def _height(level: Level) -> float:
     if level.elevation_m is not None:
         return level.elevation_m
     return level.number if level.number is not None else 0.0
-
-
-def choose_storey(sketch: Sketch, builder: ReportBuilder, in_file: Callable[[Box], Box], *, is_chosen: bool) -> Sketch:
-    """Return the largest of several storeys that are drawn side by side; warn with the `crop` of every one.
-
-    `in_file` converts a box in metres (left, lowest, right, highest) to the file's coordinates. The other storeys are
-    left out if `is_chosen`, else they are only named.
-    """
-    together = shapely.union_all([room.shape.buffer(0.5 * _APART_M) for room in sketch.rooms])
-    parts = polygons_from_geometry(together)
-    areas = [sum(room.shape.area for room in sketch.rooms if part.covers(room.shape)) for part in parts]
-    largest = max(areas, default=0.0)
-    storeys = sorted(
-        ((area, part) for area, part in zip(areas, parts, strict=True) if area >= max(_SHARE * largest, _MIN_M2)),
-        key=lambda storey: -storey[0],
-    )
-    if len(storeys) < 2:
-        return sketch
-    named = "; ".join(
-        f"{area:.0f} m² at crop={','.join(f'{number:.0f}' for number in in_file(_around(part)))}"
-        for area, part in storeys[:_MAX_NAMED]
-    )
-    read = "only the first was read" if is_chosen else "they were read as one"
-    builder.warnings.append(
-        f"{len(storeys)} storeys seem to be drawn side by side, {named}; {read}: set crop to read one"
-    )
-    if not is_chosen:
-        return sketch
-    chosen, near = storeys[0][1], storeys[0][1].buffer(_REACH_M)
-    builder.no_room = [area for area in builder.no_room if near.covers(area)]
-    sketch.rooms = [room for room in sketch.rooms if chosen.covers(room.shape)]
-    sketch.openings = [opening for opening in sketch.openings if near.covers(opening.line)]
-    sketch.fixtures = [fixture for fixture in sketch.fixtures if near.covers(fixture.shape)]
-    return sketch
-
-
-def name_storeys(sketch: Sketch, builder: ReportBuilder, *, flip_y: bool) -> Sketch:
-    """Warn of storeys that are drawn side by side in a vector drawing, which can also be buildings of one site."""
-    unit = builder.metres_per_unit
-
-    def in_units(box: Box) -> Box:
-        x0, y0, x1, y1 = (number / unit for number in box)
-        return (x0, -y1, x1, -y0) if flip_y else (x0, y0, x1, y1)
-
-    return choose_storey(sketch, builder, in_units, is_chosen=False)
-
-
-def _around(part: shapely.Polygon) -> Box:
-    x0, y0, x1, y1 = part.buffer(_MARGIN_M - 0.5 * _APART_M).bounds
-    return x0, y0, x1, y1

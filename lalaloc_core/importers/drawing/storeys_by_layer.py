@@ -16,8 +16,9 @@ from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assem
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import Level, name_storeys
+from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.storeys_beside import name_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Stroke
 
 _STOREYS = keys_by_word("storeys")

@@ -17,11 +17,11 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import Box, Sketch, choose_storey
+from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
 from lalaloc_core.importers.drawing.scale_guess import (
     Measures,
@@ -32,6 +32,7 @@ from lalaloc_core.importers.drawing.scale_guess import (
     measures_of,
 )
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
+from lalaloc_core.importers.drawing.storeys_beside import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.ink import blank_outside
@@ -82,13 +83,13 @@ def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tu
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
     _remove_letters(found)
+    # Searchable scans contain text over the picture.
+    letterings = found.drawing.scaled(factor, flip_y=False).letterings or scan.placed(factor)
     before = deepcopy(builder)
     sketch = _as_drawing(found, factor, builder, budget)
     if sketch is None or not sketch.rooms:
         builder = before
         builder.notes.append(f"page {options.page} was read as a picture")
-        # Searchable scans contain text over the picture.
-        letterings = found.drawing.scaled(factor, flip_y=False).letterings or scan.placed(factor)
         sketch = _as_picture(found, factor, builder, budget, letterings=letterings)
         rooms = [Area(room.shape, "", "room") for room in sketch.rooms]
         sketch.rooms = name_rooms(rooms, letterings, builder, sketch.drawn)
@@ -97,8 +98,7 @@ def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tu
         x0, y0, x1, y1 = box
         return x0 / factor, y0 / factor, x1 / factor, y1 / factor
 
-    sketch = choose_storey(sketch, builder, in_points, is_chosen=True)
-    return (assemble(sketch, builder, options, budget.limits.plan),)
+    return assemble_storeys(sketch, letterings, builder, options, budget, in_points)
 
 
 def _guess(found: PageContent, scan: PictureTexts, budget: Budget) -> ScaleGuess | None:

@@ -12,11 +12,10 @@ from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import Tones
-from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.sketch import Box, choose_storey
 from lalaloc_core.importers.drawing.drawing_scale import (
     check_scale,
     drawing_scale,
@@ -26,6 +25,7 @@ from lalaloc_core.importers.drawing.drawing_scale import (
 )
 from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
+from lalaloc_core.importers.drawing.storeys_beside import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.ink import blank_outside, drawn_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
@@ -117,8 +117,7 @@ def _read_plan(
         x0, y0, x1, y1 = (number / factor for number in box)
         return max(x0, 0.0), max(rows - y1, 0.0), min(x1, float(columns)), min(rows - y0, float(rows))
 
-    sketch = choose_storey(sketch, builder, in_file, is_chosen=True)
-    return (assemble(sketch, builder, options, budget.limits.plan),)
+    return assemble_storeys(sketch, letterings, builder, options, budget, in_file)
 
 
 def _open(

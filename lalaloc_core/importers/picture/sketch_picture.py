@@ -158,6 +158,7 @@ def sketch_picture(
         fixtures=fixtures,
         recall=_RECALL,
         drawn=best.enclosed.walls.envelope,
+        walls=best.enclosed.walls,
         leaves_m=[swing.leaf_m + pen_m for swing in swings if swing.leaf_m > 0.0],
         wall_m=best.walls.thickness_m,
     )

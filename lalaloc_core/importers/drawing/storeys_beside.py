@@ -1,0 +1,180 @@
+"""Storeys that are drawn beside each other in a picture, on a page or in a drawing, and their titles."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
+from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Level, Sketch, T
+from lalaloc_core.importers.drawing.vector_drawing import Lettering
+
+Box = tuple[float, float, float, float]
+# Rooms farther apart (m) are of different storeys; in pictures, also those that no wall joins within the second.
+_APART_M, _JOINED_M = 1.0, 0.2
+# Least share of the largest storey, and least area (m²); smaller parts are outbuildings of the nearest storey.
+_SHARE, _MIN_M2 = 0.3, 12.0
+# Margin (m) around the rooms of a storey, for its walls; most storeys that a warning names.
+_MARGIN_M, _MAX_NAMED = 0.5, 6
+_NUMBERS = keys_by_word("storeys") | keys_by_word("storeys_in_titles")
+_BESIDE = frozenset(PLAN_WORDS["levels"]["beside"].split())
+_WORDS = re.compile(r"[^\W_]+")
+
+
+def assemble_storeys(
+    sketch: Sketch,
+    letterings: Sequence[Lettering],
+    builder: ReportBuilder,
+    options: ImportOptions,
+    budget: Budget,
+    in_file: Callable[[Box], Box],
+) -> tuple[ImportedPlan, ...]:
+    """Return a plan of each storey that is drawn beside others, the lowest first by their titles; most files have one.
+
+    `letterings` are in metres. `in_file` converts a box in metres (left, lowest, right, highest) to the file's
+    coordinates.
+    """
+    storeys = storeys_beside(sketch)
+    if len(storeys) < 2:
+        if options.level is not None:
+            builder.warnings.append("the option 'level' was ignored: a single storey was found; use crop to read a part")
+        return (assemble(sketch, builder, options, budget.limits.plan),)
+    levels = _levels(storeys, letterings)
+    builder.levels = tuple(level.name for level in levels)
+    named = _in_words(storeys, in_file, levels)
+
+    def make(level: Level, part: tuple[Sketch, list[shapely.Polygon]]) -> ImportedPlan:
+        own, no_room = part
+        report = replace(deepcopy(builder), no_room=no_room)
+        report.warnings.append(
+            f"{named}; this plan is '{level.name}': choose another with level or crop, or import all levels as a venue"
+        )
+        return assemble(replace(own, level=level), report, options, budget.limits.plan)
+
+    parts = zip(levels, _parts(sketch, builder.no_room, storeys), strict=True)
+    return assemble_levels({level.name: (level, part) for level, part in parts}, options, budget, make)
+
+
+def name_storeys(sketch: Sketch, builder: ReportBuilder, *, flip_y: bool) -> Sketch:
+    """Warn of storeys that are drawn side by side in a vector drawing, which can also be buildings of one site."""
+    unit = builder.metres_per_unit
+
+    def in_units(box: Box) -> Box:
+        x0, y0, x1, y1 = (number / unit for number in box)
+        return (x0, -y1, x1, -y0) if flip_y else (x0, y0, x1, y1)
+
+    storeys = storeys_beside(sketch)
+    if len(storeys) > 1:
+        builder.warnings.append(f"{_in_words(storeys, in_units)}; they were read as one: set crop to read one")
+    return sketch
+
+
+def storeys_beside(sketch: Sketch) -> list[BaseGeometry]:
+    """Return the rooms of each storey, the largest storey first.
+
+    A storey's rooms are joined by their nearness or, if the sketch has them, by walls.
+    """
+    rooms = [room.shape for room in sketch.rooms]
+    reach_m = 0.5 * (_APART_M if sketch.walls is None else _JOINED_M)
+    drawn = [*rooms, *([] if sketch.walls is None else [sketch.walls])]
+    parts = polygons_from_geometry(shapely.union_all(shapely.buffer(drawn, reach_m)))
+    areas = [sum(room.area for room in rooms if part.intersects(room)) for part in parts]
+    least_m2 = max(_SHARE * max(areas, default=0.0), _MIN_M2)
+    main = [part for part, area in zip(parts, areas, strict=True) if area >= least_m2]
+    if len(main) < 2:
+        return [shapely.union_all(rooms)]
+    storeys = map(shapely.union_all, _by_nearest(rooms, rooms, main))
+    return sorted(storeys, key=lambda storey: -storey.area)
+
+
+def _parts(
+    sketch: Sketch, no_room: Sequence[shapely.Polygon], storeys: Sequence[BaseGeometry]
+) -> list[tuple[Sketch, list[shapely.Polygon]]]:
+    """Return each storey's part of a sketch, and of the areas that became no room."""
+    rooms = _by_nearest(sketch.rooms, [room.shape for room in sketch.rooms], storeys)
+    openings = _by_nearest(sketch.openings, [opening.line for opening in sketch.openings], storeys)
+    fixtures = _by_nearest(sketch.fixtures, [fixture.shape for fixture in sketch.fixtures], storeys)
+    lost = _by_nearest(no_room, no_room, storeys)
+    return [
+        (replace(sketch, rooms=rooms[index], openings=openings[index], fixtures=fixtures[index]), lost[index])
+        for index in range(len(storeys))
+    ]
+
+
+def _by_nearest(items: Sequence[T], shapes: Sequence[BaseGeometry], storeys: Sequence[BaseGeometry]) -> list[list[T]]:
+    """Return the items whose shape is nearest to each storey."""
+    found: list[list[T]] = [[] for _ in storeys]
+    tree = shapely.STRtree(storeys)
+    for item, shape in zip(items, shapes, strict=True):
+        found[int(tree.nearest(shape))].append(item)
+    return found
+
+
+def _levels(storeys: Sequence[BaseGeometry], letterings: Sequence[Lettering]) -> list[Level]:
+    """Return the level of each storey by the title that is nearest to it; others are numbered as they are drawn."""
+    # Inside of a room it is the room's name.
+    rooms = shapely.union_all(storeys)
+    written = [(title_of(text.text), shapely.Point(text.position)) for text in letterings]
+    titles = [(title, place) for title, place in written if title is not None and not rooms.covers(place)]
+    near = sorted(
+        (storey.distance(place), index, number)
+        for index, storey in enumerate(storeys)
+        for number, (_, place) in enumerate(titles)
+    )
+    level_of: dict[int, Level] = {}
+    taken = set[int]()
+    for distance_m, index, number in near:
+        x0, y0, x1, y1 = storeys[index].bounds
+        if index not in level_of and number not in taken and distance_m <= max(x1 - x0, y1 - y0):
+            level_of[index] = titles[number][0]
+            taken.add(number)
+    # From the top to the bottom, and from the left to the right.
+    drawn = sorted(range(len(storeys)), key=lambda index: _reading_order(storeys[index]))
+    named = [level_of.get(index, Level(f"Storey {drawn.index(index) + 1}")) for index in range(len(storeys))]
+    counts = [sum(level.name == other.name for other in named[:index]) for index, level in enumerate(named)]
+    return [
+        replace(level, name=f"{level.name} ({count + 1})") if count else level
+        for level, count in zip(named, counts, strict=True)
+    ]
+
+
+def title_of(text: str) -> Level | None:
+    """Return the level that a text is the title of, such as "FIRST FLOOR", "2. Obergeschoss" or "Level 2"."""
+    words = ["".join(split_words(word)) if word.isalpha() else word.casefold() for word in _WORDS.findall(text)]
+    known = [float(_NUMBERS[word]) for word in words if word in _NUMBERS]
+    digits = [float(word) for word in words if word.isdecimal() and len(word) == 1]
+    is_title = len(known) + len(digits) + sum(word in _BESIDE for word in words) >= len(words)
+    if not is_title or not (known or (digits and len(words) > 1)) or len(digits) > 1:
+        return None
+    number = known[0] if known else 0.0
+    # "1. UG" is the storey -1.
+    number = math.copysign(digits[0], number) if digits and (number or not known) else number
+    return Level(" ".join(text.split()), number)
+
+
+def _reading_order(storey: BaseGeometry) -> tuple[float, float]:
+    x0, y0, x1, y1 = storey.bounds
+    # Storeys whose middles differ by less than their height are in one row.
+    return -round(0.5 * (y0 + y1) / max(y1 - y0, 1.0)), 0.5 * (x0 + x1)
+
+
+def _in_words(storeys: Sequence[BaseGeometry], in_file: Callable[[Box], Box], levels: Sequence[Level] = ()) -> str:
+    """Return the number of storeys, and the area and `crop` of each."""
+    names: Mapping[int, str] = {index: f"'{level.name}' of " for index, level in enumerate(levels)}
+    listed = "; ".join(
+        f"{names.get(index, '')}{storey.area:.0f} m² at "
+        f"crop={','.join(f'{number:.0f}' for number in in_file(storey.buffer(_MARGIN_M).bounds))}"
+        for index, storey in enumerate(storeys[:_MAX_NAMED])
+    )
+    return f"{len(storeys)} storeys seem to be drawn side by side, {listed}"
