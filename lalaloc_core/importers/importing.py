@@ -148,7 +148,7 @@ _FORMATS = (
     _format("svg", "SVG", "image/svg+xml", "svg", f"units scale layers y_axis crop {_SCALE}", magic=_xml("svg")),
     _format("ifc", "IFC", "application/x-step", "ifc", "level", magic=re.compile(_START + rb"ISO-10303-21"),
             extra="ifc"),
-    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop plan level {_SCALE}",
+    _format("picture", "PNG and JPEG", "image/png", "png", f"scale crop level plan {_SCALE}",
             magic=re.compile(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff")),
     _format("pdf", "PDF", "application/pdf", "pdf", f"scale page crop level {_SCALE}",
             magic=re.compile(rb".{0,1019}%PDF-", re.DOTALL)),

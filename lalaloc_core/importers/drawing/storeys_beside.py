@@ -48,7 +48,7 @@ def assemble_storeys(
     storeys = storeys_beside(sketch)
     if len(storeys) < 2:
         if options.level is not None:
-            builder.warnings.append("the option 'level' was ignored: a single storey was found; use crop to read a part")
+            builder.warnings.append("the option 'level' was ignored: one storey was found; set crop to read a part")
         return (assemble(sketch, builder, options, budget.limits.plan),)
     levels = _levels(storeys, letterings)
     builder.levels = tuple(level.name for level in levels)
