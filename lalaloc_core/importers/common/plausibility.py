@@ -30,7 +30,7 @@ USUAL_CEILING_M = (1.9, 6.0)
 _USUAL_DOOR_M = (0.5, 3.0)
 _USUAL_ROOM_M2 = (0.64, 1600.0)
 # Largest distance of two rooms that share a wall, reach of an opening to either side, and shortest outer wall (m).
-_WALL_M, _REACH_M, _OUTER_M = 0.6, 0.45, 1.5
+_WALL_M, _REACH_M, _OUTER_M = 0.6, 0.65, 1.5
 # Usual door leaves, sides of rooms and buildings in drawings without a unit (m).
 _USUAL_LEAF_M, _USUAL_SIDE_M, _USUAL_EXTENT_M = (0.55, 1.3), (1.0, 40.0), (4.0, 120.0)
 _IMPERIAL = 0.7
@@ -169,12 +169,8 @@ def _unreachable_rooms(
     entries = [shapely.LineString(opening["line"]) for opening in openings if opening["kind"] in ("door", "passage")]
     if not entries:
         return []
-    tree = shapely.STRtree(entries)
-    unreachable = [
-        name
-        for name, room in zip(names, rooms, strict=True)
-        if len(tree.query(room.exterior, predicate="dwithin", distance=_REACH_M)) == 0
-    ]
+    reached = set(_reached(rooms, entries))
+    unreachable = [name for index, name in enumerate(names) if index not in reached]
     return [f"no door or passage reaches {_list_names(unreachable)}"] if unreachable else []
 
 
@@ -203,11 +199,11 @@ def estimate_trust(
     lines = {kind: _lines(document, kind) for kind in OPENING_CLASSES[1:]}
     chosen = np.unique(np.linspace(0, len(shapes) - 1, min(len(shapes), _MAX_ROOMS)).round().astype(int)).tolist()
     entered = [shapes[index] for index in chosen if shapes[index].area >= _MIN_ENTERED_M2]
-    reached = _count_reached(entered, lines["door"] + lines["passage"])
+    reached = len(_reached(entered, lines["door"] + lines["passage"]))
     entries = _share_drawn(reached, len(entered), (_HAS_ENTRY, _ENTRIES), recall)
     by_entries = f"{reached} of {len(entered)} rooms are reached by a door or passage"
     lit = _lit_rooms(document, shapes, chosen)
-    with_window = _count_reached(lit, lines["window"])
+    with_window = len(_reached(lit, lines["window"]))
     windows = _share_drawn(with_window, len(lit), (_HAS_WINDOW, _WINDOWS), recall)
     has_doors, has_passages = bool(lines["door"]), bool(lines["passage"])
     passages, by_passages = entries, by_entries
@@ -248,12 +244,16 @@ def _lines(document: Mapping[str, Any], kind: str) -> list[shapely.LineString]:
     return [shapely.LineString(opening["line"]) for opening in document.get("openings", ()) if opening["kind"] == kind]
 
 
-def _count_reached(rooms: Sequence[shapely.Polygon], lines: Sequence[shapely.LineString]) -> int:
+def _reached(rooms: Sequence[shapely.Polygon], lines: Sequence[shapely.LineString]) -> list[int]:
+    """Return the numbers of the rooms that openings lead to, straight across their middle; not those beside them."""
     if not rooms or not lines:
-        return 0
-    tree = shapely.STRtree(lines)
-    room, _ = tree.query([room.exterior for room in rooms], predicate="dwithin", distance=_REACH_M)
-    return len(np.unique(room))
+        return []
+    start, end = (np.array([line.coords[side] for line in lines]) for side in (0, -1))
+    along = (end - start) / np.maximum(np.linalg.norm(end - start, axis=1, keepdims=True), 1e-9)
+    middle, across = 0.5 * (start + end), _REACH_M * along[:, ::-1] * (-1.0, 1.0)
+    ways = shapely.linestrings(np.stack([middle - across, middle + across], axis=1))
+    room, _ = shapely.STRtree(ways).query(rooms, predicate="intersects")
+    return np.unique(room).tolist()
 
 
 def _lit_rooms(
