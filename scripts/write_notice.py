@@ -3,7 +3,7 @@
     make notice
 
 The licence is that of a package's metadata; a package that is not installed here keeps the line that NOTICE has of this
-version, so install the extra `heic` before its version changes.
+version.
 """
 
 from __future__ import annotations

@@ -60,8 +60,7 @@ def test_lock_has_the_versions_of_the_constraints(lock: str) -> None:
 
 def test_locks_of_image_and_serving_are_parts_of_the_environment() -> None:
     everything, serving, image = (_locked(lock) for lock in LOCKS)
-    assert image.keys() - everything.keys() == {"pillow-heif"}
-    assert serving.keys() <= everything.keys()
+    assert (serving.keys() | image.keys()) <= everything.keys()
     # What installs the packages, and builds this one; none of what only training and tests need.
     assert {"setuptools", "uv"} <= serving.keys()
     assert not serving.keys() & {"sympy", "matplotlib", "onnx", "pytest", "ray", "sphinx", "ifcopenshell"}

@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 
 import numpy as np
 from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
@@ -186,10 +185,8 @@ def _formats(content: bytes) -> tuple[str, ...]:
     """Return the formats to try; the package that reads HEIC is loaded for such files only."""
     if describe_file(content) != HEIC:
         return FORMATS
-    try:
-        from pillow_heif import register_heif_opener  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return FORMATS
+    from pi_heif import register_heif_opener
+
     register_heif_opener(thumbnails=False, depth_images=False, aux_images=False)
     return ("HEIF",)
 
@@ -314,9 +311,7 @@ def _unreadable(content: bytes) -> str:
     if kind in STAND_INS:
         return f"the photograph is {kind}; {STAND_INS[kind]}"
     if kind == HEIC:
-        missing = find_spec("pillow_heif") is None
-        fault = "which needs the extra `heic` on the server" if missing else "which is damaged"
-        return f"the photograph is {kind}, {fault}; save or export it as {_SUPPORTED}"
+        return f"the photograph is {kind}, which is damaged; save or export it as {_SUPPORTED}"
     if kind is None or kind.removeprefix("a ").removesuffix(" picture").upper() in FORMATS:
         return f"the photograph is not a readable {_SUPPORTED} picture"
     return f"the photograph is {kind}, which is not supported; save or export it as {_SUPPORTED}"

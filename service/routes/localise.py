@@ -51,9 +51,9 @@ _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-
 
 
 _PHOTO_SCHEMA = BINARY | {
-    "description": "Photograph as JPEG, PNG, WebP or, with the extra `heic`, HEIC: a 360° sphere, twice as wide as "
-    "high, or a part of it with photo sphere metadata (GPano in XMP), or, for models with an encoder of views, an "
-    "ordinary or fisheye photograph, or a strip of a phone's panorama mode. Its EXIF metadata state the field of view."
+    "description": "Photograph as JPEG, PNG, WebP or HEIC: a 360° sphere, twice as wide as high, or a part of it with "
+    "photo sphere metadata (GPano in XMP), or, for models with an encoder of views, an ordinary or fisheye photograph, "
+    "or a strip of a phone's panorama mode. Its EXIF metadata state the field of view."
 }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from pathlib import Path
@@ -11,9 +10,10 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
+from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload
 
@@ -113,12 +113,7 @@ def test_files_of_phones_are_read(client: httpx.Client, flat: str) -> None:
 
 
 def test_heic_is_read(client: httpx.Client, flat: str) -> None:
-    heif = pytest.importorskip("pillow_heif")
-    buffer = io.BytesIO()
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update(PHONE)
-    heif.from_pillow(Image.fromarray(shown())).save(buffer, exif=exif.tobytes())
-    view = ask(client, flat, buffer.getvalue()).json()["view"]
+    view = ask(client, flat, (FOLDER / "phone.heic").read_bytes()).json()["view"]
     assert view["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
 
 
