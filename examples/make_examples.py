@@ -1,4 +1,4 @@
-"""Render the example spheres and a phone photograph, write the spheres' true poses, and draw pictures for docs/.
+"""Render the example spheres and photographs of a phone, write the spheres' true poses, and draw pictures for docs/.
 
 Run `python -m examples.make_examples` after a change of the flat, the views or the renderer. The flat was drawn by
 hand, and no training data contains its plan, furniture or lighting. The pictures are those of
@@ -52,13 +52,14 @@ VIEWS = (
     View(file="study.jpg", position_m=(7.7, 7.6), heading_deg=340.0, camera_height_m=1.4, seed=43),
 )
 
-# A photograph by a phone's 0.5x lens, which its EXIF data name, held by hand.
+# Photographs by a phone's 0.5x lens, which their EXIF data name, held by hand: one, and the azimuths of a turn's.
 PHONE = View(file="phone.jpg", position_m=(2.9, 1.5), heading_deg=335.0, camera_height_m=1.45, seed=15)
+TURN_DEG = {"turn_1.jpg": 0.0, "turn_2.jpg": 50.0, "turn_3.jpg": 100.0, "turn_4.jpg": 150.0}
 _PHONE_FOCAL_MM = 13
 # Focal lengths of other formats are stated for equal diagonals: 4:3 is 34.6 mm wide where film is 36 by 24.
 _PHONE_HFOV = 2.0 * math.atan(0.5 * 0.8 * math.hypot(36.0, 24.0) / _PHONE_FOCAL_MM)
 _PHONE_PITCH, _PHONE_ROLL = math.radians(-4.0), math.radians(1.5)
-_PHONE_SPHERE, _PHONE_SIZE = (1536, 3072), (1280, 960)
+_PHONE_SPHERE, _PHONE_SIZE, _TURN_SIZE, _TURN_QUALITY = (1536, 3072), (1280, 960), (640, 480), 75
 _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
 # Pictures for docs/: rotation of a tilted camera, and the part of a sphere in a phone's panorama mode.
@@ -78,19 +79,21 @@ def main() -> None:
         Image.fromarray(pixels).save(FOLDER / view.file, quality=_JPEG_QUALITY, optimize=True)
         print(FOLDER / view.file)
     write_poses([true_pose(home.plan, view) for view in VIEWS])
-    _write_phone_photograph(home, materials)
+    _write_phone_photographs(home, materials)
     _write_pictures()
 
 
-def _write_phone_photograph(home: Home, materials: MaterialLibrary) -> None:
+def _write_phone_photographs(home: Home, materials: MaterialLibrary) -> None:
     height, width = _PHONE_SPHERE
     (sphere,) = SphereRenderer(materials, height=height, width=width).render([shot_of(home, PHONE)]).numpy()
-    camera = Perspective.of_hfov(*_PHONE_SIZE, _PHONE_HFOV)
-    pixels = cut_view(sphere, camera, azimuth=0.0, pitch=_PHONE_PITCH, roll=_PHONE_ROLL)
     exif = Image.Exif()
     exif.get_ifd(_EXIF_IFD)[_FOCAL_LENGTH_35MM] = _PHONE_FOCAL_MM
-    Image.fromarray(pixels).save(FOLDER / PHONE.file, quality=_JPEG_QUALITY, optimize=True, exif=exif)
-    print(FOLDER / PHONE.file)
+    for name, turn_deg in {PHONE.file: 0.0, **TURN_DEG}.items():
+        size, quality = (_TURN_SIZE, _TURN_QUALITY) if name in TURN_DEG else (_PHONE_SIZE, _JPEG_QUALITY)
+        camera = Perspective.of_hfov(*size, _PHONE_HFOV)
+        pixels = cut_view(sphere, camera, azimuth=math.radians(turn_deg), pitch=_PHONE_PITCH, roll=_PHONE_ROLL)
+        Image.fromarray(pixels).save(FOLDER / name, quality=quality, optimize=True, exif=exif)
+        print(FOLDER / name)
 
 
 def _write_pictures() -> None:

@@ -12,6 +12,10 @@ const root = dirname(here);
 const out = join(root, "service", "web");
 const examples = [
   "flat.json",
+  "turn_1.jpg",
+  "turn_2.jpg",
+  "turn_3.jpg",
+  "turn_4.jpg",
   "living_room.jpg",
   "kitchen.jpg",
   "bedroom.jpg",

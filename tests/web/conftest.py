@@ -49,9 +49,17 @@ class Visit:
         return self.page
 
     def open_example(self) -> Page:
-        """Load the start page with the example's photographs."""
-        page = self.open()
+        """Load the start page and choose the example's spheres."""
+        self.open()
+        return self.choose_spheres()
+
+    def choose_spheres(self) -> Page:
+        """Choose the example's spheres instead of the turn with which the page begins."""
+        page = self.page
         expect(page.locator("#photo-strip li")).to_have_count(4)
+        page.get_by_text("Plans", exact=True).click()
+        page.locator("#example-spheres").click()
+        expect(page.locator("#photo-strip")).to_contain_text("kitchen.jpg")
         # The viewer sets its shape after loading the photograph.
         expect(page.locator(".stage")).to_have_attribute("data-shape", re.compile("around|whole"))
         return page

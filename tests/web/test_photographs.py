@@ -142,11 +142,17 @@ def _phone_photographs(folder: Path, headings_deg: list[float]) -> list[Path]:
 
 @pytest.mark.slow
 def test_photographs_of_one_spot_are_one_query(desktop: Visit, tmp_path: Path) -> None:
-    page = desktop.open_example()
+    page = desktop.open()
+    # The page begins with a turn of a phone.
+    with page.expect_response("**/localise/sequence") as received:
+        desktop.find()
+    assert len(received.value.json()["poses"]) == 4
+    expect(page.locator(".stage")).to_have_attribute("data-shape", "flat")
     page.locator("#photo-file").set_input_files(_phone_photographs(tmp_path, [0.0, 60.0, 120.0]))
     # Photographs of the example give way to the user's own.
     expect(page.locator("#photo-strip li")).to_have_count(3)
     together = page.get_by_role("group", name="These photographs are")
+    expect(together.get_by_label("Each by itself")).to_be_checked()
     together.get_by_label("Taken from one spot, turning").check()
     expect(page.get_by_role("button", name="Find all")).to_be_hidden()
     with page.expect_response("**/localise/sequence") as received:

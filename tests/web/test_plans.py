@@ -308,7 +308,7 @@ def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of:
             page.locator("#key-field").fill(secret)
             page.keyboard.press("Enter")
             expect(dialog).to_be_hidden()
-            expect(page.locator("#photo-strip li")).to_have_count(4)
+            visited.choose_spheres()
             visited.find()
             page.reload()
             expect(page.locator("#photo-strip li")).to_have_count(4)

@@ -5,7 +5,7 @@ import { linkedAnswer } from "./answer_link";
 import { api } from "./api";
 import { byId, named } from "./dom";
 import { Editor } from "./editor/editor";
-import { exampleFiles, examplePlan, FLAT } from "./example";
+import { exampleFiles, examplePlan, TURN } from "./example";
 import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
 import { LookAround } from "./look/look_around";
@@ -49,7 +49,10 @@ class Page {
     listed: (plans) => this.venues.offer(plans),
     imported: (venue) => void this.venues.take(venue),
     searched: (name) => void this.venues.load(name),
-    example: (plan, photos) => this.onExamplePicked(plan, photos),
+    example: (plan, photos, isTurn) => {
+      if (plan !== null) this.onExample(plan);
+      this.answers.photos.addExample(photos, isTurn);
+    },
   });
   private readonly answers = new AnswerController(this.scene, {
     place: (signal) => this.place(signal),
@@ -84,15 +87,15 @@ class Page {
     await answers.start();
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;
-    const example = await examplePlan(FLAT);
+    const example = await examplePlan(TURN);
     // The user may have chosen a plan while the example was loading.
     if (this.hasStarted) return;
     const known = stored.find((plan) => plan.name === example.name);
     if (known !== undefined || stored.length === 0) {
       if (known === undefined) this.onExample(example);
       else await this.plans.choose(known.id);
-      const files = await exampleFiles(FLAT);
-      if (!this.hasStarted && answers.photos.list.length === 0) answers.photos.add(files, true);
+      const files = await exampleFiles(TURN);
+      if (!this.hasStarted && answers.photos.list.length === 0) answers.photos.addExample(files, true);
     } else await this.plans.choose(stored[0]!.id);
   }
 
@@ -136,14 +139,6 @@ class Page {
     showCaption(null, example);
     this.answers.offerHints();
     this.draw();
-  }
-
-  private onExamplePicked(plan: PlanDocument | null, files: File[]): void {
-    const { photos } = this.answers;
-    if (plan !== null) this.onExample(plan);
-    const shown = photos.list.find(({ file }) => file.name === files[0]?.name);
-    if (shown === undefined) photos.add(files, true);
-    else photos.choose(shown);
   }
 
   private onVenue(venue: ChosenVenue | null): void {

@@ -1,13 +1,20 @@
-/** Example plans with photographs: a rendered flat, shown on the first visit, and photographed rooms. */
+/** Example plans with photographs: a rendered flat, at first by a turn of a phone, and photographed rooms. */
 
 import type { PlanDocument } from "./types";
 
 export interface Example {
   plan: string;
   photos: readonly string[];
+  /** The photographs were taken from one spot, turning. */
+  isTurn?: boolean;
 }
 
-export const FLAT: Example = {
+export const TURN: Example = {
+  plan: "flat.json",
+  photos: ["turn_1.jpg", "turn_2.jpg", "turn_3.jpg", "turn_4.jpg"],
+  isTurn: true,
+};
+export const SPHERES: Example = {
   plan: "flat.json",
   photos: ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"],
 };

@@ -75,7 +75,7 @@ export class Photos {
     return !this.choice.hidden && this.isTurn.checked ? this.all : null;
   }
 
-  /** Add pictures and choose the first of them; those of examples give way to the user's own. */
+  /** Add pictures and choose the first of them; those of an example give way to others. */
   add(files: File[], isExample = false, directions: readonly number[] | null = null): void {
     const rejected = files.filter((file) => !isPicture(file));
     clearErrors();
@@ -91,8 +91,13 @@ export class Photos {
         direction: directions?.[index] ?? null,
         asked: { fields: {}, files: [file], onDevice: false },
       }));
+    const examples = this.all.filter((photo) => photo.isExample);
     if (added.length > 0) this.forgetGroup();
-    if (added.length > 0 && !isExample) this.discard(this.all.filter((photo) => photo.isExample));
+    if (added.length > 0 && examples.length > 0) {
+      this.discard(examples);
+      // They may have been a turn, to which others do not belong.
+      this.setTurn(false);
+    }
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
     if (rejected.length === 0) return;
@@ -104,8 +109,22 @@ export class Photos {
   takeTurn(frames: File[], directions: readonly number[] | null): void {
     this.discard(this.all);
     this.add(frames, false, directions);
-    this.isTurn.checked = true;
+    this.setTurn(true);
     this.onMotion();
+  }
+
+  /** Add the photographs of an example, unless they are there; they are no turn together with the user's own. */
+  addExample(files: File[], isTurn: boolean): void {
+    const shown = this.all.find(({ file }) => file.name === files[0]?.name);
+    if (shown !== undefined) return this.choose(shown);
+    this.add(files, true);
+    if (!isTurn || !this.all.every(({ isExample }) => isExample)) return;
+    this.setTurn(true);
+    this.onMotion();
+  }
+
+  private setTurn(isTurn: boolean): void {
+    this.choice.querySelector<HTMLInputElement>(`input[value="${isTurn ? "turn" : ""}"]`)!.checked = true;
   }
 
   private discard(photos: readonly Photo[]): void {

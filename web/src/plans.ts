@@ -5,7 +5,7 @@ import { api, ServiceError } from "./api";
 import { button, byId, confirmed, h, planButton, show } from "./dom";
 import { acceptChoice, acceptDrops } from "./drops";
 import { eventsOf } from "./events";
-import { type Example, exampleFiles, examplePlan, FLAT, ROOMS } from "./example";
+import { type Example, exampleFiles, examplePlan, ROOMS, SPHERES, TURN } from "./example";
 import { checkPixels, hasOptions, ImportForm } from "./import_form";
 import { attempt, clearError, say, showError } from "./notices";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
@@ -37,7 +37,7 @@ export interface PlanActions {
   /** All levels of a file were stored as a venue. */
   imported: (venue: { id: string }) => void;
   /** The user picked an example; the plan is null if it is stored already. */
-  example: (plan: PlanDocument | null, photos: File[]) => void;
+  example: (plan: PlanDocument | null, photos: File[], isTurn: boolean) => void;
   /** The user searches for a name. */
   searched: (name: string) => void;
 }
@@ -72,7 +72,8 @@ export class Plans {
       }, SEARCH_AFTER_MS);
     });
     this.connectMenu();
-    byId("example-flat").addEventListener("click", () => (this.pending = this.pickExample(FLAT)));
+    byId("example-turn").addEventListener("click", () => (this.pending = this.pickExample(TURN)));
+    byId("example-spheres").addEventListener("click", () => (this.pending = this.pickExample(SPHERES)));
     byId("example-rooms").addEventListener("click", () => (this.pending = this.pickExample(ROOMS)));
     acceptChoice(byId("plan-file"), ([file]) => void this.begin(file!));
     acceptDrops(byId("plan-panel"), ([file]) => {
@@ -144,7 +145,7 @@ export class Plans {
     const known = stored.find(({ name }) => name === plan.name);
     if (known === undefined) this.take(null);
     else await this.open(known.id);
-    this.actions.example(known === undefined ? plan : null, photos);
+    this.actions.example(known === undefined ? plan : null, photos, example.isTurn === true);
   }
 
   /** Ignore the results of earlier requests to show a plan. */
