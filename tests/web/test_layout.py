@@ -20,11 +20,12 @@ HEIGHT_M = 1.37
 
 @pytest.fixture(scope="module")
 def flat() -> FloorPlan:
-    """Return the example flat with a column and a stub of wall in its largest room."""
+    """Return the example flat with a column and a stub of wall in its largest room, and a door of unknown height."""
     plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_bytes()).to_dict()
     plan["name"] = "Flat with a column"
     plan["rooms"][0]["holes"] = [[[2.5, 1.0], [3.0, 1.0], [3.0, 1.4], [2.5, 1.4]]]
     plan["rooms"][0]["walls"] = [[[1.2, 3.0], [1.9, 3.6]]]
+    plan["openings"][0] |= {"sill_m": None, "head_m": None}
     return FloorPlan.from_dict(plan)
 
 
@@ -79,7 +80,7 @@ def test_view_agrees_with_the_renderer(
 def test_lines_follow_floor_and_ceiling(
     desktop: Visit, flat: FloorPlan, poses: list[tuple[int, float, float, float]]
 ) -> None:
-    drawn = _in_browser(desktop, flat, poses, "layoutLines", "x, y, rooms[room], height")
+    drawn, heights_m = _in_browser(desktop, flat, poses, "layoutLines", "x, y, rooms[room], height"), set[float]()
     for (index, x, y, _), lines in zip(poses, drawn, strict=True):
         room = flat.rooms[index]
         along = [
@@ -93,3 +94,9 @@ def test_lines_follow_floor_and_ceiling(
         # The lines of floor and ceiling go around once.
         spans = [line[-1][0] - line[0][0] for line in along]
         assert sum(spans) == pytest.approx(2 * 2 * math.pi, abs=1e-6)
+        door = np.array([point for line in lines if line["kind"] == "door" for point in line["points"]]).reshape(-1, 2)
+        away_m = cast_rays(np.array([[x, y]]), door[None, :, 0], room.walls_m[None])[0]
+        heights_m |= set(np.round(HEIGHT_M + np.tan(door[:, 1]) * away_m, 3).tolist())
+    # Doors end at their height, or at the usual one.
+    assert {2.02, 2.05} <= heights_m
+    assert not heights_m & {2.4, 2.6}

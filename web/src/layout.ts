@@ -12,6 +12,9 @@ const COLUMNS = 720;
 const HALVINGS = 24;
 const STEP = Math.PI / 180;
 
+// As in lalaloc_core/floorplan/openings.py: sills and heads (m) of openings whose heights the plan does not give.
+export const USUAL_HEIGHTS_M: Record<OpeningKind, Point> = { door: [0, 2.05], window: [0.9, 2.1], passage: [0, 2.2] };
+
 export const radians = (degrees: number): number => (degrees * Math.PI) / 180;
 export const degrees = (angle: number): number => (angle * 180) / Math.PI;
 
@@ -126,8 +129,10 @@ function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, came
       const from = Math.max(sides[0], piece.from),
         to = Math.min(sides[1], piece.to);
       if (from >= to) return [];
-      const sill = opening.sill_m ?? 0,
-        head = Math.min(opening.head_m ?? Infinity, room.ceiling_height_m);
+      const [usualSill, usualHead] = USUAL_HEIGHTS_M[opening.kind];
+      const sill = opening.sill_m ?? usualSill,
+        head = Math.min(opening.head_m ?? usualHead, room.ceiling_height_m);
+      if (sill >= head) return [];
       const elevations = (azimuth: number): Point => {
         const distance = toWall(x, y, azimuth, wall);
         return [Math.atan2(sill - cameraHeight, distance), Math.atan2(head - cameraHeight, distance)];

@@ -1,5 +1,6 @@
 /** Changes of a plan: each returns a new plan; coordinates in metres, rounded to millimetres. */
 
+import { USUAL_HEIGHTS_M } from "../layout";
 import { distanceTo } from "../plan_drawing";
 import type { OpeningDocument, OpeningKind, PlanDocument, Point, RoomDocument } from "../types";
 
@@ -7,11 +8,6 @@ import type { OpeningDocument, OpeningKind, PlanDocument, Point, RoomDocument } 
 export const NEAR_WALL_M = 0.35;
 const MIN_WIDTH_M = 0.2;
 export const DEFAULT_WIDTHS_M: Record<OpeningKind, number> = { door: 0.9, window: 1.2, passage: 1 };
-const DEFAULT_HEIGHTS: Record<OpeningKind, { sill_m: number; head_m: number }> = {
-  door: { sill_m: 0, head_m: 2 },
-  window: { sill_m: 0.9, head_m: 2.1 },
-  passage: { sill_m: 0, head_m: 2.1 },
-};
 
 export const rounded = ([x, y]: Point): Point => [Math.round(x * 1000) / 1000, Math.round(y * 1000) / 1000];
 const plus = (a: Point, b: Point): Point => rounded([a[0] + b[0], a[1] + b[1]]);
@@ -154,7 +150,8 @@ export function addOpening(plan: PlanDocument, kind: OpeningKind, wall: WallRef,
     rounded(along.point(middle - 0.5 * width, 0)),
     rounded(along.point(middle + 0.5 * width, 0)),
   ];
-  const opening: OpeningDocument = { kind, line, ...DEFAULT_HEIGHTS[kind] };
+  const [sill_m, head_m] = USUAL_HEIGHTS_M[kind];
+  const opening: OpeningDocument = { kind, line, sill_m, head_m };
   const next = { ...plan, openings: [...(plan.openings ?? []), opening] };
   // The first opening of a kind makes the kind complete, unless the plan lists no complete kinds.
   const isFirst = !(plan.openings ?? []).some((opening) => opening.kind === kind);
