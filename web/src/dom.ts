@@ -51,6 +51,13 @@ export function show(element: Element, ...children: Child[]): void {
   element.replaceChildren(...present(children));
 }
 
+/** Replace the children of an element; the focus goes from one of them to the new one with its id. */
+export function showKeepingFocus(element: Element, ...children: Child[]): void {
+  const focused = element.contains(document.activeElement) ? document.activeElement!.id : "";
+  show(element, ...children);
+  if (focused !== "") document.getElementById(focused)?.focus({ preventScroll: true });
+}
+
 /** Unit vectors of the arrow keys, with y up. */
 export const ARROWS: Record<string, [number, number]> = {
   ArrowLeft: [-1, 0],

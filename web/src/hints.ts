@@ -1,6 +1,6 @@
 /** Hints of the place of a photograph: a circle on the plan, rooms and, in a venue, a level. */
 
-import { ARROWS, byId, followPointer, h, s, show } from "./dom";
+import { ARROWS, byId, followPointer, h, s, show, showKeepingFocus } from "./dom";
 import { type Anchor, anchorOf, toEarth, toPlan } from "./earth";
 import { say } from "./notices";
 import { type Box, unitOf } from "./plan_drawing";
@@ -128,19 +128,18 @@ export class HintForm {
     this.box = box;
     const { radius } = this.hints;
     const near = this.place;
-    const isFocused = this.element.contains(document.activeElement);
-    show(
+    showKeepingFocus(
       this.element,
       near !== null && s("circle", { class: "reach", cx: near[0], cy: -near[1], r: Math.max(radius || 0, 0) }),
       near !== null && this.grip(near),
     );
-    if (isFocused) this.element.querySelector<SVGElement>(".grip")?.focus();
   }
 
   private grip([x, y]: Point): SVGElement {
     const size = unitOf(this.box);
     return s("circle", {
       class: "grip",
+      id: "hint-grip",
       cx: x,
       cy: -y,
       r: 1.2 * size,

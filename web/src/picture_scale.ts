@@ -1,6 +1,6 @@
 /** Scale of a picture: two points and the distance between them. */
 
-import { ARROWS, followPointer, h, s, show } from "./dom";
+import { ARROWS, followPointer, h, s, show, showKeepingFocus } from "./dom";
 import { ends, unitOf } from "./plan_drawing";
 import { clearError, showFieldError } from "./notices";
 import { loadPicture } from "./pictures";
@@ -116,14 +116,12 @@ export class PictureScale {
   private draw(): void {
     if (this.url === null) return;
     const size = unitOf(this.viewport.current);
-    const focused = [...this.overlay.children].indexOf(document.activeElement as Element);
-    show(
+    showKeepingFocus(
       this.overlay,
       this.frame !== null && this.frameBox(this.frame),
       s("line", ends(this.ends)),
       ...this.ends.map((end, index) => this.handle(end, index, size)),
     );
-    if (focused > 0) (this.overlay.children[focused] as SVGElement).focus();
   }
 
   private frameBox([[ax, ay], [bx, by]]: [Point, Point]): SVGElement {
@@ -137,6 +135,7 @@ export class PictureScale {
       cy: -y,
       r: 1.3 * size,
       class: "corner",
+      id: `picture-end-${index}`,
       tabindex: 0,
       role: "button",
       "aria-label": `${index === 0 ? "First" : "Second"} end of the line, at pixel ${x.toFixed(0)}, ${(-y).toFixed(0)}; arrow keys move it`,
