@@ -10,8 +10,9 @@ const TIMEOUT_MS = 960_000;
 
 /** Yield the events of a plan until it is in a final state or `signal` aborts. */
 export async function* eventsOf(id: string, signal: AbortSignal): AsyncGenerator<PlanEvent> {
+  const path = `/floorplans/${encodeURIComponent(id)}/events`;
   while (!signal.aborted) {
-    const response = await api.request(`/floorplans/${encodeURIComponent(id)}/events`, { signal, timeoutMs: TIMEOUT_MS });
+    const response = await api.request(path, { signal, timeoutMs: TIMEOUT_MS });
     try {
       for await (const line of linesOf(response)) {
         if (!line.startsWith("data:")) continue;
