@@ -20,7 +20,7 @@ import type { ChosenVenue, Plan, PlanDocument } from "./types";
 import { Venues } from "./venues";
 
 // For tests.
-export { layoutLines, layoutView } from "./layout";
+export { layoutLines } from "./layout";
 export { cameraAttitude } from "./look/orientation";
 export { toEarth, toPlan } from "./earth";
 export { heatMap } from "./heat";

@@ -5,15 +5,9 @@ import type { PlanDocument } from "./types";
 export interface Example {
   plan: string;
   photos: readonly string[];
-  /** The photographs were taken from one spot, turning. */
-  isTurn?: boolean;
 }
 
-export const TURN: Example = {
-  plan: "flat.json",
-  photos: ["turn_1.jpg", "turn_2.jpg", "turn_3.jpg", "turn_4.jpg"],
-  isTurn: true,
-};
+export const TURN: Example = { plan: "flat.json", photos: ["turn_1.jpg", "turn_2.jpg", "turn_3.jpg", "turn_4.jpg"] };
 export const SPHERES: Example = {
   plan: "flat.json",
   photos: ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"],

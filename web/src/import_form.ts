@@ -20,7 +20,7 @@ const FIELDS: [string, string, string][] = [
 ];
 // The other fields do not apply to pictures.
 const OF_PICTURES = ["metres_per_pixel", "scale", "multiply", "crop", "level", "ceiling_height_m"];
-const PICTURES = /^image\/(png|jpeg)$/;
+export const PICTURES = /^image\/(png|jpeg)$/;
 
 // Endings of files that can be read, perhaps with other options.
 const PLAN_FILES = /\.(dxf|dwg|svg|pdf|ifc|ifczip|zip|json|geojson|osm|xml|gml|ya?ml|pgm|png|jpe?g)$/i;

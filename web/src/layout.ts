@@ -3,7 +3,7 @@
  * Angles are radians, azimuths clockwise from the plan's +y, elevations up from the horizon.
  */
 
-import type { OpeningKind, Point, Pose, RoomLayout } from "./types";
+import type { OpeningKind, Point, RoomLayout } from "./types";
 
 // As in lalaloc_core/render/profile.py: rounding can make a ray miss both walls at a corner.
 const CORNER_TOLERANCE = 1e-5;
@@ -18,17 +18,11 @@ export const USUAL_HEIGHTS_M: Record<OpeningKind, Point> = { door: [0, 2.05], wi
 export const radians = (degrees: number): number => (degrees * Math.PI) / 180;
 export const degrees = (angle: number): number => (angle * 180) / Math.PI;
 
-export interface Hit {
-  distance: number;
-  wall: number;
-  share: number;
-}
-
-/** Return the nearest wall along an azimuth; at infinity if there is none. */
-export function castRay(x: number, y: number, azimuth: number, walls: RoomLayout["walls_m"]): Hit {
+/** Return the index of the nearest wall along an azimuth; -1 if there is none. */
+function nearestWall(x: number, y: number, azimuth: number, walls: RoomLayout["walls_m"]): number {
   const dx = Math.sin(azimuth),
     dy = Math.cos(azimuth);
-  const nearest: Hit = { distance: Infinity, wall: -1, share: 0 };
+  let [nearest, found] = [Infinity, -1];
   walls.forEach(([x0, y0, x1, y1], wall) => {
     const sx = x0 - x,
       sy = y0 - y,
@@ -39,44 +33,19 @@ export function castRay(x: number, y: number, azimuth: number, walls: RoomLayout
     const distance = (sx * ey - sy * ex) / determinant;
     const share = (sx * dy - sy * dx) / determinant;
     const hit = distance > 0 && share >= -CORNER_TOLERANCE && share <= 1 + CORNER_TOLERANCE;
-    if (hit && distance < nearest.distance) Object.assign(nearest, { distance, wall, share });
+    if (hit && distance < nearest) [nearest, found] = [distance, wall];
   });
-  return nearest;
+  return found;
 }
 
-/** Return the azimuth of each column's centre, relative to the heading. */
-export function columnAzimuths(columns: number): number[] {
+/** Return the azimuths of the centres of columns, once around. */
+function columnAzimuths(columns: number): number[] {
   return Array.from({ length: columns }, (_, column) => ((column + 0.5) / columns - 0.5) * 2 * Math.PI);
 }
 
 /** Return the elevations at which a wall meets floor and ceiling. */
-export function wallElevations(distance: number, cameraHeight: number, ceilingHeight: number): Point {
+function wallElevations(distance: number, cameraHeight: number, ceilingHeight: number): Point {
   return [-Math.atan2(cameraHeight, distance), Math.atan2(ceilingHeight - cameraHeight, distance)];
-}
-
-export interface ColumnView {
-  distance_m: number;
-  kind: "wall" | OpeningKind;
-  floor: number;
-  ceiling: number;
-}
-
-/** Return the wall or opening that each column of a sphere shows at camera height. */
-export function layoutView(pose: Pose, room: RoomLayout, columns: number, cameraHeight: number): ColumnView[] {
-  const heading = radians(pose.heading_deg);
-  return columnAzimuths(columns).map((azimuth) => {
-    const hit = castRay(pose.x_m, pose.y_m, heading + azimuth, room.walls_m);
-    const met = room.openings.find(
-      (opening) =>
-        opening.wall === hit.wall &&
-        opening.start <= hit.share &&
-        hit.share <= opening.end &&
-        (opening.sill_m ?? -Infinity) < cameraHeight &&
-        cameraHeight < (opening.head_m ?? Infinity),
-    );
-    const [floor, ceiling] = wallElevations(hit.distance, cameraHeight, room.ceiling_height_m);
-    return { distance_m: hit.distance, kind: met?.kind ?? "wall", floor, ceiling };
-  });
 }
 
 /** Line of the layout as directions from the camera: azimuth and elevation of each point. */
@@ -156,7 +125,7 @@ function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, came
 
 /** Return the visible pieces of walls, clockwise, once around. */
 function visiblePieces(x: number, y: number, room: RoomLayout): Piece[] {
-  const wallAt = (azimuth: number): number => castRay(x, y, azimuth, room.walls_m).wall;
+  const wallAt = (azimuth: number): number => nearestWall(x, y, azimuth, room.walls_m);
   const azimuths = columnAzimuths(COLUMNS);
   const walls = azimuths.map(wallAt);
   const borders: { azimuth: number; wall: number }[] = [];

@@ -76,7 +76,7 @@ export class Photos {
   }
 
   /** Add pictures and choose the first of them; those of an example give way to others. */
-  add(files: File[], isExample = false, directions: readonly number[] | null = null): void {
+  add(files: File[], isExample = false, directions: readonly number[] | null = null, isTurn = false): void {
     const rejected = files.filter((file) => !isPicture(file));
     clearErrors();
     const added = files
@@ -91,15 +91,15 @@ export class Photos {
         direction: directions?.[index] ?? null,
         asked: { fields: {}, files: [file], onDevice: false },
       }));
-    const examples = this.all.filter((photo) => photo.isExample);
-    if (added.length > 0) this.forgetGroup();
-    if (added.length > 0 && examples.length > 0) {
+    if (added[0] !== undefined) {
+      this.forgetGroup();
+      const examples = this.all.filter((photo) => photo.isExample);
       this.discard(examples);
-      // They may have been a turn, to which others do not belong.
-      this.setTurn(false);
+      // Photographs of an example and the user's own are no turn together.
+      if (isTurn || examples.length > 0) this.setTurn(isTurn && this.all.length === 0);
+      this.all.push(...added);
+      this.choose(added[0]);
     }
-    this.all.push(...added);
-    if (added[0] !== undefined) this.choose(added[0]);
     if (rejected.length === 0) return;
     const names = rejected.map((file) => `“${file.name}”`).join(", ");
     showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
@@ -108,19 +108,14 @@ export class Photos {
   /** Take the frames of a guided turn instead of all photographs. */
   takeTurn(frames: File[], directions: readonly number[] | null): void {
     this.discard(this.all);
-    this.add(frames, false, directions);
-    this.setTurn(true);
-    this.onMotion();
+    this.add(frames, false, directions, true);
   }
 
-  /** Add the photographs of an example, unless they are there; they are no turn together with the user's own. */
+  /** Add the photographs of an example, unless they are there, and choose the first of them. */
   addExample(files: File[], isTurn: boolean): void {
     const shown = this.all.find(({ file }) => file.name === files[0]?.name);
-    if (shown !== undefined) return this.choose(shown);
-    this.add(files, true);
-    if (!isTurn || !this.all.every(({ isExample }) => isExample)) return;
-    this.setTurn(true);
-    this.onMotion();
+    if (shown === undefined) this.add(files, true, null, isTurn);
+    else this.choose(shown);
   }
 
   private setTurn(isTurn: boolean): void {

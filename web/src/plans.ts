@@ -6,7 +6,7 @@ import { button, byId, confirmed, h, planButton, show } from "./dom";
 import { acceptChoice, acceptDrops } from "./drops";
 import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, ROOMS, SPHERES, TURN } from "./example";
-import { checkPixels, hasOptions, ImportForm } from "./import_form";
+import { checkPixels, hasOptions, ImportForm, PICTURES } from "./import_form";
 import { attempt, clearError, say, showError } from "./notices";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
 
@@ -23,7 +23,6 @@ const showStep =
   };
 
 const SEARCH_AFTER_MS = 250;
-const PICTURES = /^image\/(png|jpeg)$/;
 
 export interface PlanActions {
   /** A plan is to be shown; called again when its progress changes. */
@@ -145,7 +144,7 @@ export class Plans {
     const known = stored.find(({ name }) => name === plan.name);
     if (known === undefined) this.take(null);
     else await this.open(known.id);
-    this.actions.example(known === undefined ? plan : null, photos, example.isTurn === true);
+    this.actions.example(known === undefined ? plan : null, photos, example === TURN);
   }
 
   /** Ignore the results of earlier requests to show a plan. */

@@ -25,7 +25,8 @@ export type SequenceAnswer = Schemas["SequenceAnswer"];
  */
 export type Answer = Omit<Schemas["LocaliseAnswer"], "floorplan_revision"> & {
   floorplan_revision?: string;
-  together?: Together;
+  /** Photographs of a turn that were localised together, and the probability that all of their places are right. */
+  together?: { photographs: number; confidence: number | null };
 };
 export type Session = Schemas["SessionAnswer"];
 export type ViewAnswer = Schemas["ViewAnswer"];
@@ -38,19 +39,12 @@ export interface Pose {
   heading_deg: number;
 }
 
-/** Photographs of a turn that were localised together, and the probability that all of their places are right. */
-export interface Together {
-  photographs: number;
-  confidence: number | null;
-}
-
-export type PlanPoint = Schemas["PlanPoint"];
 export type EarthPoint = Schemas["EarthPoint"];
 
 /** Hints of the place of a photograph: a circle on the plan, rooms and, in a venue, a level. */
 export interface Hints {
   /** Centre of the circle: metres of the plan, or degrees, which all plans of a venue share. */
-  near: PlanPoint | EarthPoint | null;
+  near: Schemas["PlanPoint"] | EarthPoint | null;
   radius: number;
   rooms: string[];
   level: number | null;
