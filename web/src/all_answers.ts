@@ -1,9 +1,10 @@
 /** Answers to all photographs as a table, and as files. */
 
 import { within95 } from "./answer_overlay";
-import { headingWords, percent } from "./answer_words";
+import { headingWords } from "./answer_words";
 import { button, byId, download, h, show } from "./dom";
 import type { Photo } from "./photos";
+import { percent } from "./plain_words";
 import type { Answer } from "./types";
 
 interface Found {

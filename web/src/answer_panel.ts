@@ -7,7 +7,6 @@ import {
   HEADING_SOURCES,
   headingWords,
   milliseconds,
-  percent,
   placeWords,
   roomWords,
   seenWords,
@@ -19,7 +18,7 @@ import { button, byId, h, show } from "./dom";
 import { say, showError } from "./notices";
 import type { Photo } from "./photos";
 import { type Place, placesOf, remainder } from "./places";
-import { plainWords } from "./plain_words";
+import { percent, plainWords } from "./plain_words";
 import { curlSnippet, pythonSnippet } from "./snippets";
 import type { Answer } from "./types";
 import { planLabel } from "./venues";

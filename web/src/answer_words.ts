@@ -1,6 +1,7 @@
 /** Words for the parts of an answer. */
 
 import { within95 } from "./answer_overlay";
+import { percent } from "./plain_words";
 import type { Answer, ViewAnswer } from "./types";
 
 // 95 % of a normal distribution lie within this many standard deviations.
@@ -15,9 +16,6 @@ export function confidenceWords(confidence: number | null): string {
   if (confidence >= 0.2) return "Possibly here";
   return "Uncertain: possibly another place, or not in this plan";
 }
-
-export const percent = (share: number): string =>
-  share > 0 && share < 0.01 ? "under 1 %" : share > 0.99 && share < 1 ? "over 99 %" : `${Math.round(100 * share)} %`;
 
 export const milliseconds = (duration: number): string =>
   duration >= 1000 ? `${(duration / 1000).toFixed(1)} s` : `${Math.round(duration)} ms`;

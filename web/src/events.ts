@@ -1,6 +1,6 @@
 /** Server-sent events over fetch, because the browser's EventSource cannot send a key. */
 
-import { linesOf } from "../../clients/typescript/src/transport";
+import { linesOf, pause } from "../../clients/typescript/src/transport";
 import { api } from "./api";
 import type { PlanEvent } from "./types";
 
@@ -24,6 +24,6 @@ export async function* eventsOf(id: string, signal: AbortSignal): AsyncGenerator
       signal.throwIfAborted();
     }
     // The stream has ended or broken off; reconnect.
-    await new Promise((done) => setTimeout(done, RECONNECT_MS));
+    await pause(RECONNECT_MS, signal);
   }
 }

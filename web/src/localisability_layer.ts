@@ -1,10 +1,10 @@
 /** "Will it work here?": the probability by place that a photograph is found, as a layer of the map. */
 
-import { percent } from "./answer_words";
 import { api } from "./api";
 import { button, byId, h, s, show } from "./dom";
 import { type Cells, cellSize, cellsOf, roomPictures } from "./heat";
 import { clearError, showError } from "./notices";
+import { percent } from "./plain_words";
 import type { Localisability, Plan } from "./types";
 
 type Condition = keyof Localisability["probability"];

@@ -14,6 +14,7 @@ const PLAIN_TEXTS: Record<string, string> = {
   "features-required":
     "This service takes no photographs. Load the page again: it then computes features in the browser.",
   overloaded: "The service is overloaded.",
+  "unknown-album": "The folder is no longer stored. Choose its plan, and add the photographs again.",
   "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
 };
 
@@ -36,11 +37,12 @@ export function showError(place: HTMLElement, error: unknown, fields: Fields = {
   const text = error instanceof Error ? error.message : String(error);
   const faults = failure?.faults ?? [];
   const title = failure?.title ?? (error instanceof InputError ? null : "Something went wrong");
-  const plain = PLAIN_TEXTS[failure?.slug ?? ""];
+  const plain = PLAIN_TEXTS[failure?.slug ?? ""],
+    detail = plainWords(failure?.detail ?? text);
   show(
     place,
     title !== null && h("strong", {}, title),
-    h("p", {}, plain ? `${plain} (${failure!.detail})` : plainWords(failure?.detail ?? text)),
+    h("p", {}, plain ? `${plain} (${detail})` : detail),
     faults.length > 0 &&
       h(
         "ul",
@@ -100,5 +102,6 @@ export function say(text: string): void {
   place.textContent = text;
   place.classList.add("shown");
   clearTimeout(hide);
-  hide = window.setTimeout(() => place.classList.remove("shown"), 4000);
+  // Long ones stay as long as they take to read.
+  hide = window.setTimeout(() => place.classList.remove("shown"), Math.max(4000, 60 * text.length));
 }

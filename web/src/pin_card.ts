@@ -5,6 +5,7 @@ import { button, h, s } from "./dom";
 import { degrees, layoutLines, radians } from "./layout";
 import type { Floors, PinnedAt, Row } from "./pin_floors";
 import type { Thumbnail } from "./pin_photographs";
+import { percent } from "./plain_words";
 import { equirectangular } from "./projection";
 import type { Point } from "./types";
 
@@ -19,7 +20,6 @@ export interface CardActions {
 }
 
 const WIDTH = 400;
-export const percent = (share: number): string => `${Math.round(100 * share)} %`;
 
 /** Return the number of photographs whose place is sure. */
 export const sureOf = (rows: Row[]): number =>

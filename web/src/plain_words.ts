@@ -24,6 +24,9 @@ const LABELS: Record<string, string> = {
   layers: "Only these layers",
   ceiling_height_m: "Ceiling",
   plan: "A plan, though it looks like a photograph",
+  north_deg: "North",
+  sill_m: "From, m over the floor",
+  head_m: "To, m over the floor",
   opening_kinds: "Complete in this plan",
   opening_trust: "Trust in openings",
   projection: "Kind",
@@ -39,9 +42,15 @@ const VALUES: Record<string, string> = {
 /** Return the label of a field, by its name in the API. */
 export const labelOf = (field: string): string => LABELS[field] ?? field;
 
-/** Replace names of fields in a message: `hfov_deg` and `units=mm` by the labels of their fields. */
+/** Return a probability; none is 0 or 100 %. */
+export const percent = (share: number): string =>
+  share < 0.01 ? "< 1 %" : share > 0.99 ? "> 99 %" : `${Math.round(100 * share)} %`;
+
+/** Replace names of fields in a message by their labels; leave out those of settings and of files of documentation. */
 export function plainWords(message: string): string {
   return message
+    .replace(/[;,] see docs\/\S+$/, "")
+    .replace(/ \((?:LALALOC_[A-Z_]+|([a-z]+(?:_[a-z]+)+))\)/g, (whole, name: string) => (name in LABELS ? whole : ""))
     .replace(/\b([a-z]+)=(\w+(?:[.,:]\d+)*)/g, (whole, field: string, value: string) =>
       field in LABELS ? `“${labelOf(field)}” (${VALUES[value] ?? value})` : whole,
     )

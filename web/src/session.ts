@@ -1,11 +1,13 @@
 /** Live session: a camera that is followed from photograph to photograph, by this page or by another client. */
 
+import { pause } from "../../clients/typescript/src/transport";
 import { ellipse } from "./answer_overlay";
 import { api, ServiceError } from "./api";
 import { device } from "./device/device";
 import { button, byId, h, s, show } from "./dom";
 import { acceptChoice } from "./drops";
 import { attempt } from "./notices";
+import { percent } from "./plain_words";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Plan, Session, Venue } from "./types";
 
@@ -29,8 +31,6 @@ export interface SessionActions {
   opened: () => void;
 }
 
-const percent = (share: number): string => `${Math.round(100 * share)} %`;
-const wait = (milliseconds: number): Promise<void> => new Promise((done) => setTimeout(done, milliseconds));
 
 /** Panel and layer on the plan of a session. */
 export class LiveSession {
@@ -94,7 +94,7 @@ export class LiveSession {
   /** Ask for the state of the session until it ends. */
   private async poll(id: string): Promise<void> {
     while (this.session?.id === id) {
-      await wait(POLL_MS);
+      await pause(POLL_MS);
       if (document.hidden || this.sending || this.session?.id !== id) continue;
       try {
         const session = await api.session(id);
@@ -132,7 +132,7 @@ export class LiveSession {
       } catch (error) {
         const isBusy = error instanceof ServiceError && error.slug === "session-busy";
         if (!isBusy || tries === BUSY_TRIES || this.session === null) throw error;
-        await wait(1000 * (error.retryAfterS ?? 1));
+        await pause(1000 * (error.retryAfterS ?? 1));
       }
     }
   }
