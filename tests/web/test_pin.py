@@ -90,7 +90,7 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     # The same folder again adds nothing.
     page.locator("#photo-files").set_input_files(FILES)
-    expect(page.locator("#problems")).to_contain_text("Photographs that the album has already: 3")
+    expect(page.locator("#problems")).to_contain_text("Photographs that the folder has already: 3")
     expect(page.locator(".card")).to_have_count(3)
 
 
@@ -183,7 +183,14 @@ def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_
             assert plan["name"] == "Six photographed rooms"
             assert album["floorplan_id"] == plan["id"]
             page.locator("#photo-files").set_input_files(FILES[:2])
-            expect(page.locator("#problems")).to_contain_text("An album has at most 2 photographs; left out: 1.")
+            expect(page.locator("#problems")).to_contain_text("A folder has at most 2 photographs; left out: 1.")
+            # The folder before is listed with its date.
+            saved = page.locator("#plan-choice optgroup[label='Saved folders'] option")
+            names = "Six photographed rooms", "Example flat"
+            expect(saved).to_have_text([re.compile(rf"{name}, .*\d{{4}}") for name in names])
+            page.locator("#plan-choice").select_option(saved.last.get_attribute("value"))
+            expect(page.locator("#plan .room")).to_have_count(len(FLAT["rooms"]))
+            expect(page.locator("#plan .pin")).to_have_count(2)
 
 
 @pytest.mark.slow
@@ -257,6 +264,15 @@ def test_changed_plan_lists_what_moved(desktop: Visit) -> None:
     page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     expect(page.locator("#moved-list li")).to_have_text(re.compile(r"1 kitchen.jpg: kitchen, 5\.\d m away"))
     desktop.client.delete(f"/floorplans/{plan_id}")
+
+
+@pytest.mark.slow
+def test_pins_of_one_spot_are_side_by_side(desktop: Visit, tmp_path: Path) -> None:
+    with Image.open(FILES[1]) as picture:
+        picture.save(tmp_path / "kitchen again.jpg", quality=80)
+    page = pin_files(desktop, [FILES[1], tmp_path / "kitchen again.jpg"])
+    first, second = (present(page.locator(f"#pin-{number} circle").bounding_box()) for number in (1, 2))
+    assert math.dist((first["x"], first["y"]), (second["x"], second["y"])) > 0.7 * first["width"]
 
 
 @pytest.mark.slow

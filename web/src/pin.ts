@@ -7,19 +7,21 @@ import { connectKeyDialog } from "./key_dialog";
 import { attempt, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
-import { choicesOf, Floors, type Row } from "./pin_floors";
-import { type PinActions, pinOf } from "./pin_map";
+import { choicesOf, Floors, folderOption, type Row } from "./pin_floors";
+import { fanned, type PinActions, pinOf } from "./pin_map";
 import { added, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
 import { plainWords } from "./plain_words";
 import { boxOf, drawNames, drawPlan, lostAreas, unitOf } from "./plan_drawing";
 import type { Plan } from "./types";
 import type { Schemas } from "../../clients/typescript/src/index";
+import { pause } from "../../clients/typescript/src/transport";
 
 type Correction = Partial<Schemas["CorrectionDocument"]>;
 
 const POLL_MS = 700;
 const RADIUS = 1.5;
+const OUTDATED = "by an earlier model; to pin them anew, choose the plan and add the photographs again";
 const FILES = { GeoJSON: "application/geo+json", CSV: "text/csv", SVG: "image/svg+xml" } as const;
 // Groups of the list, by the state of the pins.
 const GROUPS = [
@@ -28,7 +30,6 @@ const GROUPS = [
   ["Pinned", ["sure", "corrected"]],
   ["Waiting", ["waiting"]],
 ] as const;
-const wait = (milliseconds: number): Promise<void> => new Promise((done) => setTimeout(done, milliseconds));
 
 class PinPage {
   private readonly svg = byId("plan") as unknown as SVGSVGElement;
@@ -38,6 +39,7 @@ class PinPage {
   private readonly error = byId("pin-error");
   private readonly filter = byId<HTMLSelectElement>("room-filter");
   private readonly choice = byId<HTMLSelectElement>("plan-choice");
+  private readonly saved = h("optgroup", { label: "Saved folders" });
   private readonly levels = byId<HTMLSelectElement>("level-choice");
   private readonly thumbnails = new Map<string, Thumbnail>();
   private readonly done: { id: string; before: Correction | null }[] = [];
@@ -80,17 +82,13 @@ class PinPage {
 
   /** List plans and venues; show the album that the address names, or the newest plan. */
   private async begin(): Promise<void> {
-    const [{ floorplans }, { venues }] = await Promise.all([api.plans(), api.venues()]);
+    const [{ floorplans }, { venues }, { albums }] = await Promise.all([api.plans(), api.venues(), api.albums()]);
     show(this.choice, choicesOf("Plans", "plan", floorplans), choicesOf("Venues", "venue", venues));
+    show(this.saved, ...albums.map(folderOption));
+    if (albums.length > 0) this.choice.append(this.saved);
     const id = named("album");
-    if (id !== null) {
-      const album = await api.album(id);
-      const place = album.venue_id === null ? `plan:${album.floorplan_id}` : `venue:${album.venue_id}`;
-      await this.choose(place);
-      this.choice.value = place;
-      this.album = album;
-      await this.follow();
-    } else if (floorplans.length > 0) await this.choose(`plan:${floorplans[0]!.id}`);
+    if (id !== null) await this.open(id);
+    else if (floorplans.length > 0) await this.choose(`plan:${floorplans[0]!.id}`);
   }
 
   private readonly guarded = (work: () => Promise<void>): Promise<void> => attempt(this.error, work);
@@ -101,9 +99,22 @@ class PinPage {
     return () => number === this.requests;
   }
 
+  /** Show a saved folder, unless another choice is made meanwhile. */
+  private async open(id: string): Promise<void> {
+    this.choice.value = `album:${id}`;
+    const chosen = this.choice.value,
+      album = await api.album(id);
+    await this.choose(album.venue_id === null ? `plan:${album.floorplan_id}` : `venue:${album.venue_id}`);
+    if (this.choice.value !== chosen) return;
+    this.album = album;
+    await this.polling;
+    await this.follow();
+  }
+
   private async choose(value: string): Promise<void> {
     const isLast = this.request(),
       [kind, id] = value.split(":") as [string, string];
+    if (kind === "album") return this.open(id);
     if (kind === "plan") return this.take(await api.plan(id), isLast);
     const [venue, { plans }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
     if (!isLast()) return;
@@ -176,7 +187,7 @@ class PinPage {
     if (pictures.length > 0 || plans.length > 1) await this.add([...pictures, ...(plans.length > 1 ? plans : [])]);
   }
 
-  /** Add files to the album, which is made for the first ones. */
+  /** Add files to the album, which is made for the first ones and named after their folder, else after the plan. */
   private async add(files: File[]): Promise<void> {
     const { photographs, note } = photographsOf(files);
     const tell = (text: string): void => byId("problems").append(h("li", {}, text));
@@ -188,12 +199,18 @@ class PinPage {
       return;
     }
     const place = this.floors.venue === null ? { floorplan_id: this.shown } : { venue_id: this.floors.venue };
-    const album = (this.album ??= await api.createAlbum({ ...place, name: this.title } as Schemas["AlbumDocument"]));
-    history.replaceState(null, "", `#album=${album.id}`);
+    let album = this.album;
+    if (album === null) {
+      const name = photographs[0]!.webkitRelativePath.split("/")[0] || this.title;
+      album = this.album = await api.createAlbum({ ...place, name } as Schemas["AlbumDocument"]);
+      this.saved.prepend(folderOption(album));
+      this.choice.append(this.saved);
+      this.choice.value = `album:${album.id}`;
+    }
     const most = (await api.limits()).max_album_photographs;
-    const free = Math.max(most - this.rows.length, 0);
-    if (photographs.length > free)
-      tell(`An album has at most ${most} photographs; left out: ${photographs.length - free}. Open /pin again.`);
+    const free = Math.max(most - this.rows.length, 0),
+      left = photographs.length - free;
+    if (left > 0) tell(`A folder has at most ${most} photographs; left out: ${left}. Choose the plan again for them.`);
     let sent = 0,
       copies = 0;
     for await (const { file, line } of added(album.id, photographs.slice(0, free))) {
@@ -209,7 +226,7 @@ class PinPage {
       if (sent % 5 === 0) void this.guarded(() => this.follow());
     }
     this.reading = "";
-    if (copies > 0) tell(`Photographs that the album has already: ${copies}`);
+    if (copies > 0) tell(`Photographs that the folder has already: ${copies}`);
     await this.polling;
     await this.follow();
   }
@@ -220,7 +237,7 @@ class PinPage {
   }
 
   private async poll(): Promise<void> {
-    for (let album = this.album, seen = ""; album !== null && album.id === this.album?.id; await wait(POLL_MS)) {
+    for (let album = this.album, seen = ""; album !== null && album.id === this.album?.id; await pause(POLL_MS)) {
       const now = await api.album(album.id);
       const key = [now.revision, now.solved_revision_number, now.place_revision].join();
       const photographs = key === seen ? this.rows : (await api.albumPhotographs(album.id)).photographs;
@@ -232,7 +249,8 @@ class PinPage {
       await this.floors.load(places.map((place) => place.floorplan_id));
       if (album.id !== this.album?.id) return;
       [this.album, this.rows] = [now, photographs];
-      const state = now.state === "outdated" ? "outdated: it can only be read" : (now.reason ?? now.state);
+      history.replaceState(null, "", `#album=${now.id}`);
+      const state = now.state === "outdated" ? OUTDATED : plainWords(now.reason ?? now.state);
       if (this.reading === "")
         byId("pin-state").textContent =
           `${sureOf(this.rows)} of ${now.photographs} photographs pinned for sure (${state})`;
@@ -330,11 +348,12 @@ class PinPage {
     const floor = this.floors.get(planId);
     if (floor === null) return [];
     const radius = RADIUS * unitOf(boxOf(floor.plan.plan));
-    const make = (row: Row) => pinOf(row, radius, this.svg, act);
     const own = rows.filter(({ pin }) => pin?.place?.floorplan_id === planId);
-    const pins = own.map((row) =>
-      act === null ? make(row) : drawn(this.drawnPins, row.id, [row.pin, radius], () => make(row)),
-    );
+    const seen = fanned(own, radius);
+    const pins = own.map((row, index) => {
+      const make = () => pinOf(row, seen[index]!, radius, this.svg, act);
+      return act === null ? make() : drawn(this.drawnPins, row.id, [row.pin, seen[index], radius], make);
+    });
     return pins.filter((pin) => pin !== null);
   }
 

@@ -21,6 +21,12 @@ export function choicesOf(label: string, kind: string, places: { id: string; nam
   return options.length > 0 && h("optgroup", { label }, ...options);
 }
 
+/** Return a saved folder as a choice, with its date. */
+export function folderOption(album: Pick<Schemas["AlbumSummary"], "id" | "name" | "updated_at">): HTMLOptionElement {
+  const date = new Date(album.updated_at).toLocaleDateString("en-GB", { dateStyle: "medium" });
+  return h("option", { value: `album:${album.id}` }, `${album.name}, ${date}`);
+}
+
 export class Floors {
   private readonly loaded = new Map<string, Floor>();
   private levels: Schemas["VenuePlanList"]["plans"] = [];

@@ -2,8 +2,8 @@
 
 import { ARROWS, followPointer, s } from "./dom";
 import { degrees } from "./layout";
-import { percent } from "./pin_card";
 import type { Row } from "./pin_floors";
+import { percent } from "./plain_words";
 import { placeOf } from "./pose_marker";
 import type { Point } from "./types";
 
@@ -16,8 +16,22 @@ export interface PinActions {
   show(row: Row): void;
 }
 
-/** Return the pin of a photograph with a radius (m); without actions, for paper. */
-export function pinOf(row: Row, radius: number, svg: SVGSVGElement, act: PinActions | null): SVGElement | null {
+/** Return where pins with places are drawn: those of one spot, such as of a turn, side by side around it. */
+export function fanned(rows: Row[], radius: number): Point[] {
+  const spots = rows.map(({ pin }): Point => [pin!.place!.position.x_m, pin!.place!.position.y_m]);
+  const firsts = spots.map(([x, y]) => spots.findIndex(([a, b]) => Math.hypot(a - x, b - y) < 1.5 * radius));
+  return spots.map((spot, index) => {
+    const group = [...spots.keys()].filter((other) => firsts[other] === firsts[index]);
+    if (group.length === 1) return spot;
+    const turn = (2 * Math.PI * group.indexOf(index)) / group.length,
+      reach = (1.15 * radius) / Math.sin(Math.PI / group.length);
+    const [x, y] = spots[firsts[index]!]!;
+    return [x + reach * Math.sin(turn), y + reach * Math.cos(turn)];
+  });
+}
+
+/** Return the pin of a photograph, drawn at a point with a radius (m); without actions, for paper. */
+export function pinOf(row: Row, seen: Point, radius: number, svg: SVGSVGElement, act: PinActions | null) {
   const place = row.pin?.place;
   if (!place) return null;
   const { x_m, y_m } = place.position,
@@ -29,12 +43,13 @@ export function pinOf(row: Row, radius: number, svg: SVGSVGElement, act: PinActi
   const pin = s(
     "g",
     { class: `pin ${row.pin!.state}`, ...roles },
+    s("line", { class: "stem", x2: x_m - seen[0], y2: seen[1] - y_m }),
     arrow,
     s("circle", { r: radius, "stroke-width": 0.3 * radius }),
     s("text", { y: 0.38 * radius, "font-size": (row.number < 100 ? 1.1 : 0.8) * radius }, row.number),
   );
   const put = ([x, y]: Point): void => pin.setAttribute("transform", `translate(${x} ${-y})`);
-  put([x_m, y_m]);
+  put(seen);
   if (act === null) return pin;
   const follow = (begin: PointerEvent, moved: (at: Point) => void, done: () => void): void => {
     begin.preventDefault();
@@ -55,7 +70,7 @@ export function pinOf(row: Row, radius: number, svg: SVGSVGElement, act: PinActi
     follow(
       event as PointerEvent,
       ([x, y]) => {
-        turned = (degrees(Math.atan2(x - x_m, y - y_m)) + 360) % 360;
+        turned = (degrees(Math.atan2(x - seen[0], y - seen[1])) + 360) % 360;
         arrow.setAttribute("transform", `rotate(${turned})`);
       },
       () => turned !== null && act.move(row, [x_m, y_m], turned),

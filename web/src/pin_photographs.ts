@@ -23,7 +23,9 @@ const PORTION_BYTES = 60e6;
 export function photographsOf(files: File[]): { photographs: File[]; note: string | null } {
   const seen = files.filter((file) => !file.name.startsWith("."));
   const photographs = seen.filter((file) => isPicture(file));
-  photographs.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true }));
+  // As on the command line, whose numbers the photographs then have: digits count as numbers, letters by their codes.
+  const key = ({ name }: File): string => name.replace(/\d+/g, (digits) => `\0${digits.padStart(20, "0")}\0`);
+  photographs.sort((a, b) => (key(a) < key(b) ? -1 : Number(key(a) > key(b))));
   const others = seen.length - photographs.length;
   const note = others === 0 ? null : `Files that are no JPEG, PNG, WebP or HEIC, which are left out: ${others}`;
   return { photographs, note };
