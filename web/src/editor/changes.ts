@@ -7,7 +7,9 @@ import type { OpeningDocument, OpeningKind, PlanDocument, Point, RoomDocument } 
 /** Maximum distance of an opening from its wall. */
 export const NEAR_WALL_M = 0.35;
 const MIN_WIDTH_M = 0.2;
-export const DEFAULT_WIDTHS_M: Record<OpeningKind, number> = { door: 0.9, window: 1.2, passage: 1 };
+// As in lalaloc_core/floorplan/openings.py: openings that share no more of a wall only touch.
+const TOUCHING_M = 0.01;
+const DEFAULT_WIDTHS_M: Record<OpeningKind, number> = { door: 0.9, window: 1.2, passage: 1 };
 
 export const rounded = ([x, y]: Point): Point => [Math.round(x * 1000) / 1000, Math.round(y * 1000) / 1000];
 const plus = (a: Point, b: Point): Point => rounded([a[0] + b[0], a[1] + b[1]]);
@@ -211,6 +213,42 @@ export const widenOpening = (plan: PlanDocument, index: number, width: number): 
   withEnds(plan, index, ({ length }) => [0.5 * (length - width), 0.5 * (length + width)]);
 
 export const widthOf = ({ line: [a, b] }: OpeningDocument): number => Math.hypot(b[0] - a[0], b[1] - a[1]);
+
+/** Return why a changed plan is refused: openings that did not overlap before, and now do; null without any. */
+export function overlapIn(plan: PlanDocument, before: PlanDocument): string | null {
+  const [now, old] = [plan.openings ?? [], before.openings ?? []];
+  for (const [index, opening] of now.entries()) {
+    if (old.includes(opening)) continue;
+    for (const [k, other] of now.entries()) {
+      const overlap = index === k ? 0 : shared(opening, other);
+      if (overlap <= TOUCHING_M || shared(old[index], old[k]) > TOUCHING_M) continue;
+      const pair = `${opening.kind} ${index + 1} would overlap ${other.kind} ${k + 1}`;
+      return (
+        `${pair} by ${overlap.toFixed(2)} m; openings may share ${TOUCHING_M} m of a wall. ` +
+        "Move or narrow one, or set heights that put one above the other."
+      );
+    }
+  }
+  return null;
+}
+
+/** Return the length (m) of a wall that two openings share side by side; 0 if one is missing. */
+function shared(a: OpeningDocument | undefined, b: OpeningDocument | undefined): number {
+  if (a === undefined || b === undefined || isAbove(a, b) || isAbove(b, a)) return 0;
+  const line = frame(...a.line);
+  if (b.line.some((end) => Math.abs(line.off(end)) >= NEAR_WALL_M)) return 0;
+  const [from, to] = [line.along(b.line[0]), line.along(b.line[1])];
+  return Math.min(Math.max(from, to), line.length) - Math.max(Math.min(from, to), 0);
+}
+
+const isAbove = ({ sill_m: sill }: OpeningDocument, { head_m: head }: OpeningDocument): boolean =>
+  sill != null && head != null && sill >= head;
+
+/** Return a sentence on rooms whose types a stored plan has from their names; "" without any. */
+export function typesByName(sent: PlanDocument, stored: PlanDocument): string {
+  const found = stored.rooms.filter(({ type }, index) => type && type !== (sent.rooms[index]?.type ?? "unknown"));
+  return found.length === 0 ? "" : ` Types of rooms: ${found.map(({ name, type }) => `${name}: ${type}`).join(", ")}.`;
+}
 
 /** Scale the whole plan, except heights. */
 export function scaled(plan: PlanDocument, factor: number): PlanDocument {

@@ -42,6 +42,8 @@ export class Editor {
   private base: Plan | null = null;
   private selection: Selection = { kind: "none" };
   private measured = 0;
+  /** Factors by which plans of the history were scaled. */
+  private readonly factors = new WeakMap<PlanDocument, number>();
   private readonly traced = new TracedPictures();
   private readonly actions: EditActions = {
     edit: (plan, goesOn) => this.edit(plan, goesOn),
@@ -59,10 +61,8 @@ export class Editor {
     this.tools = new Tools(svg, {
       edit: (plan) => {
         const isRoom = plan.rooms.length > (this.history?.now.rooms.length ?? 0);
-        this.selection = isRoom
-          ? { kind: "room", index: plan.rooms.length - 1 }
-          : { kind: "opening", index: (plan.openings ?? []).length - 1 };
-        this.edit(plan);
+        const index = (isRoom ? plan.rooms : (plan.openings ?? [])).length - 1;
+        return this.edit(plan, false, { kind: isRoom ? "room" : "opening", index });
       },
       done: () => this.drawBar(),
       measured: (distance) => this.onMeasured(distance),
@@ -127,7 +127,21 @@ export class Editor {
     showForm(this.form, plan, this.selection, this.actions);
   }
 
-  private edit(plan: PlanDocument, goesOn = false): void {
+  /** Take a changed plan; return false, and say why, if it is refused. */
+  private edit(plan: PlanDocument, goesOn = false, selection = this.selection): boolean {
+    const overlap = this.history && change.overlapIn(plan, this.history.now);
+    if (overlap === null) this.put(plan, goesOn, selection);
+    else {
+      say(overlap);
+      // The form shows the value that is refused.
+      delete this.form.dataset.of;
+      this.redraw();
+    }
+    return overlap === null;
+  }
+
+  private put(plan: PlanDocument, goesOn: boolean, selection: Selection): void {
+    this.selection = selection;
     this.history?.push(plan, goesOn);
     this.redraw();
     this.drawUndo();
@@ -139,8 +153,11 @@ export class Editor {
   }
 
   private close(stored: Plan | null): void {
-    if (stored !== null) say(`“${stored.name}” is stored, revision ${stored.revision_number}.`);
-    if (stored !== null) this.traced.keep(stored.id, this.underlay.traced);
+    if (stored !== null && this.history !== null) {
+      const types = change.typesByName(this.history.now, stored.plan);
+      say(`“${stored.name}” is stored, revision ${stored.revision_number}.${types}`);
+      this.traced.keep(stored.id, this.underlay.traced);
+    }
     this.history = null;
     this.underlay.remove();
     this.tools.choose("select");
@@ -202,9 +219,15 @@ export class Editor {
   }
 
   private step(way: "undo" | "redo"): void {
-    this.history?.[way]();
-    // The selected element may no longer exist.
-    this.selection = { kind: "none" };
+    if (this.history === null) return;
+    const before = this.history.now;
+    this.history[way]();
+    const { now } = this.history,
+      elements = this.selection.kind === "room" ? now.rooms : (now.openings ?? []);
+    // The picture below was scaled with the plan.
+    if (now !== before)
+      this.underlay.scale(way === "redo" ? (this.factors.get(now) ?? 1) : 1 / (this.factors.get(before) ?? 1));
+    if (this.selection.kind !== "none" && this.selection.index >= elements.length) this.selection = { kind: "none" };
     this.redraw();
     this.drawUndo();
   }
@@ -216,15 +239,13 @@ export class Editor {
         plan.rooms.length === 0 ? 0 : Math.max(...plan.rooms.flatMap(({ polygon }) => polygon.map(([x]) => x))) + 0.1;
     const [width, depth] = NEW_ROOM_M;
     this.tools.choose("select");
-    this.selection = { kind: "room", index: plan.rooms.length };
-    this.edit(
-      change.addRoom(plan, [
-        [right, 0],
-        [right + width, 0],
-        [right + width, depth],
-        [right, depth],
-      ]),
-    );
+    const corners: Point[] = [
+      [right, 0],
+      [right + width, 0],
+      [right + width, depth],
+      [right, depth],
+    ];
+    this.edit(change.addRoom(plan, corners), false, { kind: "room", index: plan.rooms.length });
     this.scene.viewport.fit(boxOf(this.history.now));
   }
 
@@ -274,7 +295,9 @@ export class Editor {
     this.measure.hidden = true;
     this.underlay.scale(factor);
     this.tools.choose("select");
-    this.edit(change.scaled(this.history.now, factor));
+    const plan = change.scaled(this.history.now, factor);
+    this.factors.set(plan, factor);
+    this.put(plan, false, this.selection);
     viewport.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
     say(`The plan was scaled by ${factor.toFixed(3)}.`);
   }
@@ -325,8 +348,7 @@ export class Editor {
         return;
       }
       // One more step of the history, so that undo returns to the user's version.
-      this.selection = { kind: "none" };
-      this.edit(this.base.plan);
+      this.put(this.base.plan, false, { kind: "none" });
       this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” returns to your version; saving makes it the latest.`;
     });
   }

@@ -1,6 +1,7 @@
 /** Forms for the properties of a room, an opening or the whole plan. */
 
 import { button, h, show } from "../dom";
+import { say } from "../notices";
 import type { OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from "../types";
 import * as change from "./changes";
 import type { EditActions, Selection } from "./handles";
@@ -27,6 +28,8 @@ const ROOM_TYPES: RoomType[] = [
 ];
 // Height (m) that the service assumes for plans without one, as a field shows it.
 const ASSUMED = "2.5 assumed";
+// Latitude and longitude, as maps give them.
+const DEGREES = /^\s*(-?\d+(?:\.\d+)?)\s*[,;\s]\s*(-?\d+(?:\.\d+)?)\s*$/;
 // Rooms that a hint names.
 const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
@@ -53,7 +56,9 @@ export function setFormPlan(plan: PlanDocument): void {
 }
 
 function planForm(plan: PlanDocument, { edit }: EditActions): (HTMLElement | null)[] {
-  const set = (values: Partial<PlanDocument>): void => edit({ ...current, ...values });
+  const set = (values: Partial<PlanDocument>): boolean => edit({ ...current, ...values });
+  const { latitude, longitude } = plan.anchor ?? {};
+  const place = latitude == null || longitude == null ? "" : `${latitude.toFixed(7)}, ${longitude.toFixed(7)}`;
   return [
     h("h3", {}, "The whole plan"),
     text("plan-form-name", "Name", plan.name ?? "", (name) => set({ name })),
@@ -69,6 +74,13 @@ function planForm(plan: PlanDocument, { edit }: EditActions): (HTMLElement | nul
       set({ camera_height_m: value ?? undefined }),
     ),
     number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
+    text("plan-form-anchor", "Latitude, longitude of x 0, y 0", place, (value) => {
+      const [latitudeDeg, longitudeDeg] = (DEGREES.exec(value) ?? []).slice(1).map(Number);
+      const anchor = { ...current.anchor, latitude: latitudeDeg, longitude: longitudeDeg };
+      if (latitudeDeg !== undefined) set({ anchor });
+      else if (value.trim() === "") set({ anchor: null });
+      else say(`“${value}” must be latitude and longitude in degrees, such as 48.13722, 11.57569.`);
+    }),
     completeKinds(plan, edit),
     h(
       "p",
@@ -114,7 +126,7 @@ function completeKinds(plan: PlanDocument, edit: EditActions["edit"]): HTMLEleme
 }
 
 function roomForm(room: RoomDocument, index: number, { edit, select }: EditActions): HTMLElement[] {
-  const set = (values: Partial<RoomDocument>): void => edit(change.changeRoom(current, index, values));
+  const set = (values: Partial<RoomDocument>): boolean => edit(change.changeRoom(current, index, values));
   return [
     h("h3", {}, "Room"),
     text("room-form-name", "Name", room.name ?? "", (name) =>
@@ -139,7 +151,7 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: EditActio
 }
 
 function openingForm(opening: OpeningDocument, index: number, { edit, select }: EditActions): HTMLElement[] {
-  const set = (values: Partial<OpeningDocument>): void => edit(change.changeOpening(current, index, values));
+  const set = (values: Partial<OpeningDocument>): boolean => edit(change.changeOpening(current, index, values));
   return [
     h("h3", {}, "Opening"),
     choice("opening-form-kind", "Kind", opening.kind, OPENING_KINDS, (kind) => set({ kind })),

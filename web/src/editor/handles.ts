@@ -1,6 +1,6 @@
 /** Handles of corners, walls and openings, for pointer and keyboard. */
 
-import { ARROWS, followPointer, s, show } from "../dom";
+import { ARROWS, followPointer, s, showKeepingFocus } from "../dom";
 import { ends, path } from "../plan_drawing";
 import { placeOf } from "../pose_marker";
 import type { OpeningKind, PlanDocument, Point } from "../types";
@@ -9,8 +9,8 @@ import * as change from "./changes";
 export type Selection = { kind: "none" } | { kind: "room"; index: number } | { kind: "opening"; index: number };
 
 export interface EditActions {
-  /** Another plan; `goesOn` while the user drags. */
-  edit: (plan: PlanDocument, goesOn?: boolean) => void;
+  /** Another plan, `goesOn` while the user drags; returns false if it is refused. */
+  edit: (plan: PlanDocument, goesOn?: boolean) => boolean;
   select: (selection: Selection) => void;
 }
 
@@ -31,15 +31,14 @@ export class Handles {
 
   /** Draw the handles of the selection and keep the focus. */
   draw(plan: PlanDocument, selection: Selection, unit: number): void {
-    const focused = this.element.contains(document.activeElement) ? document.activeElement!.id : null;
     this.plan = plan;
     this.unit = unit;
     const room = selection.kind === "room" ? selection.index : -1;
     const shapes: SVGElement[] = plan.rooms.map(({ polygon }, index) => this.roomShape(polygon, index, index === room));
-    if (room >= 0 && plan.rooms[room] !== undefined) shapes.push(...this.wallShapes(room), ...this.cornerShapes(room));
+    plan.rooms.forEach((_, index) => index !== room && shapes.push(...this.wallShapes(index, false)));
+    if (plan.rooms[room] !== undefined) shapes.push(...this.wallShapes(room, true), ...this.cornerShapes(room));
     (plan.openings ?? []).forEach((_, index) => shapes.push(...this.openingShapes(index, selection)));
-    show(this.element, ...shapes);
-    if (focused) document.getElementById(focused)?.focus();
+    showKeepingFocus(this.element, ...shapes);
   }
 
   private roomShape(polygon: Point[], index: number, isSelected: boolean): SVGElement {
@@ -70,7 +69,7 @@ export class Handles {
 
   private cornerShapes(room: number): SVGElement[] {
     return this.plan.rooms[room]!.polygon.map(([x, y], corner) => {
-      const move = (to: Point, goesOn: boolean): void =>
+      const move = (to: Point, goesOn: boolean): boolean =>
         this.actions.edit(change.moveCorner(this.plan, room, corner, to), goesOn);
       const handle = s("circle", {
         cx: x,
@@ -90,27 +89,26 @@ export class Handles {
       });
       this.drag(handle, (to, goesOn) => {
         const here = this.plan.rooms[room]!.polygon[corner]!;
-        move(change.snapped(this.plan, to, SNAP_UNITS * this.unit, here), goesOn);
+        return move(change.snapped(this.plan, to, SNAP_UNITS * this.unit, here), goesOn);
       });
       return handle;
     });
   }
 
-  private wallShapes(room: number): SVGElement[] {
+  /** Draw the walls of a room for the pointer, and those of the selected one for the keyboard. */
+  private wallShapes(room: number, isSelected: boolean): SVGElement[] {
     return this.plan.rooms[room]!.polygon.flatMap((_, edge) => {
       const wall = { room, edge },
         [[ax, ay], [bx, by]] = change.wallOf(this.plan, wall);
       const middle: Point = [0.5 * (ax + bx), 0.5 * (ay + by)];
-      const split = (): void => this.actions.edit(change.splitWall(this.plan, wall, middle), false);
-      const line = s("line", {
-        ...ends(change.wallOf(this.plan, wall)),
-        class: "grab-wall",
+      const split = (): boolean => this.actions.edit(change.splitWall(this.plan, wall, middle), false);
+      const select = (): void => this.actions.select({ kind: "room", index: room });
+      const keys = {
         id: `edit-wall-${edge}`,
         tabindex: 0,
         role: "button",
         "aria-label": `Wall ${edge + 1}, ${Math.hypot(bx - ax, by - ay).toFixed(2)} m. Arrow keys move it, Enter adds a corner; D, W and P add a door, a window or a passage.`,
-        ondblclick: split,
-        onkeydown: (event) => {
+        onkeydown: (event: Event): void => {
           const kind = KINDS[(event as KeyboardEvent).key.toLowerCase()];
           if (kind !== undefined) this.actions.edit(change.addOpening(this.plan, kind, wall, middle), false);
           else
@@ -119,14 +117,20 @@ export class Handles {
               split,
             });
         },
+      };
+      const line = s("line", {
+        ...ends(change.wallOf(this.plan, wall)),
+        class: "grab-wall",
+        ondblclick: split,
+        ...(isSelected ? keys : { onclick: select }),
       });
-      let from: Point | null = null;
-      this.drag(line, (to, goesOn) => {
-        if (!goesOn) from = null;
-        const by: Point = from === null ? [0, 0] : [to[0] - from[0], to[1] - from[1]];
-        from = to;
-        if (by[0] !== 0 || by[1] !== 0 || !goesOn) this.actions.edit(change.moveWall(this.plan, wall, by), goesOn);
+      let before = this.plan;
+      this.drag(line, (to, goesOn, from) => {
+        if (!goesOn) before = this.plan;
+        if (!goesOn && !isSelected) select();
+        return this.actions.edit(change.moveWall(before, wall, [to[0] - from[0], to[1] - from[1]]), goesOn);
       });
+      if (!isSelected) return [line];
       const plus = s("circle", {
         cx: middle[0],
         cy: -middle[1],
@@ -143,7 +147,7 @@ export class Handles {
     const opening = this.plan.openings![index]!,
       [[ax, ay], [bx, by]] = opening.line;
     const isSelected = selection.kind === "opening" && selection.index === index;
-    const slide = (to: Point, goesOn: boolean): void =>
+    const slide = (to: Point, goesOn: boolean): boolean =>
       this.actions.edit(change.slideOpening(this.plan, index, to), goesOn);
     const select = (): void => {
       if (!isSelected) this.actions.select({ kind: "opening", index });
@@ -169,7 +173,7 @@ export class Handles {
     });
     this.drag(line, (to, goesOn) => {
       if (!goesOn) select();
-      slide(to, goesOn);
+      return slide(to, goesOn);
     });
     if (!isSelected) return [line];
     const tips = opening.line.map(([x, y], end) => {
@@ -182,8 +186,8 @@ export class Handles {
     return [line, ...tips];
   }
 
-  /** Follow a pointer from its first movement on, even if the handle is redrawn. */
-  private drag(handle: SVGElement, to: (place: Point, goesOn: boolean) => void): void {
+  /** Follow a pointer from its first movement on, even if the handle is redrawn; `to` returns false if it is refused. */
+  private drag(handle: SVGElement, to: (place: Point, goesOn: boolean, from: Point) => boolean): void {
     handle.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;
       event.preventDefault();
@@ -193,9 +197,7 @@ export class Handles {
       let goesOn = false;
       followPointer((moving) => {
         if (!goesOn && Math.hypot(moving.clientX - event.clientX, moving.clientY - event.clientY) < 3) return;
-        if (!goesOn) to(begin, false);
-        goesOn = true;
-        to(placeOf(this.svg, moving), true);
+        goesOn = to(placeOf(this.svg, moving), goesOn, begin) || goesOn;
       });
     });
   }

@@ -22,10 +22,11 @@ export class History<T> {
     return this.index < this.states.length - 1;
   }
 
-  /** Add a state; with `goesOn` it replaces the last one, as while dragging. */
+  /** Add a state; with `goesOn` it replaces the last one, as while dragging, unless that was undone meanwhile. */
   push(next: T, goesOn: boolean): void {
     if (next === this.now) return;
-    this.states = [...this.states.slice(0, this.index + (goesOn ? 0 : 1)), next].slice(-MAX_STEPS - 1);
+    const kept = this.index + (goesOn && !this.canRedo ? 0 : 1);
+    this.states = [...this.states.slice(0, kept), next].slice(-MAX_STEPS - 1);
     this.index = this.states.length - 1;
   }
 

@@ -9,7 +9,8 @@ import * as change from "./changes";
 export type Tool = "select" | "room" | OpeningKind | "scale";
 
 export interface ToolActions {
-  edit: (plan: PlanDocument) => void;
+  /** A plan with another room or opening; returns false if it is refused. */
+  edit: (plan: PlanDocument) => boolean;
   done: () => void;
   /** Two points were clicked; their distance as drawn. */
   measured: (distance: number) => void;
@@ -122,8 +123,7 @@ export class Tools {
       this.actions.instruct(`No wall is close enough. ${HINTS[kind]}`);
       return;
     }
-    this.actions.edit(change.addOpening(this.plan, kind, nearest.wall, place));
-    this.choose("select");
+    if (this.actions.edit(change.addOpening(this.plan, kind, nearest.wall, place))) this.choose("select");
   }
 
   private draw(ahead: Point | null): void {
