@@ -79,7 +79,7 @@ REFUSED = {
 @pytest.mark.parametrize("name", EXPECTED)
 def test_file_is_read_right(name: str):
     expected = EXPECTED[name]
-    plan = import_plan(_content(name))
+    plan = import_plan(content_of(name))
     assert sorted((room.area for room in shapes(plan.document)), reverse=True) == pytest.approx(
         sorted(expected.areas_m2, reverse=True), abs=0.06
     )
@@ -94,17 +94,17 @@ def test_file_is_read_right(name: str):
 @pytest.mark.parametrize("name", REFUSED)
 def test_file_is_refused_with_a_remedy(name: str):
     with pytest.raises(InvalidFloorPlanError, match=REFUSED[name]):
-        import_plan(_content(name))
+        import_plan(content_of(name))
 
 
 def test_storeys_on_layers_of_their_own_are_plans():
-    plans = import_plans(_content("levels_by_layer.dxf"))
+    plans = import_plans(content_of("levels_by_layer.dxf"))
     assert [plan.level and plan.level.name for plan in plans] == ["EG", "OG"]
     assert [round(sum(room.area for room in shapes(plan.document)), 1) for plan in plans] == [79.9, 79.9]
 
 
 def test_picture_of_a_robots_map_has_the_map():
-    assert import_plan(_content("valetudo.png")).document == import_plan(_content("valetudo.json")).document
+    assert import_plan(content_of("valetudo.png")).document == import_plan(content_of("valetudo.json")).document
 
 
 def test_every_file_is_expected():
@@ -112,7 +112,8 @@ def test_every_file_is_expected():
     assert names == EXPECTED.keys() | REFUSED.keys()
 
 
-def _content(name: str) -> bytes:
+def content_of(name: str) -> bytes:
+    """Return a file, with the picture beside it if it has one."""
     path = FOLDER / name
     if path.suffix != ".yaml":
         return path.read_bytes()
