@@ -580,15 +580,6 @@ def postgres_app(start_app: StartApp, postgres: PostgresServer, tmp_path_factory
     return lambda: start_app(tmp_path_factory.mktemp("data"), database_url=url, sweep_s=0.2)
 
 
-def test_two_replicas_serve_the_same_plans(postgres_app: Any, sphere: bytes) -> None:
-    with postgres_app() as first, postgres_app() as second:
-        plan_id = upload(first, wait=False)
-        assert localise(second, plan_id, sphere, refine="none").status_code == 200
-        assert second.delete(f"/floorplans/{plan_id}").status_code == 204
-        assert_problem(localise(first, plan_id, sphere, refine="none"), 404, "unknown-floorplan")
-        wait_for(lambda: "lalaloc_grid_cache_bytes 0.0" in first.get("/metrics").text)
-
-
 @pytest.mark.one_replica
 def test_queries_continue_during_an_outage(postgres_app: Any, postgres: PostgresServer, sphere: bytes) -> None:
     with postgres_app() as client:

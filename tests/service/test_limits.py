@@ -36,26 +36,26 @@ def test_limits_match_the_settings(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "plan"),
+    ("name", "value", "status", "slug"),
     [
-        ("max_rooms", 1, TWO_ROOMS),
-        ("max_vertices", 3, TWO_ROOMS),
-        ("max_plan_vertices", 7, TWO_ROOMS),
-        ("max_extent_m", 6.5, TWO_ROOMS),
-        ("max_area_m2", 17.5, TWO_ROOMS),
-        ("max_grid_poses", 3, TWO_ROOMS),
-        ("max_plan_bytes", 100, TWO_ROOMS),
+        ("max_rooms", 1, 422, "invalid-floorplan"),
+        ("max_vertices", 3, 422, "invalid-floorplan"),
+        ("max_plan_vertices", 7, 422, "invalid-floorplan"),
+        ("max_extent_m", 6.5, 422, "invalid-floorplan"),
+        ("max_area_m2", 17.5, 422, "invalid-floorplan"),
+        ("max_grid_poses", 3, 422, "floorplan-too-large"),
+        ("max_plan_bytes", 100, 413, "upload-too-large"),
     ],
 )
 def test_plan_over_a_limit_is_refused(
-    start_app: StartApp, tmp_path: Path, name: str, value: float, plan: dict[str, Any]
+    start_app: StartApp, tmp_path: Path, name: str, value: float, status: int, slug: str
 ) -> None:
     with start_app(tmp_path, **{name: value}) as client:
         assert client.get("/limits").json()[name] == value
-        response = client.post("/floorplans", json=plan)
-        assert 400 <= response.status_code < 500
-        assert re.search(rf"\((LALALOC_)?{name}\)", response.json()["detail"], re.IGNORECASE)
-        assert re.search(rf"(at most|limit is) {value:g}", response.json()["detail"])
+        detail = assert_problem(client.post("/floorplans", json=TWO_ROOMS), status, slug)["detail"]
+        assert re.search(rf"\((LALALOC_)?{name}\)", detail, re.IGNORECASE)
+        assert re.search(rf"(at most|limit is) {value:g}", detail)
+        assert client.get("/floorplans").json()["floorplans"] == []
 
 
 def test_plan_quota_is_enforced(start_app: StartApp, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from time import sleep
 from typing import Any
 
 import numpy as np
@@ -121,18 +120,6 @@ def test_torch_is_loaded_with_the_first_job_by_latents(
         assert loaded()
 
 
-@pytest.mark.slow
-def test_concurrent_callers_get_their_own_results(pool: LpoPool, job: RefinementJob) -> None:
-    jobs = [replace(job, position_m=job.position_m + 0.05 * index) for index in range(4)]
-    alone = [_refine(pool, job, _LONG_S) for job in jobs]
-    with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda job: _refine(pool, job, _LONG_S), jobs))
-    for first, second in zip(alone, together, strict=True):
-        assert first is not None
-        assert second is not None
-        np.testing.assert_array_equal(first.position_m, second.position_m)
-
-
 def test_failing_job_leaves_the_worker_alive(pool: LpoPool, job: RefinementJob) -> None:
     workers = set(_workers())
     assert _refine(pool, replace(job, targets=np.ones((2, 3), np.float32)), _LONG_S) is None
@@ -143,32 +130,6 @@ def test_failing_job_leaves_the_worker_alive(pool: LpoPool, job: RefinementJob) 
 def test_no_time_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
     assert _refine(pool, job, 0.0) is None
     assert _refine(pool, job, -1.0) is None
-
-
-@pytest.mark.slow
-def test_idle_killed_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
-    killed, other = _workers()
-    os.kill(killed, signal.SIGKILL)
-    # The kill is not noticed yet, but the other worker runs the job.
-    assert _refine(pool, job, _LONG_S) is not None
-    wait_for(lambda: killed not in _workers() and pool.state.ready == len(_workers()) == 2, 120.0)
-    assert other in _workers()
-
-
-def test_second_worker_takes_over_from_a_killed_one(pool: LpoPool, job: RefinementJob) -> None:
-    first, second = _workers()
-    for pid in (first, second):
-        os.kill(pid, signal.SIGSTOP)
-    with ThreadPoolExecutor(1) as threads:
-        # Either of the two holds the job when the first one dies.
-        waiting = threads.submit(_refine, pool, job, _LONG_S)
-        wait_for(lambda: pool._workers.waiting == 0 and waiting.running())
-        sleep(0.3)
-        os.kill(first, signal.SIGKILL)
-        os.kill(second, signal.SIGCONT)
-        assert waiting.result() is not None
-    # A process that dies still counts as a worker for a moment.
-    wait_for(lambda: first not in _workers())
 
 
 def test_stalled_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
@@ -184,22 +145,6 @@ def test_stalled_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     for pid in stopped & set(_workers()):
         os.kill(pid, signal.SIGCONT)
     assert _refine(pool, job, _LONG_S) is not None
-
-
-@pytest.mark.slow
-def test_full_queue_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
-    for pid in _workers():
-        os.kill(pid, signal.SIGSTOP)
-    with ThreadPoolExecutor(6) as threads:
-        # Two jobs run, and four fill one client's share of the queue.
-        waiting = [threads.submit(_refine, pool, job, _LONG_S) for _ in range(6)]
-        wait_for(lambda: pool._workers.waiting == 4)
-        refused = _missed(pool, "queue-full")
-        assert _refine(pool, job, _LONG_S) is None
-        assert _missed(pool, "queue-full") == refused + 1
-        for pid in _workers():
-            os.kill(pid, signal.SIGCONT)
-        assert len([future.result() for future in waiting]) == 6
 
 
 def test_cold_pool_returns_none_and_closes(bundle: Bundle, job: RefinementJob, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,6 @@ import pytest
 
 from lalaloc_core.bundle import default_bundle
 from service.cli.entry_point import main as lalaloc_service
-from service.settings import SETTING_NAMES
 from service.storage import Store
 from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, localise, upload, wait_for
@@ -249,14 +248,6 @@ def test_replicas_of_two_models_coexist(
                     localise(client, plan_id, sphere, heading_deg=0).json()["model"]["version"] for client in (old, new)
                 ]
                 assert versions[1] == "next" != versions[0]
-
-
-def test_documented_settings_exist() -> None:
-    text = "".join(page.read_text(encoding="utf-8") for page in GUIDES.glob("*.md"))
-    named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", text))
-    known = {name.upper() for name in SETTING_NAMES}
-    # Variables of the compose files, of Caddy, and of `lalaloc mcp`.
-    assert named - known == {"API_KEY", "DATABASE_PASSWORD", "HOST", "MEMORY", "PUBLISH", "UPSTREAM"}
 
 
 def own_database(postgres: PostgresServer) -> str:

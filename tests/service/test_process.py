@@ -23,7 +23,7 @@ from service.cli.lan_access import lan_address, lan_certificate
 from service.settings import CONSTANTS, PREFIX, Settings
 from service.storage import open_store
 from tests.local_servers import free_port
-from tests.service.conftest import assert_problem, localise, upload, wait_for
+from tests.service.conftest import localise, upload, wait_for
 from tests.service.test_localise import HALL
 
 ROOT = Path(__file__).parents[2]
@@ -211,31 +211,6 @@ def test_damaged_model_stops_the_start(tiny_bundle: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_module_prints_its_address(tiny_bundle: Path, tmp_path: Path) -> None:
-    environment = environment_of(tiny_bundle, tmp_path, WORKERS="0")
-    command = [sys.executable, "-m", "service", "--port", "0"]
-    process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    try:
-        assert process.stdout is not None
-        address = process.stdout.readline().decode().strip()
-        with httpx.Client(base_url=address, timeout=30.0) as client:
-            assert client.get("/healthz").status_code == 200
-            assert_problem(client.get("/floorplans/none"), 404, "unknown-floorplan")
-    finally:
-        process.terminate()
-        process.wait(10.0)
-
-
-def test_certificate_is_kept_until_it_is_old(tmp_path: Path) -> None:
-    path = lan_certificate(tmp_path, "192.0.2.7")
-    assert path.stat().st_mode & 0o777 == 0o600
-    first = path.read_bytes()
-    assert lan_certificate(tmp_path, "192.0.2.7").read_bytes() == first
-    os.utime(path, (0.0, 0.0))
-    assert lan_certificate(tmp_path, "192.0.2.7").read_bytes() != first
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(lan_address() is None, reason="this machine is in no network")
 def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "service", "--port", "0", "--example", "--lan"]
@@ -254,6 +229,15 @@ def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp
         process.wait(30.0)
     with closing(open_store(Settings(data_dir=tmp_path))) as store:
         assert [run.revoked_at is None for run in store.keys.list_keys()] == [False]
+
+
+def test_certificate_is_kept_until_it_is_old(tmp_path: Path) -> None:
+    path = lan_certificate(tmp_path, "192.0.2.7")
+    assert path.stat().st_mode & 0o777 == 0o600
+    first = path.read_bytes()
+    assert lan_certificate(tmp_path, "192.0.2.7").read_bytes() == first
+    os.utime(path, (0.0, 0.0))
+    assert lan_certificate(tmp_path, "192.0.2.7").read_bytes() != first
 
 
 @pytest.mark.slow

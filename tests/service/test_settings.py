@@ -60,13 +60,7 @@ def test_removed_setting_is_ignored_with_a_warning(
     assert "LALALOC_MAX_ROOMS is ignored" in caplog.text
 
 
-def test_settings_named_in_promises_exist() -> None:
-    named = re.findall(r"`LALALOC_([A-Z_]+)`", (ROOT / "docs" / "reference" / "promises.md").read_text())
-    assert named
-    assert {name.lower() for name in named} - EARLIER_NAMES.keys() <= SETTING_NAMES
-
-
-def test_settings_named_in_other_pages_and_in_messages_exist() -> None:
+def test_settings_named_in_pages_and_in_messages_exist() -> None:
     patterns = ("docs/**/*.md", "docker/**/*", "service/**/*.py", "lalaloc_core/**/*.py", "examples/*.py")
     files = [path for pattern in patterns for path in ROOT.glob(pattern)]
     known = SETTING_NAMES | EARLIER_NAMES.keys() | OF_OTHERS

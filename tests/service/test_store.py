@@ -33,7 +33,6 @@ from service.storage.records import (
     Claimed,
     ComputedGrid,
     Conflict,
-    Cursor,
     GridKey,
     InProgress,
     NewPlan,
@@ -288,28 +287,6 @@ def test_deleted_plan_leaves_no_rows(store: Store) -> None:
     assert _filled_tables(store) == []
 
 
-def test_listing_is_newest_first_and_paged(store: Store) -> None:
-    ids = [f"{index:032d}" for index in range(5)]
-    for plan_id in ids:
-        _add(store, plan_id)
-    _add(store, "z" * 32, tenant="other")
-    found, after = [], None
-    while page := store.plans.list_plans("default", limit=2, after=after):
-        found += [summary.id for summary in page]
-        after = Cursor(page[-1].created_at, page[-1].id)
-    assert found == ids[::-1]
-
-
-@pytest.mark.parametrize(
-    ("part", "found"),
-    [("FLAT", {"a", "b"}), ("straße", {"c"}), ("STRASSE", {"c"}), ("äpfel", {"d"}), ("%", {"b"}), ("_", set())],
-)
-def test_name_filter_is_case_insensitive(store: Store, part: str, found: set[str]) -> None:
-    for plan_id, name in {"a": "Flat 3", "b": "flat 100%", "c": "Lange Straße 5", "d": "ÄPFEL"}.items():
-        _add(store, plan_id, name=name)
-    assert {summary.id for summary in store.plans.list_plans("default", limit=10, name=part)} == found
-
-
 def test_summaries_skip_missing_plans(store: Store) -> None:
     _add(store, "a", name="one")
     _add(store, "b", name="two")
@@ -325,29 +302,6 @@ def test_repeated_upload_is_stored_once(store: Store) -> None:
 
 
 # Revisions
-
-
-def test_old_revision_stays_readable(store: Store) -> None:
-    old = _add(store, "p")
-    smaller = FloorPlan.from_dict({**FLAT, "name": "smaller", "rooms": FLAT["rooms"][:1]})
-    new = store.plans.add_revision("default", "p", NewPlan(smaller, Original(b"new")), keep=5, expected=old)
-    current = present(store.plans.get("default", "p"))
-    assert (current.revision, current.revision_id) == (2, new.revision_id) != (1, old)
-    assert (current.plan.name, len(current.plan.rooms)) == ("smaller", 1)
-    assert current.updated_at > current.created_at
-    assert original_of(store, "p") == b"new"
-    assert store.plans.list_plans("default", limit=5)[0].name == "smaller"
-    before = present(store.plans.get("default", "p", old))
-    assert (before.revision, before.plan.name) == (1, "Flat 3")
-    assert store.plans.current_revisions([old, new.revision_id, "nonsense"]) == {new.revision_id}
-
-
-def test_unexpected_revision_is_rejected(store: Store) -> None:
-    old = _add(store, "p")
-    new = store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"2")), keep=5, expected=old)
-    with pytest.raises(RevisionMismatchError, match=new.revision_id):
-        store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"3")), keep=5, expected=old)
-    assert original_of(store, "p") == b"2"
 
 
 def test_one_of_two_concurrent_revisions_is_rejected(open_store: OpenStore) -> None:
@@ -440,22 +394,6 @@ def test_idempotency_keys_expire_after_a_day(store: Store) -> None:
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
     assert store.idempotency_keys.purge() == 1
     assert store.idempotency_keys.begin("t", "r", "new", "body") == ANSWER
-
-
-def test_api_key_is_found_by_hash_until_revoked(store: Store) -> None:
-    made = store.keys.create("t", "robot", "h1", {"read", "localise"})
-    store.keys.create("u", "other", "h2", {"read"})
-    assert store.keys.find("h1") == made
-    assert made.scopes == {"read", "localise"}
-    assert store.keys.find("h3") is None
-    assert [key.name for key in store.keys.list_keys("t")] == ["robot"]
-    store.keys.touch(made.id)
-    touched = present(store.keys.find("h1"))
-    assert touched.last_used_at is not None
-    assert store.keys.revoke(made.id)
-    assert not store.keys.revoke(made.id)
-    assert store.keys.find("h1") is None
-    assert [key.revoked_at is None for key in store.keys.list_keys()] == [False, True]
 
 
 def test_claim_of_a_fast_clock_is_expired(store: Store) -> None:

@@ -45,19 +45,22 @@ def answer_to(connection: socket.socket, send: Callable[[socket.socket], None]) 
     return received.decode("utf-8")
 
 
-def test_stalled_body_times_out(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, upload_idle_s=0.5, upload_deadline_s=60.0) as client, open_body(client) as connection:
-        answer = answer_to(connection, lambda _connection: None)
-    assert "408" in answer.splitlines()[0]
-    assert "stopped for 0.5 s (upload_idle_s)" in answer
-
-
-def test_trickling_body_times_out(start_app: StartApp, tmp_path: Path) -> None:
-    limits = {"upload_idle_s": 0.5, "upload_bytes_per_s": 1000.0, "upload_deadline_s": 60.0}
+@pytest.mark.parametrize(
+    ("limits", "sent", "reason"),
+    [
+        ({"upload_idle_s": 0.5}, b"", "stopped for 0.5 s (upload_idle_s)"),
+        ({"upload_idle_s": 0.5, "upload_bytes_per_s": 1000.0}, b"[", "behind 1000 bytes/s (upload_bytes_per_s)"),
+        ({"upload_deadline_s": 0.3}, b"", "took longer than 0.3 s (upload_deadline_s)"),
+    ],
+    ids=["stalled", "trickling", "deadline"],
+)
+def test_slow_body_times_out(
+    start_app: StartApp, tmp_path: Path, limits: dict[str, float], sent: bytes, reason: str
+) -> None:
     with start_app(tmp_path, **limits) as client, open_body(client) as connection:
-        answer = answer_to(connection, lambda connection: connection.sendall(b"["))
+        answer = answer_to(connection, lambda connection: connection.sendall(sent))
     assert "408" in answer.splitlines()[0]
-    assert "behind 1000 bytes/s (upload_bytes_per_s)" in answer
+    assert reason in answer
 
 
 def test_slow_body_above_the_minimum_rate_arrives(start_app: StartApp, tmp_path: Path) -> None:
