@@ -50,13 +50,6 @@ def with_xmp(pixels: np.ndarray, properties: str) -> bytes:
 
 
 class TestProjection:
-    def test_phone_photograph_is_perspective_by_exif(self) -> None:
-        view = opened(jpeg(view_of(MAIN), PHONE))
-        assert (view.projection, view.projection_source, view.hfov.source) == ("perspective", "exif", "exif")
-        assert math.degrees(view.hfov.value) == pytest.approx(67.3, abs=0.1)
-        assert 0.0 < math.degrees(view.hfov.sd) < 3.0
-        assert view.sphere is None
-
     def test_orientation_is_applied_before_the_lens(self) -> None:
         upright = take(sphere("living_room"), Perspective.of_hfov(480, 640, math.radians(53.1)))
         view = opened(jpeg(np.rot90(upright).copy(), PHONE, orientation=6))
@@ -356,20 +349,6 @@ class TestPatches:
         expected = 127.5 + (594.0 / 1024.0 - 0.5) * 360.0 * 256.0 / 112.5
         assert len(rows) > 100
         np.testing.assert_allclose(centres, expected, atol=1.0)
-
-
-def test_unreadable_heic_file_names_the_remedy() -> None:
-    with pytest.raises(
-        InvalidPhotographError, match=r"is a HEIC picture, which .*; save or export it as JPEG, PNG or WEBP"
-    ):
-        opened(b"\0\0\0\x18ftypheic" + bytes(100))
-
-
-def test_heic_photograph_is_read() -> None:
-    view = opened((FOLDER / "phone.heic").read_bytes())
-    assert view.hfov.source == "exif"
-    expected = opened(jpeg(view_of(MAIN), PHONE)).patches[0].pixels
-    assert np.abs(view.patches[0].pixels.astype(int) - expected).mean() < 4.0
 
 
 @pytest.mark.parametrize("field", [120.0, 130.0])

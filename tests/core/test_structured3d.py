@@ -302,20 +302,21 @@ class TestBadAnnotation:
 
     @pytest.mark.parametrize(
         ("content", "reason"),
-        [(b"", "not valid JSON"), (b"[]", "must hold an object, not list"), (b"\xff\xfe{", "not valid JSON")],
+        [
+            (None, "cannot be read: No such file"),
+            (b"", "not valid JSON"),
+            (slice(-500), "not valid JSON"),
+            (b"[]", "must hold an object, not list"),
+            (b"\xff\xfe{", "not valid JSON"),
+        ],
     )
-    def test_invalid_file_is_refused(self, root: Path, content: bytes, reason: str) -> None:
-        (root / NAME / "annotation_3d.json").write_bytes(content)
-        refused(root, reason)
-
-    def test_truncated_file_is_refused(self, root: Path) -> None:
+    def test_unreadable_file_is_refused(self, root: Path, content: bytes | slice | None, reason: str) -> None:
         path = root / NAME / "annotation_3d.json"
-        path.write_bytes(path.read_bytes()[:-500])
-        refused(root, "not valid JSON", str(path))
-
-    def test_missing_file_is_refused(self, root: Path) -> None:
-        (root / NAME / "annotation_3d.json").unlink()
-        refused(root, "cannot be read: No such file")
+        stored = path.read_bytes()
+        path.unlink()
+        if content is not None:
+            path.write_bytes(stored[content] if isinstance(content, slice) else content)
+        refused(root, reason, str(path))
 
     def test_bad_plan_is_raised_despite_problems(self, root: Path) -> None:
         (root / NAME / "annotation_3d.json").write_bytes(b"{}")

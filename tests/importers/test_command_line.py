@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
@@ -77,13 +76,6 @@ def test_plan_without_a_name_is_named_after_its_file(tmp_path: Path, capsys: pyt
     file.write_bytes(export_plan(FloorPlan.from_dict(json.loads(json.dumps(FLAT))), "svg"))
     assert main(["plan", "check", str(file)]) == 0
     assert "'Ground floor': 3 rooms" in capsys.readouterr().out
-
-
-def test_drawing_is_opaque(file: Path, tmp_path: Path):
-    out = tmp_path / "flat.png"
-    assert main(["plan", "draw", str(file), "--out", str(out)]) == 0
-    with Image.open(out) as picture:
-        assert np.asarray(picture.convert("RGBA"))[..., 3].min() == 255
 
 
 def test_anchor_option_is_used_for_imdf(file: Path, tmp_path: Path):

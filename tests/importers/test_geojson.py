@@ -49,14 +49,6 @@ def test_osm_indoor_tags_give_one_plan_per_level():
     assert shapes(ground.document)[0].area == pytest.approx(12.0, abs=1e-3)
 
 
-def test_level_option_selects_a_level():
-    with pytest.raises(InvalidFloorPlanError, match=r"2 levels: '0', '1'; choose one with `level`"):
-        import_plan(_collection(KITCHEN, HALL))
-    assert len(import_plan(_collection(KITCHEN, HALL), ImportOptions(level="1")).document["rooms"]) == 1
-    with pytest.raises(InvalidFloorPlanError, match="no level '7'; set level to one of '0', '1'"):
-        import_plan(_collection(KITCHEN, HALL), ImportOptions(level="7"))
-
-
 def test_levels_are_in_the_order_of_their_numbers_without_roofs():
     levels = [
         _feature([[0, 0], [4, 0], [4, 3]], indoor="room", name=f"room on {name}", level=name)

@@ -9,7 +9,6 @@ import re
 import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import (
     ImportOptions,
     KnownDistance,
@@ -18,7 +17,7 @@ from lalaloc_core.importers import (
     import_plan,
     import_plans,
 )
-from lalaloc_core.importers.common.plausibility import check_document, likely_unit
+from lalaloc_core.importers.common.plausibility import likely_unit
 from tests.importers.conftest import FLAT, assert_same_plan
 
 FOOT = 0.3048
@@ -66,11 +65,6 @@ def test_units_option_overrides_the_file():
     assert _import({**FLAT, "units": "mm"}, units="m").document["rooms"] == json.loads(json.dumps(FLAT["rooms"]))
 
 
-def test_unused_option_gives_a_warning():
-    (warning,) = _import(FLAT, page=3).report.warnings
-    assert warning == "the option 'page' was ignored: it does not apply to native JSON"
-
-
 def _street(*levels: object) -> list[dict]:
     return [{**FLAT, "name": f"home {number}", "level": level} for number, level in enumerate(levels)]
 
@@ -116,11 +110,6 @@ def test_faulty_plans_are_refused(document: dict, words: str):
         import_plans(json.dumps(document).encode())
 
 
-def test_level_of_a_single_plan_is_ignored_with_a_warning():
-    (warning,) = _import(FLAT, level="1").report.warnings
-    assert warning == "the option 'level' was ignored: it does not apply to native JSON"
-
-
 def test_y_down_flips_plan_and_north():
     plan = {**FLAT, "y_axis": "down", "north_deg": 30.0}
     imported = _import(plan)
@@ -143,13 +132,6 @@ def test_invalid_values_are_rejected(change: dict, message: str):
         _import({**FLAT, **change})
 
 
-def test_ceiling_of_eight_metres_suggests_feet():
-    (warning,) = _import({**FLAT, "ceiling_height_m": 8.0}).report.warnings
-    assert "8 m" in warning
-    assert "feet" in warning
-    assert "2.44 m" in warning
-
-
 def test_doors_wider_than_three_metres_give_a_warning():
     plan = json.loads(json.dumps(FLAT))
     plan["openings"] = [{"kind": "door", "line": [[0.2, 1.95], [3.6, 1.95]]}]
@@ -159,16 +141,6 @@ def test_doors_wider_than_three_metres_give_a_warning():
 @pytest.mark.parametrize(("value", "unit"), [(2.5, None), (8.0, "ft"), (250.0, "cm"), (2500.0, "mm"), (96.0, "in")])
 def test_likely_unit_of_a_ceiling(value: float, unit: str | None):
     assert likely_unit(value, (1.9, 6.0)) == unit
-
-
-def test_unreachable_isolated_and_duplicate_rooms_are_warned():
-    plan = json.loads(json.dumps(FLAT))
-    plan["rooms"].append({"name": "bedroom", "polygon": [[20, 0], [24, 0], [24, 4], [20, 4]]})
-    warnings = check_document(FloorPlan.from_dict(plan).to_dict())
-    assert any(warning == "no door or passage reaches 'bedroom'" for warning in warnings)
-    assert any("rooms farther than a wall's thickness" in warning and "'bedroom'" in warning for warning in warnings)
-    assert any("share a name: 'bedroom'" in warning for warning in warnings)
-    assert check_document(FloorPlan.from_dict(FLAT).to_dict()) == []
 
 
 def test_options_are_parsed_from_text():

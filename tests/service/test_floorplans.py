@@ -37,7 +37,7 @@ BAD_PLANS = {
     "camera above the ceiling": ({**FLAT, "camera_height_m": 2.45}, "2.4"),
     "a lone surrogate": ({**FLAT, "name": "\ud800"}, "surrogates"),
     "a control character": (_room(SQUARE, name="a\0b"), "control characters"),
-    "too wide": (_room([[0, 0], [1600, 0], [1600, 1]]), "the limit is 1000 m"),
+    "too wide": (_room([[0, 0], [1600, 0], [1600, 1]]), "the limit is 1000 m (max_extent_m); check that the coord"),
 }
 
 

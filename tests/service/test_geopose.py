@@ -344,17 +344,6 @@ def test_exported_plan_can_be_uploaded_again(client: httpx.Client, format: str, 
     assert_problem(unknown, 422, "invalid-request")
 
 
-def test_imdf_round_trip_keeps_the_anchor(client: httpx.Client) -> None:
-    plan_id = client.post("/floorplans", json=PLAN | {"anchor": ANCHOR, "north_deg": 0}).json()["id"]
-    archive = client.get(f"/floorplans/{plan_id}/export", params={"format": "imdf"}).content
-    again = client.post("/floorplans", files={"file": ("plan", archive)}).json()["plan"]
-    first, second = (Anchor(**{k: d["anchor"][k] for k in ("latitude", "longitude")}) for d in (
-        client.get(f"/floorplans/{plan_id}").json()["plan"], again))  # fmt: skip
-    corners = [np.concatenate([r["polygon"] for r in d["rooms"]]) for d in (PLAN, again)]
-    lowest = [a.to_earth(c.min(axis=0)[None]) for a, c in zip((first, second), corners, strict=True)]
-    assert lowest[0] == pytest.approx(lowest[1], abs=1e-7)
-
-
 def test_client_uploads_with_options_and_exports(client: httpx.Client) -> None:
     with Client(str(client.base_url)) as service:
         plan = service.upload_floorplan(PLAN, options={"name": "named"})

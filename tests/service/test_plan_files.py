@@ -22,10 +22,10 @@ from benchmarks.hostile_drawings import HOSTILE_PLANS
 from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
-from tests.importers.conftest import EXTERNAL_ENTITY, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture
+from tests.importers.conftest import ZIP_BOMB, dxf_file, large_picture
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_fault_files import EXPECTED, REFUSED, content_of
-from tests.importers.test_ifc import DUPLEX, ifc_flat
+from tests.importers.test_ifc import ifc_flat
 from tests.importers.test_pictures import hall_beside_a_photograph, open_hall, vector_pdf
 from tests.painted import picture_file
 from tests.service.conftest import StartApp, assert_problem, document_of, end_time_limits, localise, wait_for
@@ -148,14 +148,6 @@ def test_preview_marks_what_became_no_room(client: httpx.Client) -> None:
     assert "no-room" not in client.get(f"/floorplans/{plan['id']}/preview.svg").text
 
 
-def test_plan_in_feet_is_converted(client: httpx.Client) -> None:
-    feet = {"units": "ft", "ceiling_height": 8, "rooms": [{"polygon": [[0, 0], [12, 0], [12, 10], [0, 10]]}]}
-    plan = client.post("/floorplans", json=feet).json()
-    assert plan["area_m2"] == pytest.approx(120 * 0.3048**2, abs=1e-3)
-    assert plan["rooms"][0]["ceiling_height_m"] == pytest.approx(8 * 0.3048)
-    assert plan["warnings"] == []
-
-
 def test_likely_mistakes_are_warnings(client: httpx.Client) -> None:
     square = [[0, 0], [4, 0], [4, 3], [0, 3]]
     plan = {
@@ -222,19 +214,6 @@ def test_files_with_faults_are_read_or_refused_as_on_the_command_line(client: ht
         assert re.search(remedy, send_plan(client, content_of(name)).json()["detail"]), name
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(DUPLEX is None, reason="the sample model is not available")
-def test_sample_model_of_two_storeys(client: httpx.Client) -> None:
-    assert DUPLEX is not None
-    content = DUPLEX.read_bytes()
-    levels = assert_problem(send_plan(client, content), 422, "several-levels")["levels"]
-    assert "Level 1" in levels
-    plan = store_plan(client, content, level="Level 1")
-    assert len(plan["rooms"]) >= 8
-    assert plan["import_report"]["level"]["name"] == "Level 1"
-    assert client.get(f"/floorplans/{plan['id']}/original").content == content
-
-
 @pytest.mark.parametrize(
     ("options", "field", "words"),
     [
@@ -260,7 +239,7 @@ def test_invalid_option_is_rejected_by_name(
 
 def test_unused_option_gives_a_warning(client: httpx.Client) -> None:
     plan = store_plan(client, plan_file("native"), level="2")
-    assert any("the option 'level' was ignored" in line for line in plan["warnings"])
+    assert "the option 'level' was ignored: it does not apply to native JSON" in plan["warnings"]
 
 
 def test_picture_that_looks_like_a_photograph_is_read_with_plan_true(client: httpx.Client) -> None:
@@ -309,12 +288,7 @@ def test_idempotency_key_covers_the_options(client: httpx.Client) -> None:
 
 @pytest.fixture(scope="module")
 def strict(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    limits: dict[str, Any] = {
-        "max_unpacked_bytes": 1_000_000,
-        "max_entities": 3000,
-        "max_plan_pixels": 1_000_000,
-        "max_plan_bytes": 3_000_000,
-    }
+    limits: dict[str, Any] = {"max_unpacked_bytes": 1_000_000, "max_entities": 3000, "max_plan_pixels": 1_000_000}
     with start_app(tmp_path_factory.mktemp("strict"), **limits) as client:
         reported = client.get("/limits").json()
         assert {name: reported[name] for name in limits} == limits
@@ -332,10 +306,6 @@ class TestHostileFiles:
     def test_zip_above_the_unpacked_limit(self, strict: httpx.Client) -> None:
         self.assert_rejected(strict, ZIP_BOMB, "more than 1000000 bytes (max_unpacked_bytes)")
 
-    def test_nested_and_external_xml_entities(self, strict: httpx.Client) -> None:
-        self.assert_rejected(strict, NESTED_ENTITIES, "declares entities")
-        self.assert_rejected(strict, EXTERNAL_ENTITY, "entities")
-
     def test_drawing_with_too_many_lines(self, strict: httpx.Client) -> None:
         document = new_dxf()
         for x in range(4000):
@@ -345,26 +315,10 @@ class TestHostileFiles:
     def test_picture_with_too_many_pixels(self, strict: httpx.Client) -> None:
         self.assert_rejected(strict, large_picture(30_000), "pixels")
 
-    def test_deep_and_large_json(self, strict: httpx.Client) -> None:
-        self.assert_rejected(strict, b'{"type": "FeatureCollection", "features": ' + b"[" * 1_000_000, "nested")
-        rooms = {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0, 0]] * 290_000}]}
-        self.assert_rejected(strict, json.dumps(rooms).encode(), "vertices")
-
     @pytest.mark.slow
     def test_nested_forms_of_a_pdf(self, strict: httpx.Client) -> None:
         (plan,) = (each for each in HOSTILE_PLANS if each.title == "nested forms")
         self.assert_rejected(strict, plan.make(20_000), "two attempts ended before the end of it")
-
-    def test_endless_file(self, strict: httpx.Client) -> None:
-        def endless() -> Iterator[bytes]:
-            yield b"0\nSECTION\n"
-            for _ in range(200):
-                yield b"0\nLINE\n" * 10_000
-
-        response = strict.post("/floorplans", content=endless(), headers={"content-type": "image/vnd.dxf"})
-        problem = assert_problem(response, 413, "upload-too-large")
-        assert "the limit is 3000000 bytes (LALALOC_MAX_PLAN_BYTES)" in problem["detail"]
-        assert store_plan(strict, plan_file("svg"))["rooms"]
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from service.storage.plan_rows import plan_bytes
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
 from tests.importers.conftest import zip_file
-from tests.importers.test_ifc import DUPLEX, ifc_flat, ifc_house
+from tests.importers.test_ifc import ifc_flat, ifc_house
 from tests.importers.test_roomplan import two_stories
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, wait_for
 from tests.service.test_security import bearer, make_key
@@ -115,14 +115,6 @@ def test_levels_of_a_model_are_searched(client: httpx.Client, sphere: bytes) -> 
     query = {"venue_id": venue["id"], "refine": "none"}
     answer = client.post("/localise", data=query, files={"photo": ("p.jpg", sphere, "image/jpeg")}).json()
     assert answer["floorplan_id"] in {entry["floorplan_id"] for entry in entries}
-
-
-@pytest.mark.skipif(DUPLEX is None, reason="the sample model is not available")
-def test_sample_model_becomes_a_venue(client: httpx.Client) -> None:
-    assert DUPLEX is not None
-    venue = send(client, DUPLEX.read_bytes(), "Duplex.ifc").json()
-    names = [entry["name"] for entry in plans_of(client, venue["id"])]
-    assert names == ["Duplex – Level 1", "Duplex – Level 2"]
 
 
 def test_levels_keep_their_plan_as_a_file(client: httpx.Client) -> None:
