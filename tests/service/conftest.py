@@ -6,6 +6,7 @@ import io
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import socket
 import threading
@@ -354,6 +355,13 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     while not condition():
         assert monotonic() < deadline, "timed out waiting"
         sleep(0.05)
+
+
+def metric(client: httpx.Client, sample: str) -> float:
+    """Return the value of a sample of /metrics; 0 for a labelled one that has not occurred yet."""
+    match = re.search(rf"^{re.escape(sample)} (\S+)$", client.get("/metrics").text, re.MULTILINE)
+    assert match or "{" in sample, f"there is no metric {sample}"
+    return float(match[1]) if match else 0.0
 
 
 def end_time_limits(verdict: Literal["stalled", "stopped"] = "stalled") -> int:

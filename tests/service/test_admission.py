@@ -15,13 +15,14 @@ import pytest
 
 from service.capacity.admission_control import Slots
 from service.errors import OverloadedError, ShareExceededError
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
 from tests.service.test_localise import HALL
 
 pytestmark = pytest.mark.one_replica
 
 # Slots of one client address; one more is left for others.
 PLACES = 3
+IN_FLIGHT = "lalaloc_requests_in_flight"
 
 
 @pytest.fixture(scope="module")
@@ -42,27 +43,18 @@ def _open_upload(client: httpx.Client, path: str = "/floorplans") -> Iterator[so
         yield connection
 
 
-def _metric(client: httpx.Client, name: str) -> float:
-    lines = [line for line in client.get("/metrics").text.splitlines() if line.startswith(f"{name} ")]
-    return float(lines[0].split()[1])
-
-
-def _in_flight(client: httpx.Client) -> float:
-    return _metric(client, "lalaloc_requests_in_flight")
-
-
 def test_requests_beyond_the_limit_are_refused(small: httpx.Client) -> None:
     with ExitStack() as uploads:
         for _ in range(PLACES):
             uploads.enter_context(_open_upload(small))
-        wait_for(lambda: _in_flight(small) == PLACES)
+        wait_for(lambda: metric(small, IN_FLIGHT) == PLACES)
         response = small.post("/floorplans", json=FLAT)
         assert f"{PLACES} of your requests are in progress" in assert_problem(response, 503, "overloaded")["detail"]
         assert 1 <= int(response.headers["retry-after"]) <= 30
         # Reads have slots of their own; health and metrics need none.
         assert small.get("/floorplans").status_code == 200
         assert small.get("/healthz").status_code == 200
-    wait_for(lambda: _in_flight(small) == 0)
+    wait_for(lambda: metric(small, IN_FLIGHT) == 0)
     upload(small)
 
 
@@ -70,10 +62,10 @@ def test_refusal_does_not_wait_for_the_body(small: httpx.Client) -> None:
     with ExitStack() as uploads:
         for _ in range(PLACES):
             uploads.enter_context(_open_upload(small))
-        wait_for(lambda: _in_flight(small) == PLACES)
+        wait_for(lambda: metric(small, IN_FLIGHT) == PLACES)
         refused = uploads.enter_context(_open_upload(small))
         assert refused.recv(4096).startswith(b"HTTP/1.1 503 ")
-    wait_for(lambda: _in_flight(small) == 0)
+    wait_for(lambda: metric(small, IN_FLIGHT) == 0)
 
 
 def test_excess_query_is_refused_before_its_upload(small: httpx.Client, sphere: bytes) -> None:
@@ -95,7 +87,7 @@ def test_parallel_queries_of_one_client_are_all_answered(start_app: StartApp, tm
         plan_id = upload(client)
         answers = list(threads.map(lambda _: localise(client, plan_id, sphere, refine="none"), range(14)))
         assert [answer.status_code for answer in answers] == [200] * 14
-        assert _metric(client, "lalaloc_queries_waiting") == _metric(client, "lalaloc_queries_in_work") == 0
+        assert metric(client, "lalaloc_queries_waiting") == metric(client, "lalaloc_queries_in_work") == 0
 
 
 def test_slot_queue_is_bounded_and_round_robin() -> None:
@@ -190,7 +182,7 @@ def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, sphere: b
     with ThreadPoolExecutor(1) as threads:
         waiting = threads.submit(localise, small, preparing, sphere)
         # Until its picture is encoded, it takes the place of a query.
-        wait_for(lambda: _in_flight(small) == 1)
+        wait_for(lambda: metric(small, IN_FLIGHT) == 1)
         wait_for(lambda: localise(small, ready, sphere).status_code == 200)
         assert not waiting.done()
         assert small.delete(f"/floorplans/{preparing}").status_code == 204
@@ -204,11 +196,11 @@ def test_disconnect_frees_the_slot(small: httpx.Client, sphere: bytes) -> None:
         lines = ["POST /localise HTTP/1.1", "Host: localhost", f"Content-Type: {content_type}"]
         head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
         connection.sendall(head.encode() + body)
-        wait_for(lambda: _in_flight(small) == 1)
-    wait_for(lambda: _in_flight(small) == 0)
+        wait_for(lambda: metric(small, IN_FLIGHT) == 1)
+    wait_for(lambda: metric(small, IN_FLIGHT) == 0)
     assert 'lalaloc_disconnects_total{route="/localise"} 1.0' in small.get("/metrics").text
     assert small.delete(f"/floorplans/{preparing}").status_code == 204
-    assert _metric(small, "lalaloc_queries_in_work") == 0
+    assert metric(small, "lalaloc_queries_in_work") == 0
 
 
 def _multipart(plan_id: str, sphere: bytes) -> tuple[bytes, str]:

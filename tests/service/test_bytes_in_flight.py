@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,13 +19,14 @@ from service.capacity.admission_control import BytesInFlight
 from service.errors import BytesInFlightError, UploadTooLargeError
 from service.http.uploads import UploadLimits, ending_request, read_body, read_parts
 from service.uploaded_file import UploadedFile
-from tests.service.conftest import FLAT, StartApp, assert_problem, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, metric, wait_for
 from tests.service.test_uploads import open_body
 
 _LIMITS = UploadLimits(
     max_bytes=10**7, name="max_plan_bytes", deadline_s=60.0, idle_s=60.0, bytes_per_s=1.0, memory_bytes=100_000
 )
 _CLIENTS = st.sampled_from("abc")
+IN_FLIGHT = 'lalaloc_tenant_bytes_in_flight{tenant="default"}'
 
 
 @given(st.lists(st.tuples(_CLIENTS, st.integers(0, 60), st.booleans()), max_size=60))
@@ -65,14 +65,14 @@ def test_announced_body_takes_its_length_before_it_is_read(start_app: StartApp, 
     limits = {"upload_tenant_bytes": 150_000, "upload_total_bytes": 10**6}
     with start_app(tmp_path, **limits) as client:
         with open_body(client):
-            wait_for(lambda: _in_flight(client) == 100_000)
+            wait_for(lambda: metric(client, IN_FLIGHT) == 100_000)
             response = client.post("/floorplans", json=FLAT | {"name": "n" * 60_000})
             problem = assert_problem(response, 503, "overloaded")
             assert "have 100000 of 150000 bytes (LALALOC_UPLOAD_TENANT_BYTES)" in problem["detail"]
             assert response.headers["Retry-After"] == "2"
             # A body that fits is stored.
             assert client.post("/floorplans", json=FLAT).status_code == 201
-        wait_for(lambda: _in_flight(client) == 0)
+        wait_for(lambda: metric(client, IN_FLIGHT) == 0)
 
 
 def test_body_without_a_length_takes_steps(start_app: StartApp, tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_body_without_a_length_takes_steps(start_app: StartApp, tmp_path: Path) 
         for path in ("/floorplans", "/venues"):
             response = client.post(path, content=endless(), headers={"content-type": "application/json"})
             assert_problem(response, 503, "overloaded")
-        wait_for(lambda: _in_flight(client) == 0)
+        wait_for(lambda: metric(client, IN_FLIGHT) == 0)
 
 
 def test_bodies_beyond_the_memory_limit_are_on_disk_until_the_request_ends() -> None:
@@ -126,12 +126,6 @@ def _request(content: bytes, media: str) -> tuple[dict[str, Any], Any]:
 
 def _is_on_disk(file: UploadedFile) -> bool:
     return file._file._rolled  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _in_flight(client: httpx.Client) -> float:
-    lines = client.get("/metrics").text.splitlines()
-    name = 'lalaloc_tenant_bytes_in_flight{tenant="default"} '
-    return sum(float(line.removeprefix(name)) for line in lines if line.startswith(name))
 
 
 def test_cpu_time_is_in_metrics_and_usage(start_app: StartApp, tmp_path: Path) -> None:

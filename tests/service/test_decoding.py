@@ -23,11 +23,12 @@ from service.storage.database import Database
 from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
 from tests.painted import picture_file
-from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, metric, upload, wait_for
 
 pytestmark = pytest.mark.one_replica
 
 MIB = 2**20
+RESTARTS = 'lalaloc_pool_restarts_total{pool="decode"}'
 QUICK = {"refine": "none", "top_k": 1}
 # Black pictures do not look like spheres.
 BLACK = QUICK | {"projection": "equirectangular"}
@@ -56,11 +57,6 @@ def ready(client: httpx.Client) -> None:
     wait_for(lambda: client.get("/readyz").json()["decode_pool"]["ready"] == 1)
 
 
-def restarts(client: httpx.Client) -> float:
-    name = 'lalaloc_pool_restarts_total{pool="decode"}'
-    return float(next(line for line in client.get("/metrics").text.splitlines() if line.startswith(name)).split()[-1])
-
-
 def black_png(width: int, height: int) -> bytes:
     """Return a PNG of zeros, a thousandth of the size of its pixels."""
 
@@ -86,7 +82,7 @@ def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, sp
             ready(client)
             os.kill(decoder(), signal.SIGKILL)
             assert localise(client, plan_id, sphere, **QUICK).status_code == 200
-        assert restarts(client) == 3.0
+        assert metric(client, RESTARTS) == 3.0
     assert decoders() == [], "the pool left a process behind"
 
 
@@ -98,10 +94,10 @@ def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, spher
         ready(client)
         problem = assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-photograph")
         assert "more than 0.2 s of CPU time (decode_stall_s)" in problem["detail"]
-        wait_for(lambda: restarts(client) == 1.0)
+        wait_for(lambda: metric(client, RESTARTS) == 1.0)
         ready(client)
         assert_problem(localise(client, plan_id, slow, **BLACK), 422, "invalid-photograph")
-        wait_for(lambda: restarts(client) == 2.0)
+        wait_for(lambda: metric(client, RESTARTS) == 2.0)
         assert localise(client, plan_id, sphere, **QUICK).status_code == 200
 
 

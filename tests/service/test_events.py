@@ -22,7 +22,7 @@ from service.http.events import PLAN_ENDS, ProgressEvents, plan_look
 from service.schemas.stored_plans import PlanEvent
 from service.settings import Settings
 from service.storage.store import Store
-from tests.service.conftest import FLAT, StartApp, assert_problem, serve, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, metric, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
 from tests.service.test_security import bearer, id_of, make_key
 
@@ -49,11 +49,6 @@ def _follow(client: httpx.Client, plan_id: str) -> list[Event]:
     with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
         assert response.status_code == 200
         return list(_events(response))
-
-
-def _streams(client: httpx.Client) -> float:
-    lines = client.get("/metrics").text.splitlines()
-    return float(next(line for line in lines if line.startswith("lalaloc_streams ")).split()[1])
 
 
 def test_ready_plan_has_one_event(client: httpx.Client) -> None:
@@ -100,7 +95,7 @@ def test_deleting_a_plan_ends_its_streams(start_app: StartApp, tmp_path: Path) -
             assert next(events)[0] == "progress"
             assert client.delete(f"/floorplans/{plan_id}").status_code == 204
             assert list(events)[-1] == ("deleted", {"status": "deleted"})
-        wait_for(lambda: _streams(client) == 0)
+        wait_for(lambda: metric(client, "lalaloc_streams") == 0)
 
 
 def test_replaced_plan_streams_its_new_revision(start_app: StartApp, tmp_path: Path) -> None:
@@ -134,7 +129,7 @@ def test_streams_are_limited_and_freed_on_disconnect(start_app: StartApp, tmp_pa
             assert_problem(refused, 503, "overloaded")
             assert int(refused.headers["retry-after"]) >= 1
             assert client.get(f"/floorplans/{plan_id}").status_code == 200
-        wait_for(lambda: _streams(client) == 0)
+        wait_for(lambda: metric(client, "lalaloc_streams") == 0)
         with client.stream("GET", url) as again:
             assert next(_events(again))[0] == "progress"
 

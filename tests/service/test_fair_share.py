@@ -23,7 +23,7 @@ from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
 
 WORST = "127.0.0.2"
 
@@ -373,11 +373,6 @@ def _sent(client: httpx.Client, head: str) -> Iterator[socket.socket]:
         yield connection
 
 
-def _gauge(client: httpx.Client, name: str) -> float:
-    lines = client.get("/metrics").text.splitlines()
-    return float(next(line for line in lines if line.startswith(f"{name} ")).split()[1])
-
-
 @pytest.mark.one_replica
 def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     head = "POST /localise HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
@@ -385,7 +380,7 @@ def test_stalled_uploads_leave_slots_for_others(start_app: StartApp, tmp_path: P
         plan_id = upload(client)
         for _ in range(10):
             attack.enter_context(_sent(client, f"{head}Content-Length: 100000\r\n\r\n--b"))
-        wait_for(lambda: _gauge(client, "lalaloc_requests_in_flight") == 6)
+        wait_for(lambda: metric(client, "lalaloc_requests_in_flight") == 6)
         assert localise(client, plan_id, sphere, refine="none").status_code == 200
         assert client.post("/floorplans", json=FLAT).status_code == 201
         with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
@@ -404,11 +399,11 @@ def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Pa
         for _ in range(10):
             attack.enter_context(_sent(client, f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n"))
         # The limit of the address, which is more than the reads that run at a time.
-        wait_for(lambda: _gauge(client, "lalaloc_reads_in_flight") == 6)
+        wait_for(lambda: metric(client, "lalaloc_reads_in_flight") == 6)
         sleep(0.2)
         assert client.get(path).content == content
         # The slot of an answer is free a moment after its last byte.
-        wait_for(lambda: _gauge(client, "lalaloc_reads_in_flight") == 6)
+        wait_for(lambda: metric(client, "lalaloc_reads_in_flight") == 6)
         assert client.get("/floorplans").status_code == 200
 
 
@@ -420,7 +415,7 @@ def test_streams_of_one_client_leave_slots_for_others(start_app: StartApp, tmp_p
         path = f"/floorplans/{upload(client, hall, wait=False)}"
         for _ in range(6):
             attack.enter_context(_sent(client, f"GET {path}/events HTTP/1.1\r\nHost: localhost\r\n\r\n"))
-        wait_for(lambda: _gauge(client, "lalaloc_streams") == 3)
+        wait_for(lambda: metric(client, "lalaloc_streams") == 3)
         with client.stream("GET", f"{path}/events") as events:
             assert events.status_code == 200
             assert next(events.iter_lines()).startswith("retry")
@@ -441,11 +436,11 @@ def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path
         for _ in range(3):
             connection = attack.enter_context(_sent(client, "\r\n".join([*lines, "", ""])))
             connection.sendall(request.read())
-        wait_for(lambda: _gauge(client, "lalaloc_queries_in_work") >= 2)
+        wait_for(lambda: metric(client, "lalaloc_queries_in_work") >= 2)
         # Three pictures of 1.5 s and more: one after the other they would be in the way for 4.5 s.
         begin = monotonic()
         assert localise(client, plan_id, sphere, refine="none").status_code == 200
-        assert _gauge(client, "lalaloc_queries_in_work") >= 2, f"all were done after {monotonic() - begin:.1f} s"
+        assert metric(client, "lalaloc_queries_in_work") >= 2, f"all were done after {monotonic() - begin:.1f} s"
 
 
 def _endless_picture() -> bytes:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from service.errors import InvalidRequestError
 from service.routes.dependencies import cursor_text, parse_cursor
 from service.storage.records import Cursor
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 NEVER = "0123456789abcdef" * 2
@@ -335,11 +335,6 @@ def replicas(postgres: PostgresServer, start_app: StartApp, tmp_path: Path) -> I
         yield [first, second]
 
 
-def _cached_bytes(client: httpx.Client) -> float:
-    lines = client.get("/metrics").text.splitlines()
-    return float(next(line for line in lines if line.startswith("lalaloc_grid_cache_bytes ")).split()[1])
-
-
 def test_replicas_see_changes_at_once(replicas: list[httpx.Client], sphere: bytes) -> None:
     first, second = replicas
     created = first.post("/floorplans", json=FLAT).json()
@@ -348,9 +343,9 @@ def test_replicas_see_changes_at_once(replicas: list[httpx.Client], sphere: byte
     replaced = second.put(url, json=_named("new")).json()
     assert first.get(url).json()["name"] == "new"
     assert localise(first, created["id"], sphere, refine="none").json()["floorplan_revision"] == replaced["revision"]
-    wait_for(lambda: _cached_bytes(first) > 0 and _cached_bytes(second) > 0)
+    wait_for(lambda: all(metric(replica, "lalaloc_grid_cache_bytes") > 0 for replica in replicas))
     assert first.delete(url).status_code == 204
     assert_problem(second.get(url), 404, "unknown-floorplan")
     assert_problem(localise(second, created["id"], sphere), 404, "unknown-floorplan")
     # Both caches are empty.
-    wait_for(lambda: _cached_bytes(first) == _cached_bytes(second) == 0, 10.0)
+    wait_for(lambda: all(metric(replica, "lalaloc_grid_cache_bytes") == 0 for replica in replicas), 10.0)

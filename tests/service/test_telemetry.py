@@ -30,7 +30,7 @@ from service.telemetry import LOGGER_NAME, RequestLogFields
 from service.telemetry.logs import JsonFormatter, TraceContext, child_of, parse_traceparent
 from service.telemetry.tracing import Tracing, otlp_exporter
 from tests.local_servers import QuietHandler, http_server
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
 
 ROOT = Path(__file__).parents[2]
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
@@ -78,12 +78,6 @@ def log() -> Iterator[Log]:
     logger.setLevel(level)
 
 
-def _metric(client: httpx.Client, sample: str) -> float:
-    """Return the value of a sample; 0 if there is none yet."""
-    match = re.search(rf"^{re.escape(sample)} (\S+)$", client.get("/metrics").text, re.MULTILINE)
-    return float(match[1]) if match else 0.0
-
-
 def test_query_has_one_log_line(client: httpx.Client, log: Log, sphere: bytes) -> None:
     plan_id = upload(client)
     response = localise(client, plan_id, sphere, refine="vdr")
@@ -112,13 +106,13 @@ def test_log_has_route_template_and_plan_id(client: httpx.Client, log: Log) -> N
 def test_refused_request_logs_its_reason(client: httpx.Client, log: Log) -> None:
     plan_id = upload(client)
     refusals = 'lalaloc_rejections_total{reason="invalid-photograph"}'
-    before = _metric(client, refusals)
+    before = metric(client, refusals)
     response = localise(client, plan_id, b"no picture")
     assert_problem(response, 422, "invalid-photograph")
     (line,) = log.of_request(response.headers["x-request-id"])
     assert (line["status"], line["rejection"], line["plan"]) == (422, "invalid-photograph", plan_id)
     assert set(line["stages_ms"]) == {"upload", "decode"}
-    assert _metric(client, refusals) == before + 1.0
+    assert metric(client, refusals) == before + 1.0
 
 
 def test_early_refusal_logs_its_route(start_app: StartApp, tmp_path: Path, log: Log) -> None:
@@ -133,18 +127,18 @@ def test_early_refusal_logs_its_route(start_app: StartApp, tmp_path: Path, log: 
 @pytest.mark.one_replica
 def test_disconnect_is_counted_and_logged(client: httpx.Client, log: Log) -> None:
     gone = 'lalaloc_disconnects_total{route="/floorplans"}'
-    before = _metric(client, gone)
+    before = metric(client, gone)
     with socket.create_connection((client.base_url.host, client.base_url.port or 80)) as connection:
         head = (
             "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
             "Content-Length: 1000\r\nX-Request-ID: gone-1\r\n\r\n"
         )
         connection.sendall(head.encode() + b"{" * 10)
-        wait_for(lambda: _metric(client, "lalaloc_requests_in_flight") == 1.0)
+        wait_for(lambda: metric(client, "lalaloc_requests_in_flight") == 1.0)
     (line,) = log.of_request("gone-1")
     assert line["gave_up"] is True
     assert line["bytes_in"] == 10
-    assert _metric(client, gone) == before + 1.0
+    assert metric(client, gone) == before + 1.0
 
 
 def test_log_has_no_keys_or_queries(client: httpx.Client, log: Log, sphere: bytes) -> None:
