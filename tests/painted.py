@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+import zlib
 from typing import Any
 
 import numpy as np
@@ -50,3 +52,13 @@ def picture_file(picture: Image.Image | np.ndarray, kind: str = "PNG", **options
     image = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     image.save(buffer, kind, **options)
     return buffer.getvalue()
+
+
+def png_chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png_file(width: int, height: int, packed: bytes, *, depth: int = 8, colour_type: int = 2) -> bytes:
+    """Return a PNG of packed rows, which begin with their filter types and may be fewer than the header states."""
+    header = struct.pack(">IIBBBBB", width, height, depth, colour_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IDAT", packed) + png_chunk(b"IEND", b"")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import struct
-import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -26,7 +25,7 @@ from lalaloc_core.photograph.spheres import read_sphere
 from lalaloc_core.render.sampling import pose_grid
 from lalaloc_core.render.sweep import profiles_at
 from tests.growth import assert_no_worse_than_linear
-from tests.painted import picture_file
+from tests.painted import picture_file, png_chunk
 from tests.strategies import plan_document, plan_of, plans, rectangle, spiral
 
 
@@ -307,18 +306,14 @@ def _segment(marker: int, content: bytes) -> bytes:
     return bytes([0xFF, marker]) + struct.pack(">H", len(content) + 2) + content
 
 
-def _chunk(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-
 _PIECES = {
     "comments": ("JPEG", 2, _segment(0xFE, b"")),
     "exif": ("JPEG", 2, _segment(0xE1, b"Exif\0\0x")),
     "xmp": ("JPEG", 2, _segment(0xE1, b"http://ns.adobe.com/xap/1.0/\0<a/>")),
     "profiles": ("JPEG", 2, _segment(0xE2, b"ICC_PROFILE\0\1\1x")),
     "fill bytes": ("JPEG", 2, b"\xff"),
-    "texts": ("PNG", 33, _chunk(b"tEXt", b"a\0b")),
-    "unknown chunks": ("PNG", 33, _chunk(b"abCd", b"")),
+    "texts": ("PNG", 33, png_chunk(b"tEXt", b"a\0b")),
+    "unknown chunks": ("PNG", 33, png_chunk(b"abCd", b"")),
 }
 
 
@@ -344,7 +339,7 @@ def test_million_segments_are_refused_early() -> None:
     for piece, message in ((_segment(0xFE, b""), "2000 segments"), (_segment(0xE1, b"Exif\0\0x"), "16 Exif segments")):
         with pytest.raises(InvalidPhotographError, match=message):
             read_sphere(jpeg[:2] + piece * 1_000_000 + jpeg[2:], height=32, width=64)
-    for piece in (_chunk(b"tEXt", b"a\0b"), _chunk(b"IDAT", b"")):
+    for piece in (png_chunk(b"tEXt", b"a\0b"), png_chunk(b"IDAT", b"")):
         with pytest.raises(InvalidPhotographError, match="20000 chunks"):
             read_sphere(png[:33] + piece * 1_000_000 + png[33:], height=32, width=64)
 
@@ -353,6 +348,6 @@ def test_usual_segment_counts_are_accepted() -> None:
     jpeg, png = _picture("JPEG"), _picture("PNG")
     # 40 MB of metadata in the largest possible segments, and pixels in the smallest chunks that encoders write.
     check_segments(jpeg[:2] + _segment(0xE2, bytes(65_000)) * 640 + jpeg[2:])
-    check_segments(png[:33] + _chunk(b"IDAT", bytes(4096)) * 10_000)
+    check_segments(png[:33] + png_chunk(b"IDAT", bytes(4096)) * 10_000)
     for content in (jpeg, png, _picture("WEBP"), b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"):
         check_segments(content)

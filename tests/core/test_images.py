@@ -19,6 +19,8 @@ from lalaloc_core.photograph import StatedCamera, open_photograph
 from lalaloc_core.photograph.file_segments import count_scans
 from lalaloc_core.photograph.spheres import NEUTRAL, PhotographLimits, read_sphere
 from tests.growth import assert_no_worse_than_linear
+from tests.painted import picture_file as encoded
+from tests.painted import png_chunk, png_file
 
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
@@ -33,24 +35,8 @@ def picture(mode: str = "RGB", height: int = 128) -> Image.Image:
     return Image.fromarray(pixels).convert(mode)
 
 
-def encoded(image: Image.Image, kind: str = "PNG", **options: object) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, kind, **options)
-    return buffer.getvalue()
-
-
 def read(content: bytes, limits: PhotographLimits | None = None) -> np.ndarray:
     return read_sphere(content, height=HEIGHT, width=WIDTH, limits=limits)
-
-
-def png(width: int, height: int, rows: bytes, *, depth: int = 8, colour_type: int = 2) -> bytes:
-    """Return a PNG of rows, each starting with its filter type."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour_type, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 def of_scans(width: int, height: int, added: int) -> bytes:
@@ -120,8 +106,7 @@ class TestAccepted:
         values[:, :128] = 1000
         content = encoded(Image.fromarray(values))
         # Pillow does not write tRNS for 16 bits; the chunk follows IHDR's 33 bytes.
-        chunk = b"tRNS" + struct.pack(">H", 1000)
-        content = content[:33] + struct.pack(">I", 2) + chunk + struct.pack(">I", zlib.crc32(chunk)) + content[33:]
+        content = content[:33] + png_chunk(b"tRNS", struct.pack(">H", 1000)) + content[33:]
         pixels = read(content)
         assert pixels[10, 10].tolist() == list(NEUTRAL)
         assert pixels[10, 50].tolist() == [200, 200, 200]
@@ -132,7 +117,7 @@ class TestAccepted:
         if channels in (2, 4):
             values[..., -1] = 65535
         rows = b"".join(b"\0" + row.tobytes() for row in values)
-        pixels = read(png(256, 128, rows, depth=16, colour_type=colour_type)).astype(float)
+        pixels = read(png_file(256, 128, zlib.compress(rows), depth=16, colour_type=colour_type)).astype(float)
         colours = values[..., :3] if channels > 2 else values[..., :1].repeat(3, -1)
         expected = colours.astype(float).reshape(HEIGHT, 4, WIDTH, 4, 3).mean(axis=(1, 3)) / 257.0
         np.testing.assert_allclose(pixels, expected, atol=1.5)
@@ -319,7 +304,7 @@ class TestRefused:
     def test_decompression_bomb_is_refused_by_header(self, width: int, height: int) -> None:
         # The file has almost no pixels.
         with pytest.raises(InvalidPhotographError, match=r"pixels|damaged"):
-            read(png(width, height, b"\0" * 100))
+            read(png_file(width, height, zlib.compress(b"\0" * 100)))
 
     def test_jpeg_with_many_scans_is_refused(self) -> None:
         content = of_scans(14_000, 7_000, 400)

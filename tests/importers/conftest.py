@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 import zipfile
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportedPlan
+from tests.painted import png_file
 
 # Two rooms above a corridor, walls of 10 cm; a door to each room, a window, a column, a free-standing wall.
 FLAT = {
@@ -66,11 +65,7 @@ def dxf_file(document: Any) -> bytes:
 
 def large_picture(side_px: int) -> bytes:
     """Return a PNG picture whose header claims a size that its data does not have."""
-    chunks = ((b"IHDR", struct.pack(">IIBBBBB", side_px, side_px, 8, 0, 0, 0, 0)), (b"IEND", b""))
-    parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    return png_file(side_px, side_px, b"", colour_type=0)
 
 
 ZIP_BOMB = zip_file({"unit.geojson": b" " * 3_000_000})

@@ -22,7 +22,7 @@ from service.decoding import decoder as decoding
 from service.storage.database import Database
 from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
-from tests.painted import picture_file
+from tests.painted import picture_file, png_file
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, metric, upload, wait_for
 
 pytestmark = pytest.mark.one_replica
@@ -59,15 +59,10 @@ def ready(client: httpx.Client) -> None:
 
 def black_png(width: int, height: int) -> bytes:
     """Return a PNG of zeros, a thousandth of the size of its pixels."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     packer = zlib.compressobj(9)
     rows = bytes(1 + 3 * width)
     data = b"".join([packer.compress(rows) for _ in range(height)]) + packer.flush()
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return png_file(width, height, data)
 
 
 def black(width: int, height: int, kind: str, **options: object) -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
-import struct
 import threading
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -28,6 +27,7 @@ from lalaloc_core.photograph.spheres import read_sphere
 from service.grids import builder
 from service.schemas import TimingsAnswer
 from service.settings import Settings
+from tests.painted import png_file
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
@@ -180,23 +180,13 @@ def test_unknown_plan_is_not_found(client: httpx.Client, sphere: bytes) -> None:
     assert "'nowhere'" in assert_problem(localise(client, "nowhere", sphere), 404, "unknown-floorplan")["detail"]
 
 
-def _png_header(width: int, height: int) -> bytes:
-    """Return a PNG with a header only; a decoder of its pixels would find none."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
-
-
 BAD_PICTURES = {
     "empty": (b"", "empty"),
     "no picture": (b"\x89PNG but not really", "not a readable"),
     "GIF": (b"GIF89a", "is a GIF picture"),
     "truncated": (encode_picture(512, 256, "JPEG")[:3000], "rows are missing, because the file ends too early"),
-    "bomb": (_png_header(20_000, 10_000), "pixels"),
-    "twelve thousand wide": (_png_header(16_000, 8_000), "16000 x 8000"),
+    "bomb": (png_file(20_000, 10_000, zlib.compress(b"\0")), "pixels"),
+    "twelve thousand wide": (png_file(16_000, 8_000, zlib.compress(b"\0")), "16000 x 8000"),
     "strip": (encode_picture(800, 256, "PNG"), "800 x 256 is a strip; send projection=cylindrical and hfov_deg"),
     "tiny": (encode_picture(64, 32, "PNG"), "the minimum is 64"),
 }

@@ -22,8 +22,8 @@ from benchmarks.hostile_drawings import HOSTILE_PLANS
 from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
-from tests.importers.conftest import ZIP_BOMB, dxf_file, large_picture
 from tests.importers.conftest import FLAT as PLAN
+from tests.importers.conftest import ZIP_BOMB, dxf_file, large_picture
 from tests.importers.test_fault_files import EXPECTED, REFUSED, content_of
 from tests.importers.test_ifc import ifc_flat
 from tests.importers.test_pictures import hall_beside_a_photograph, open_hall, vector_pdf
