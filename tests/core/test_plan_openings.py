@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, room_type_from_label
 from lalaloc_core.learn.synth.homes.plans import generate_home
@@ -267,12 +267,6 @@ def test_ids_from_names_are_unique() -> None:
     assert ids == ["bed-room-2", "bed-room-3", "küche", "bed-room-2-2", "bed-room"]
     document["rooms"][0]["id"] = "bed-room"
     assert "2 rooms have the id 'bed-room'; ids must be unique" in refused(FloorPlan.from_dict, document)
-
-
-def test_room_types_round_trip() -> None:
-    for name in ROOM_TYPES:
-        assert with_room(type=name).rooms[0].type == name
-    assert "type" not in with_room().to_dict()["rooms"][0]
 
 
 def test_room_type_from_label() -> None:

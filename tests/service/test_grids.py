@@ -499,18 +499,6 @@ def test_queue_of_grids_is_limited(store: Store, make_grids: MakeGrids, encoders
     assert all(future.result(60.0) is not None for future in (*futures, own))
 
 
-def test_grid_of_replaced_revision_is_cancelled(
-    store: Store, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
-    grids, record = make_grids(store), _add(store, HALL)
-    future = _begun(encoders, grids, record)
-    new = store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
-    grids.forget({record.revision_id})
-    encoders.go_on.set()
-    assert isinstance(future.exception(30.0), PlanNotReadyError)
-    assert len(grids.compute(new, 1.5).result(30.0).poses) == 110
-
-
 # Outages of the database
 
 

@@ -26,13 +26,6 @@ ROOT = Path(__file__).parents[2]
 PROBES = {"/healthz", "/readyz", "/metrics"}
 
 
-def test_unknown_routes_and_methods_are_problems(client: httpx.Client) -> None:
-    assert_problem(client.get("/no/such/route"), 404, "not-found")
-    response = client.put("/localise")
-    assert_problem(response, 405, "method-not-allowed")
-    assert response.headers["allow"] == "POST"
-
-
 @pytest.mark.parametrize(
     ("method", "path", "faults"),
     [

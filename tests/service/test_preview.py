@@ -52,15 +52,6 @@ def test_valid_name_gives_well_formed_svg(name: str) -> None:
     assert drawn == name.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd")
 
 
-def test_camera_is_drawn_at_its_pose() -> None:
-    root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(FLAT), Marker(x_m=1.5, y_m=2.0, heading_deg=90.0)))
-    camera = next(group for group in root.iter(f"{SVG}g") if group.get("class") == "camera")
-    assert camera.attrib["transform"] == "translate(1.5000 -2.0000)"
-    wedge = camera.find(f"{SVG}path")
-    assert wedge is not None
-    assert wedge.attrib["transform"] == "rotate(90.000)"
-
-
 @pytest.mark.parametrize("size_m", [(400.0, 3.0), (3.0, 400.0), (400.0, 300.0), (3.0, 2.0)])
 def test_scale_bar_lies_within_the_drawing(size_m: tuple[float, float]) -> None:
     (width, height) = size_m
