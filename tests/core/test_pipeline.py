@@ -19,7 +19,7 @@ from lalaloc_core.localise.belief import HEADING_SEPARATION, photograph_heading
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
-from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedProfile, Query
+from lalaloc_core.localise.query import CameraHeight, Candidate, Query
 from lalaloc_core.localise.refine import RefinementJob, RefinementResult
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise
@@ -385,20 +385,3 @@ class TestHeadings:
             noisy = localised(encoders, optimiser, plan, (0.9, 1.1), known=False, noise=1e-6, seed=seed).candidates[0]
             assert noisy.position_m == pytest.approx(first.position_m, abs=1e-3)
             assert noisy.hypothesis == first.hypothesis
-
-
-def test_corridor_is_determined_across_but_not_along(encoders: PhotographEncoder, optimiser: PoseRefiner) -> None:
-    # The ends are visible at a few azimuths only.
-    plan = plan_of(rectangle(60.0, 1.8))
-    position = np.array([[30.0, 0.8]])
-    _, profile_m = encoders.layouts.poses(plan, PoseSet(position, np.array([0])), np.zeros(1), CAMERA_M)
-    # The prediction is uncertain beyond 6 m, as in a photograph of a plain corridor.
-    far = profile_m > 6.0
-    profile = PredictedProfile(np.log(np.minimum(profile_m, 9.0)), np.where(far, 3.0, LOG_SCALE))
-    latents = np.eye(1, encoders.manifest.latent_size)
-    query = Query(latents, np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(CAMERA_M), profile=profile)
-    grid = build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
-    found = localise(plan, grid, encoders.layouts, query, refiner=optimiser.refine)
-    assert found.posterior.position < 0.2
-    information = present(found.candidates[0].information)
-    assert information[0, 0] < 1e-3 * information[1, 1]

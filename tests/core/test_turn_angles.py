@@ -46,15 +46,6 @@ def misses_deg(angles: Sequence[TurnAngles], headings: Float[np.ndarray, "n"]) -
     return np.degrees(np.abs(wrap_angle(missed - np.median(missed))))
 
 
-def test_overlapping_photographs_give_their_angles() -> None:
-    angles = angles_of_turn(turn_views(photographs(ONCE_AROUND, hfov_deg=53.0)))
-    assert {angle.group for angle in angles} == {0}
-    assert misses_deg(angles, np.radians(ONCE_AROUND)).max() < 0.5
-    assert all(0.0 < angle.heading_sd < math.radians(3.0) for angle in angles[1:])
-    pitches_deg = [math.degrees(angle.attitude.pitch) for angle in angles]
-    assert pitches_deg == pytest.approx([4.0, -6.0, 1.0] * 5, abs=0.8)
-
-
 @pytest.mark.slow
 def test_closed_turn_fixes_the_field_of_view() -> None:
     taken = photographs(ONCE_AROUND)

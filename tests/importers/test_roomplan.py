@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import ImportOptions, import_plan, import_plans
+from lalaloc_core.importers import import_plan
 from tests.importers.conftest import lines, shapes
 
 
@@ -66,13 +66,6 @@ def test_floors_replace_walls_with_gaps():
     scan["walls"] = [wall for wall in scan["walls"] if wall["dimensions"][0] != 4.0]
     (room,) = shapes(import_plan(json.dumps(scan).encode()).document)
     assert room.area == pytest.approx(21.0)
-
-
-def test_stories_are_plans():
-    ground, first = _scan(), _scan(1)
-    both = json.dumps({key: ground[key] + first[key] for key in ground}).encode()
-    assert [plan.level.number for plan in import_plans(both) if plan.level] == [0.0, 1.0]
-    assert len(import_plan(both, ImportOptions(level="1")).document["rooms"]) == 2
 
 
 @pytest.mark.parametrize(

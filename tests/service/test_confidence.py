@@ -192,54 +192,6 @@ def test_compass_heading_is_corrected(shipped: httpx.Client, shots: list[Shot], 
     assert np.median(off) < 0.4 * TOLERANCE_DEG
 
 
-COPIES = 4
-
-
-def copies(plan: dict[str, Any]) -> dict[str, Any]:
-    """Return a plan with `COPIES` copies of a home side by side."""
-    corners = np.concatenate([room["polygon"] for room in plan["rooms"]])
-    step_m = float(np.ptp(corners[:, 0])) + 3.0
-
-    def moved(points: list[list[float]], k: int) -> list[list[float]]:
-        return [[x + k * step_m, y] for x, y in points]
-
-    rooms, openings = [], []
-    for k in range(COPIES):
-        rooms += [{**room, "id": f"{room['id']}-{k}", "polygon": moved(room["polygon"], k)} for room in plan["rooms"]]
-        openings += [
-            {key: value for key, value in opening.items() if key != "rooms"} | {"line": moved(opening["line"], k)}
-            for opening in plan.get("openings", [])
-        ]
-    return {**plan, "rooms": rooms, "openings": openings}
-
-
-@pytest.mark.slow
-def test_copies_of_a_home_share_the_probability(shipped: httpx.Client, shots: list[Shot], given: bool) -> None:
-    # The first room is so narrow that the grid fits its copies unequally.
-    for shot in shots[:3]:
-        answer = ask(
-            shipped, upload(shipped, copies(shot.plan)), shot.picture, shot.heading_deg if given else None, top_k=10
-        )
-        assert answer["confidence"] <= 1.0 / COPIES + 0.05
-        shares = [candidate["probability"] for candidate in answer["candidates"]]
-        assert sum(shares) <= 1.0
-
-
-@pytest.mark.slow
-def test_contradicted_heading_is_searched_with_a_warning(
-    shipped: httpx.Client, shots: list[Shot], homes: list[str]
-) -> None:
-    warned = 0
-    for shot, home in list(zip(shots, homes, strict=True))[:6]:
-        answer = ask(shipped, home, shot.picture, (shot.heading_deg + 120.0) % 360.0)
-        if any("contradicts" in warning for warning in answer["warnings"]):
-            warned += 1
-            assert answer["heading_source"] == "searched"
-        else:
-            assert answer["confidence"] < 0.5
-    assert warned >= 3
-
-
 @pytest.mark.slow
 def test_right_heading_is_not_doubted(right: list[dict[str, Any]], given: bool) -> None:
     assert sum(bool(answer["warnings"]) for answer in right) <= 1

@@ -217,21 +217,6 @@ def test_postgresql_dump_restores_everything(
         assert stored(client, sphere) == before
 
 
-@pytest.mark.slow
-def test_postgresql_dump_restores_albums(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
-    dump = str(tmp_path / "backup.dump")
-    shipped: dict[str, Any] = {"database_url": own_database(postgres), "bundle": default_bundle()}
-    shipped |= {"request_deadline_s": 90.0, "sweep_s": 0.2}
-    with start_app(tmp_path / "a", **shipped) as client:
-        before = pinned_album(client)
-        run(postgres, "pg_dump", "--format=custom", f"--file={dump}", shipped["database_url"])
-        assert client.delete(f"/albums/{before[0]}").status_code == 204
-    options = present(re.search(r"pg_restore (.*) --dbname", PAGE))
-    run(postgres, "pg_restore", *options[1].split(), f"--dbname={shipped['database_url']}", dump)
-    with start_app(tmp_path / "b", **shipped) as client:
-        assert is_same_album(client, *before)
-
-
 def test_replicas_of_two_models_coexist(
     start_app: StartApp, postgres: PostgresServer, tiny_bundle: Path, sphere: bytes, tmp_path: Path
 ) -> None:

@@ -174,27 +174,6 @@ def test_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) ->
     assert not {"torch", "safetensors", "matplotlib", "onnx"} & set(report["modules"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("variable", "value", "message"),
-    [
-        ("LALALOC_WORKER", "2", "unknown setting LALALOC_WORKER"),
-        ("LALALOC_BUNDLE", "no/such", "no model bundle at"),
-        ("LALALOC_DATABASE_URL", "mysql://somewhere/plans", "mysql"),
-    ],
-)
-def test_invalid_setting_stops_the_start(
-    tiny_bundle: Path, tmp_path: Path, variable: str, value: str, message: str
-) -> None:
-    environment = environment_of(tiny_bundle, tmp_path) | {variable: value}
-    command = [sys.executable, "-m", "service", "--port", "0"]
-    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
-    # The address is not printed either.
-    assert (done.returncode, done.stdout) == (1, "")
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
 def test_damaged_model_stops_the_start(tiny_bundle: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "model"
     shutil.copytree(tiny_bundle, damaged)
