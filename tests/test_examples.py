@@ -63,11 +63,6 @@ def test_doors_join_two_rooms_and_windows_face_outside() -> None:
     assert sum(opening.kind == "door_open" for opening in openings) == 4
 
 
-def test_every_room_has_a_door() -> None:
-    with_door = {opening.room for opening in example_home().openings if opening.kind != "window"}
-    assert with_door == set(range(len(PLAN.rooms)))
-
-
 def _localisation(**changes: Any) -> Localisation:
     position = Position(1.0, 2.0)
     localisation = Localisation(

@@ -15,9 +15,10 @@ from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from tests.client.conftest import FailingServer, Planned
 from tests.client.test_retries import LOCALISATION
-from tests.service.conftest import FLAT, upload
+from tests.service.conftest import FLAT, metric, upload
 
 COUNT = 14
+REJECTED = 'lalaloc_rejections_total{reason="overloaded"}'
 ONCE = RetryPolicy(attempts=1)
 # Four concurrent queries, three of them per client, and no queue.
 APP_SETTINGS = {"max_queries": 4, "max_waiting_queries": 0}
@@ -33,18 +34,12 @@ def query_on_threads(client: Client, plan_id: str, sphere: bytes) -> list[Any]:
         return list(threads.map(lambda _: client.localise(plan_id, sphere, refine="none"), range(COUNT)))
 
 
-def count_rejections(service: httpx.Client) -> float:
-    lines = service.get("/metrics").text.splitlines()
-    prefix = 'lalaloc_rejections_total{reason="overloaded"} '
-    return next(float(line.removeprefix(prefix)) for line in lines if line.startswith(prefix))
-
-
 def test_concurrent_queries_are_not_rejected(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    before = count_rejections(app)
+    before = metric(app, REJECTED)
     with Client(str(app.base_url), retry=ONCE) as client:
         answers = query_on_threads(client, plan_id, sphere)
     assert len({answer.position for answer in answers}) == 1
-    assert count_rejections(app) == before
+    assert metric(app, REJECTED) == before
 
 
 def test_concurrent_queries_with_asyncio_are_not_rejected(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
@@ -52,20 +47,20 @@ def test_concurrent_queries_with_asyncio_are_not_rejected(app: httpx.Client, pla
         async with AsyncClient(str(app.base_url), retry=ONCE) as client:
             return await asyncio.gather(*(client.localise(plan_id, sphere, refine="none") for _ in range(COUNT)))
 
-    before = count_rejections(app)
+    before = metric(app, REJECTED)
     answers = asyncio.run(query())
     assert len(answers) == COUNT
-    assert count_rejections(app) == before
+    assert metric(app, REJECTED) == before
 
 
 @pytest.mark.slow
 def test_rejected_queries_are_retried(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    before = count_rejections(app)
+    before = metric(app, REJECTED)
     patient = RetryPolicy(attempts=40, total_s=60.0)
     with Client(str(app.base_url), retry=patient, max_queries=COUNT) as client:
         answers = query_on_threads(client, plan_id, sphere)
     assert len(answers) == COUNT
-    assert count_rejections(app) > before
+    assert metric(app, REJECTED) > before
 
 
 def test_sequential_queries_do_not_fetch_limits(failing: FailingServer) -> None:

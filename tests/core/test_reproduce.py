@@ -19,7 +19,6 @@ from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, Budget, t
 from lalaloc_core.evaluate.reproduce.paper_tables import (
     COLUMN_TITLES,
     PAPER_SETTING,
-    SHIPPED,
     TABLES,
     Figure,
     RowQuery,
@@ -61,24 +60,6 @@ def result(dataset: str = "synthetic scenes (seed 0)", budget: str = "small") ->
 
 
 class TestTables:
-    def test_every_table_of_the_paper_exists(self) -> None:
-        names = [table.name for table in TABLES]
-        assert len(set(names)) == len(names)
-        assert {table.source for table in TABLES} == {
-            "tab:localisation",
-            "tab:1m_refinement",
-            "tab:furniture",
-            "tab:refinement",
-            "fig:vdr_sample",
-            "tab:oracle",
-            "tab:1m_oracle",
-            "tab:e2e",
-            "tab:lalalearning",
-            "tab:layoutarch",
-            "tab:rgblearning",
-            "tab:time",
-        }
-
     @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
     def test_columns_and_models_exist(self, table) -> None:
         fields = set(Scores.__dataclass_fields__) | set(StageScores.__dataclass_fields__)
@@ -96,14 +77,6 @@ class TestTables:
             bundle = None if ask.model is None else str(tiny_bundle)
             info = run_info(method=ask.method, kind=ask.kind, settings=dict(ask.settings), bundle=bundle)
             assert build_method(info) is not None
-
-    def test_main_table_has_both_architectures(self) -> None:
-        (table,) = (table for table in TABLES if table.name == "localisation")
-        queries = {(row.query.method, row.query.kind, row.query.model) for row in table.rows}
-        for kind in ("layout", "photograph"):
-            assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= queries
-            assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= queries
-        assert ("oracle", "layout", None) in queries
 
 
 class TestPaperSetting:

@@ -310,11 +310,6 @@ class TestStreams:
         assert all(index >= 100 and index % 2 == worker for worker, indices in drawn.items() for index in indices)
         assert not set(drawn[0]) & set(drawn[1])
 
-    def test_resumed_stage_uses_new_homes(self) -> None:
-        seen = list(itertools.islice(layout_stage().batches(0, 0), 2))
-        resumed = next(layout_stage().batches(2, 0))
-        assert not any(torch.equal(resumed["profile_m"], batch["profile_m"]) for batch in seen)
-
     def test_sphere_batch_holds_pictures_with_layouts(self) -> None:
         batch = next(sphere_batches())
         count, (height, width) = TINY.image.batch, TINY.image_size

@@ -16,7 +16,6 @@ import pytest
 
 from service.telemetry import LOGGER_NAME
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
-from tests.service.test_disk_space import limit_pages
 
 pytestmark = pytest.mark.one_replica
 
@@ -56,20 +55,6 @@ def test_deleted_data_folder_is_store_unavailable(start_app: StartApp, tmp_path:
         problem = assert_problem(client.post("/floorplans", json=FLAT), 503, "store-unavailable")
         assert "removed or replaced" in problem["detail"]
         assert_problem(client.get("/floorplans"), 503, "store-unavailable")
-
-
-def test_full_disk_is_a_507_and_reads_continue(
-    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    limit_pages(monkeypatch, 250)
-    with start_app(tmp_path) as client:
-        plan_id = upload(client)
-        _sqlite(tmp_path)
-        padded = json.dumps(FLAT).encode() + b" " * 1_100_000
-        answer = client.post("/floorplans", content=padded, headers={"content-type": "application/json"})
-        assert_problem(answer, 507, "store-full")
-        assert answer.headers["retry-after"] == "60"
-        assert client.get(f"/floorplans/{plan_id}").status_code == 200
 
 
 def _truncate(path: Path) -> None:

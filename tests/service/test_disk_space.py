@@ -229,6 +229,8 @@ def test_full_database_refuses_uploads_and_allows_deletions(
         while (answer := client.post("/floorplans", content=padded, headers=headers)).status_code == 201:
             plans.append(answer.json()["id"])
         assert_problem(answer, 507, "store-full")
+        assert answer.headers["retry-after"] == "60"
+        assert client.get(f"/floorplans/{plans[0]}").status_code == 200
         for plan_id in plans:
             assert client.delete(f"/floorplans/{plan_id}").status_code == 204
         upload(client)
