@@ -1,4 +1,4 @@
-"""Fixtures of the core's tests: the tiny bundle, opened, and the material library."""
+"""Fixtures of the core's tests: the tiny bundle, opened, the shipped manifest, and the material library."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from tests.core.questions import PaintedSession
+from tests.core.shipped import bundle
 
 
 @pytest.fixture(autouse=True)
@@ -38,6 +39,12 @@ def encoders(opened_bundle: Bundle) -> PhotographEncoder:
 def optimiser(opened_bundle: Bundle) -> PoseRefiner:
     """LPO with the tiny bundle."""
     return PoseRefiner.from_bundle(opened_bundle)
+
+
+@pytest.fixture(scope="session")
+def manifest() -> Manifest:
+    """Manifest of the shipped model."""
+    return bundle().manifest
 
 
 @pytest.fixture(scope="session")

@@ -3,13 +3,12 @@
 import math
 from dataclasses import replace
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFilter
 
-from lalaloc_core.bundle import AlbumWeights, Bundle, default_bundle
+from lalaloc_core.bundle import AlbumWeights
 from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
 from lalaloc_core.evaluate.runs.albums import pin_figures
 from lalaloc_core.floorplan import FloorPlan
@@ -29,51 +28,42 @@ from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_roo
 from lalaloc_core.localise.album.solve import MAX_ROOMS, calibrated, misread_share, solve_album
 from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
+from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import open_photograph
 from lalaloc_core.photograph.exif import Taken
+from tests.core.shipped import bundle, encoder
+from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
 from tests.strategies import present
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 NAMES = ("kitchen.jpg", "study.jpg", "bedroom.jpg", "living_room.jpg", "phone.jpg")
 ROOMS = ("kitchen", "study", "bedroom", "living-room", "living-room")
 
 
 @pytest.fixture(scope="module")
-def bundle() -> Bundle:
-    return Bundle.open(default_bundle())
-
-
-@pytest.fixture(scope="module")
-def encoder(bundle: Bundle) -> PhotographEncoder:
-    return PhotographEncoder(bundle, threads=1)
-
-
-@pytest.fixture(scope="module")
-def ground(encoder: PhotographEncoder) -> AlbumGround:
+def ground() -> AlbumGround:
     plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_text())
-    grid = build_grid(plan, encoder.layouts, step_m=0.5, camera_height_m=plan.camera_height_m, latents=False)
+    grid = build_grid(plan, encoder().layouts, step_m=0.5, camera_height_m=plan.camera_height_m, latents=False)
     return AlbumGround.of_plan("flat", plan, grid)
 
 
 @pytest.fixture(scope="module")
-def photographs(encoder: PhotographEncoder) -> list[AlbumPhotograph]:
-    manifest, found = encoder.manifest, []
+def photographs() -> list[AlbumPhotograph]:
+    manifest, found = encoder().manifest, []
     for number, name in enumerate(NAMES):
         content = (EXAMPLES / name).read_bytes()
         view = open_photograph(
             content, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest), purpose="album"
         )
         taken = Taken(at=datetime(2026, 5, 1, 12, number), make="M", model="P", width=1280, height=960)
-        found.append(photograph_entry(name, encoder.with_features(view), taken))
+        found.append(photograph_entry(name, encoder().with_features(view), taken))
     return found
 
 
-def test_entry_is_small_and_read_as_it_was(bundle: Bundle, photographs: list[AlbumPhotograph]) -> None:
+def test_entry_is_small_and_read_as_it_was(photographs: list[AlbumPhotograph]) -> None:
     for photograph in photographs:
-        content = photograph.to_bytes(bundle)
-        read = read_entry(content, bundle)
+        content = photograph.to_bytes(bundle())
+        read = read_entry(content, bundle())
         assert len(content) <= MAX_ENTRY_BYTES
         assert (read.id, read.taken) == (photograph.id, photograph.taken)
         np.testing.assert_array_equal(read.colours, photograph.colours)
@@ -84,8 +74,8 @@ def test_entry_is_small_and_read_as_it_was(bundle: Bundle, photographs: list[Alb
     assert not photographs[0].photograph.features or not photographs[0].photograph.features.outputs["ring"].any()
 
 
-def test_damaged_entries_are_refused(bundle: Bundle, photographs: list[AlbumPhotograph]) -> None:
-    content = photographs[-1].to_bytes(bundle)
+def test_damaged_entries_are_refused(photographs: list[AlbumPhotograph]) -> None:
+    content = photographs[-1].to_bytes(bundle())
     rng = np.random.default_rng(0)
     damaged = [b"", b"LLAP", content[:100], content[:-7], content[:6] + b"\xff" * 4 + content[10:], b"x" * 30_000]
     for _ in range(60):
@@ -94,14 +84,12 @@ def test_damaged_entries_are_refused(bundle: Bundle, photographs: list[AlbumPhot
         damaged.append(bytes(changed))
     for hostile in damaged:
         with pytest.raises((InvalidEntryError, InvalidFeaturesError, InvalidInputError)):
-            read_entry(hostile, bundle)
+            read_entry(hostile, bundle())
 
 
-def test_all_photographs_are_pinned_to_their_rooms(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
+def test_all_photographs_are_pinned_to_their_rooms(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     seen: list[int] = []
-    album = solve_album(ground, encoder, photographs, progress=seen.append)
+    album = solve_album(ground, encoder(), photographs, progress=seen.append)
     assert seen == [1, 2, 3, 4, 5]
     assert [pin.photograph_id for pin in album.pins] == list(NAMES)
     assert [pin.pose.room_id for pin in album.pins if pin.pose] == list(ROOMS)
@@ -117,22 +105,18 @@ def test_all_photographs_are_pinned_to_their_rooms(
 
 
 @pytest.mark.slow
-def test_solve_does_not_depend_on_the_order_of_arrival(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
-    pins = solve_album(ground, encoder, photographs).pins
-    assert solve_album(ground, encoder, photographs[::-1]).pins == pins[::-1]
+def test_solve_does_not_depend_on_the_order_of_arrival(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
+    pins = solve_album(ground, encoder(), photographs).pins
+    assert solve_album(ground, encoder(), photographs[::-1]).pins == pins[::-1]
 
 
 @pytest.mark.slow
-def test_memory_gives_the_same_pins_after_storage(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
+def test_memory_gives_the_same_pins_after_storage(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     memory = AlbumMemory()
-    album = solve_album(ground, encoder, photographs, memory=memory)
+    album = solve_album(ground, encoder(), photographs, memory=memory)
     stored = AlbumMemory.read(memory.to_bytes())
     seen: list[int] = []
-    again = solve_album(ground, encoder, photographs, memory=stored, progress=seen.append)
+    again = solve_album(ground, encoder(), photographs, memory=stored, progress=seen.append)
     assert seen == []
     assert again.pins == album.pins
     with pytest.raises(InvalidEntryError):
@@ -140,41 +124,14 @@ def test_memory_gives_the_same_pins_after_storage(
 
 
 @pytest.mark.slow
-def test_memory_of_another_plan_is_not_used(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
+def test_memory_of_another_plan_is_not_used(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     memory = AlbumMemory()
-    solve_album(ground, encoder, photographs[:1], memory=memory)
+    solve_album(ground, encoder(), photographs[:1], memory=memory)
     document = ground.plan.to_dict() | {"name": "changed"}
     changed = AlbumGround.of_plan("flat", FloorPlan.from_dict(document), ground.grid)
     seen: list[int] = []
-    solve_album(changed, encoder, photographs[:1], memory=memory, progress=seen.append)
+    solve_album(changed, encoder(), photographs[:1], memory=memory, progress=seen.append)
     assert seen == [1]
-
-
-def _corrected(photograph: AlbumPhotograph, **stated: object) -> AlbumPhotograph:
-    return replace(photograph, correction=read_correction(stated))
-
-
-def test_corrections_are_certain(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
-    corrected = [
-        _corrected(photographs[0], kind="room", plan_id="flat", room_id="bedroom"),
-        _corrected(photographs[1], kind="position", plan_id="flat", x_m=7.0, y_m=2.0, heading_deg=90.0),
-        _corrected(photographs[2], kind="elsewhere"),
-        photographs[3],
-    ]
-    first, second, third, fourth = solve_album(ground, encoder, corrected).pins
-    assert first.state == second.state == "corrected"
-    assert first.pose is not None
-    assert first.pose.room_id == "bedroom"
-    assert second.pose is not None
-    assert (second.pose.x_m, second.pose.y_m, second.pose.room_id) == (7.0, 2.0, "kitchen")
-    assert second.pose.heading_deg == pytest.approx(90.0)
-    assert (third.state, third.pose) == ("set_aside", None)
-    assert third.reason
-    assert fourth.state in ("sure", "uncertain")
 
 
 def _facade(seed: int) -> bytes:
@@ -197,45 +154,39 @@ def _facade(seed: int) -> bytes:
 
 
 @pytest.mark.slow
-def test_photographs_of_a_facade_are_set_aside(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
-    size = {"sphere_size": sphere_size(encoder.manifest), "patch_size": patch_size(encoder.manifest)}
+def test_photographs_of_a_facade_are_set_aside(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
+    size = {"sphere_size": sphere_size(encoder().manifest), "patch_size": patch_size(encoder().manifest)}
     outside = [
         photograph_entry(
             f"outside {number}",
-            encoder.with_features(open_photograph(_facade(number), purpose="album", **size)),
+            encoder().with_features(open_photograph(_facade(number), purpose="album", **size)),
             replace(photographs[-1].taken, at=datetime(2026, 5, 1, 12, 10 + number)),
         )
         for number in range(2)
     ]
-    pins = solve_album(ground, encoder, [*photographs, *outside]).pins
+    pins = solve_album(ground, encoder(), [*photographs, *outside]).pins
     assert [each.pose.room_id for each in pins[:-2] if each.pose] == list(ROOMS)
     for pin in pins[-2:]:
         assert (pin.state, pin.pose) == ("set_aside", None)
         assert "façades and gardens" in pin.reason
 
 
-def test_photograph_that_shows_no_wall_is_not_sure(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
+def test_photograph_that_shows_no_wall_is_not_sure(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     phone = photographs[-1]
     assert phone.photograph.features is not None
     outputs = dict(phone.photograph.features.outputs)
     outputs["seen"] = np.full_like(outputs["seen"], 0.0)
     features = replace(phone.photograph.features, outputs=outputs)
     blind = replace(phone, id="blind", photograph=replace(phone.photograph, features=features))
-    pin = solve_album(ground, encoder, [blind]).pins[0]
+    pin = solve_album(ground, encoder(), [blind]).pins[0]
     assert pin.state in ("set_aside", "uncertain")
     assert pin.within_1m < 0.2
 
 
-def test_correction_of_an_unknown_room_is_refused(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
-    unknown = _corrected(photographs[0], kind="room", plan_id="flat", room_id="ballroom")
+def test_correction_of_an_unknown_room_is_refused(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
+    correction = read_correction({"kind": "room", "plan_id": "flat", "room_id": "ballroom"})
     with pytest.raises(InvalidCorrectionError, match="room 'ballroom' of plan 'flat', which does not exist"):
-        solve_album(ground, encoder, [unknown])
+        solve_album(ground, encoder(), [replace(photographs[0], correction=correction)])
 
 
 @pytest.mark.parametrize(
@@ -259,12 +210,10 @@ def test_correction_survives_storage() -> None:
     assert read_correction(correction.to_document()) == correction
 
 
-def test_an_id_is_added_once(
-    ground: AlbumGround, encoder: PhotographEncoder, photographs: list[AlbumPhotograph]
-) -> None:
+def test_an_id_is_added_once(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     with pytest.raises(InvalidInputError, match="same id"):
-        solve_album(ground, encoder, [photographs[0], photographs[0]])
-    assert solve_album(ground, encoder, []).pins == ()
+        solve_album(ground, encoder(), [photographs[0], photographs[0]])
+    assert solve_album(ground, encoder(), []).pins == ()
 
 
 def test_evidence_of_photographs_of_one_spot_counts_once() -> None:
@@ -418,13 +367,13 @@ def test_moved_pins_are_those_that_moved_far_or_changed_their_room() -> None:
 
 
 @pytest.mark.slow
-def test_places_that_are_too_large_are_refused(encoder: PhotographEncoder, photographs: list[AlbumPhotograph]) -> None:
+def test_places_that_are_too_large_are_refused(photographs: list[AlbumPhotograph]) -> None:
     squares = [
         {"polygon": [[x, y], [x + 1, y], [x + 1, y + 1], [x, y + 1]]}
         for x, y in (divmod(number, 40) for number in range(MAX_ROOMS + 1))
     ]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": squares})
-    grid = build_grid(plan, encoder.layouts, step_m=1.0, camera_height_m=1.5, latents=False)
+    grid = build_grid(plan, encoder().layouts, step_m=1.0, camera_height_m=1.5, latents=False)
     ground = AlbumGround.of_plan("large", plan, grid)
     with pytest.raises(InvalidInputError, match=r"1001 rooms and .* at most 1000 rooms"):
-        solve_album(ground, encoder, photographs)
+        solve_album(ground, encoder(), photographs)

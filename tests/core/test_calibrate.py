@@ -13,15 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import (
-    COHORT,
-    Bundle,
-    ConfidenceModel,
-    LogisticModel,
-    MatchingWeights,
-    default_bundle,
-    write_manifest,
-)
+from lalaloc_core.bundle import COHORT, Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
 from lalaloc_core.errors import BundleError, InvalidInputError
 from lalaloc_core.evaluate.calibrate.calibration import (
     fit_appearance,
@@ -51,6 +43,7 @@ from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, localise
 from lalaloc_core.localise.search.retrieval import grid_costs
 from tests.core.questions import perfect_query, prediction_of
+from tests.core.shipped import encoder
 from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
@@ -327,7 +320,7 @@ class TestAppearance:
         scenes = [GeneratedScenes(homes=1, shots_per_home=1).load("validation-00000")]
         with pytest.raises(BundleError, match="predicts no openings"):
             fit_appearance(encoders, scenes)
-        rows = np.array(fit_appearance(PhotographEncoder(Bundle.open(default_bundle()), threads=1), scenes))
+        rows = np.array(fit_appearance(encoder(), scenes))
         assert MatchingWeights(appearance=tuple(map(tuple, rows.tolist()))).appearance is not None
         # Half of the result is the prior, in which walls look like walls.
         assert rows[0, 0] > 0.49

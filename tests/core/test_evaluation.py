@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import InvalidInputError, RunError
@@ -21,11 +20,10 @@ from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearanc
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m, score
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph, facts_of
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from tests.core.questions import run_info
+from tests.core.shipped import encoder
+from tests.core.taken import EXAMPLES
 from tests.strategies import present
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture
@@ -227,8 +225,7 @@ def test_options_of_single_photographs_are_refused_for_albums(
 
 
 def test_figures_cover_every_sphere_and_azimuth() -> None:
-    encoders = PhotographEncoder(Bundle.open(default_bundle()), threads=1)
-    figures = azimuth_figures(encoders, GeneratedScenes(homes=1, shots_per_home=3))
+    figures = azimuth_figures(encoder(), GeneratedScenes(homes=1, shots_per_home=3))
     assert figures["n"] == 3
     assert figures["median_error"] < 0.2
     recall, confusion = figures["classes"]["recall"], figures["confusion"]

@@ -33,6 +33,7 @@ from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.photograph import StatedCamera
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.film import read_film
+from tests.core.shipped import bundle
 from tests.core.taken import jpeg, sphere, take
 from tests.strategies import present
 
@@ -92,8 +93,7 @@ def test_film_of_a_home_looks_along_its_headings() -> None:
     assert float(np.abs(ahead.astype(float) - beside).mean()) > 5.0
 
 
-def test_bundle_without_confidence_of_turns_has_that_of_views() -> None:
-    manifest = Bundle.open(default_bundle()).manifest
+def test_bundle_without_confidence_of_turns_has_that_of_views(manifest: Manifest) -> None:
     view = present(manifest.view)
     own = present(manifest.confidence)
     assert replace(manifest, view=replace(view, turn_confidence=None)).confidence_for(view=True, turn=True) is (
@@ -134,7 +134,7 @@ def test_calibration_of_turns_changes_their_confidence_alone(
 
 
 def test_turn_is_told_from_a_single_view() -> None:
-    model, camera = LocalModel(Bundle.open(default_bundle())), Perspective.of_hfov(270, 360, math.radians(53.0))
+    model, camera = LocalModel(bundle()), Perspective.of_hfov(270, 360, math.radians(53.0))
     room, stated = sphere("kitchen"), StatedCamera(projection="perspective", hfov_deg=53.0)
     first, second = (model.open(jpeg(take(room, camera, heading_deg=angle)), stated) for angle in (0.0, 40.0))
     assert not model.encoder.query(first, None, CameraHeight(1.5)).is_turn

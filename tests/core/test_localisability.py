@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import Bundle, Manifest, default_bundle
+from lalaloc_core.bundle import Manifest
 from lalaloc_core.bundle.fitted_parameters import correlated
 from lalaloc_core.conditions import CONDITIONS, HARDEST, condition_of, parts_of
 from lalaloc_core.draw.heat import localisability_svg
@@ -23,11 +23,6 @@ from lalaloc_core.localise.localisability.predicted_localisability import (
 )
 from lalaloc_core.localise.localisability.reports import report_of, summary_of
 from lalaloc_core.render.sampling import PoseSet
-
-
-@pytest.fixture(scope="module")
-def manifest() -> Manifest:
-    return Bundle.open(default_bundle()).manifest
 
 
 def _rooms(*sizes: tuple[float, float, float]) -> FloorPlan:

@@ -8,18 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import Bundle, Manifest, default_bundle
+from lalaloc_core.bundle import Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Support
 from lalaloc_core.localise.localisability.next_step import Known, NextStep, next_step, next_steps
 from lalaloc_core.localise.localisability.reports import words_of
 
 _FIELD = math.radians(80.0)
-
-
-@pytest.fixture(scope="module")
-def manifest() -> Manifest:
-    return Bundle.open(default_bundle()).manifest
 
 
 def _plan(*, passages: bool = False) -> FloorPlan:

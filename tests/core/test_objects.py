@@ -7,57 +7,37 @@ import math
 import struct
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import Bundle, MatchingWeights, default_bundle
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Confidence, is_outside, reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.encode.view_encoder import objects_of_views, outside_odds
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost
 from lalaloc_core.localise.match.matching_cost import MatchingCost
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, PredictedRoomType, Query, SeenObject, SeenObjects
 from lalaloc_core.localise.search.pipeline import localise
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph import Photograph
 from tests.core.questions import perfect_query
-from tests.core.taken import jpeg, sphere, take
+from tests.core.shipped import bundle, encoder, level_view
 from tests.strategies import present
 
-FIELD_DEG = 80.0
 # Bed of the hotel room: azimuth from the sphere's centre.
 BED_DEG = 90.0
 HEIGHT = CameraHeight(1.5)
 
 
-@cache
-def bundle() -> Bundle:
-    return Bundle.open(default_bundle())
-
-
-@cache
-def encoder() -> PhotographEncoder:
-    return PhotographEncoder(bundle(), threads=1)
-
-
-def view(name: str, heading_deg: float, width: int = 640, height: int = 480) -> Photograph:
-    """Return a level view of a real room."""
-    camera = Perspective.of_hfov(width, height, math.radians(FIELD_DEG))
-    return open_photograph(
-        jpeg(take(sphere(f"real/{name}"), camera, heading_deg=heading_deg)),
-        sphere_size=sphere_size(bundle().manifest),
-        patch_size=patch_size(bundle().manifest),
-        stated=StatedCamera(projection="perspective", hfov_deg=FIELD_DEG, pitch_deg=0.0, roll_deg=0.0),
-    )
+def view(heading_deg: float, width: int = 640, height: int = 480) -> Photograph:
+    """Return a level view of the hotel room."""
+    return level_view("real/hotel_room", heading_deg, 0.0, width=width, height=height)
 
 
 def query(*views: tuple[Photograph, float]) -> Query:
@@ -75,7 +55,7 @@ def plan(*types: str) -> FloorPlan:
 
 
 def test_bed_is_seen_where_it_stands() -> None:
-    shown = present(query((view("hotel_room", BED_DEG - 15.0), 0.0)).objects)
+    shown = present(query((view(BED_DEG - 15.0), 0.0)).objects)
     beds = [seen for seen in shown.objects if seen.name in ("four-poster bed", "quilt", "pillows", "couch")]
     assert beds
     assert math.degrees(beds[0].azimuth) == pytest.approx(15.0, abs=25.0)
@@ -83,7 +63,7 @@ def test_bed_is_seen_where_it_stands() -> None:
 
 
 def test_low_confidence_of_a_photograph_without_household_objects_has_its_reason() -> None:
-    room = present(query((view("hotel_room", BED_DEG), 0.0)).objects)
+    room = present(query((view(BED_DEG), 0.0)).objects)
     assert room.outside < 0.0
     assert outside_odds(np.full(63, 0.0005)) > 3.0
     outside = replace(room, outside=3.0)
@@ -95,7 +75,7 @@ def test_low_confidence_of_a_photograph_without_household_objects_has_its_reason
 
 
 def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
-    asked, rooms = (view("hotel_room", BED_DEG), 0.0), plan("kitchen", "bedroom")
+    asked, rooms = (view(BED_DEG), 0.0), plan("kitchen", "bedroom")
     grid = build_grid(rooms, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     alone = query(asked)
     found = localise(rooms, grid, encoder().layouts, alone, refine="none")
@@ -123,13 +103,13 @@ def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
 def test_room_of_the_seen_type_wins_among_equal_rooms() -> None:
     types = ("kitchen", "bathroom", "bedroom", "unknown")
     equal = plan(*types)
-    asked = query((view("hotel_room", BED_DEG), 0.0))
+    asked = query((view(BED_DEG), 0.0))
     grid = build_grid(equal, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     assert types[localise(equal, grid, encoder().layouts, asked, refine="none").candidates[0].room_index] == "bedroom"
 
 
 def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
-    asked = query((view("hotel_room", BED_DEG), 0.0))
+    asked = query((view(BED_DEG), 0.0))
     assert asked.objects is not None
     cost = MatchingCost(plan("bedroom", "bathroom", "unknown"), asked, 0.1, MatchingWeights(), MatchingConfig())
     bedroom, bathroom, unknown = cost.room_costs[0]
@@ -141,7 +121,7 @@ def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
 
 
 def test_views_of_one_spot_share_their_objects() -> None:
-    bed, wall = view("hotel_room", BED_DEG), view("hotel_room", 0.0)
+    bed, wall = view(BED_DEG), view(0.0)
     alone, both = query((bed, 0.0)).objects, query((wall, 0.0), (bed, math.radians(BED_DEG))).objects
     assert alone is not None
     assert both is not None
@@ -169,7 +149,7 @@ def test_photograph_without_recognised_objects_tells_no_type() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640), (1280, 320), (200, 900)])
 def test_thumbnails_have_a_bounded_size(width: int, height: int) -> None:
-    thumbnail = present(view("hotel_room", BED_DEG, width, height).thumbnail)
+    thumbnail = present(view(BED_DEG, width, height).thumbnail)
     rows, columns = thumbnail.shape[:2]
     assert rows % 32 == columns % 32 == 0
     assert 0.7 < rows * columns / (320 * 256) < 1.3
@@ -177,7 +157,7 @@ def test_thumbnails_have_a_bounded_size(width: int, height: int) -> None:
 
 
 def test_features_carry_objects_and_files_of_version_1_are_read() -> None:
-    photograph = view("hotel_room", BED_DEG)
+    photograph = view(BED_DEG)
     content = FeatureEncoder(bundle(), threads=1).features(photograph)
     expected, found = (query((read, 0.0)).objects for read in (photograph, read_features(content, bundle())))
     assert expected is not None
@@ -194,7 +174,7 @@ def test_features_carry_objects_and_files_of_version_1_are_read() -> None:
 
 
 def test_features_with_impossible_objects_are_refused() -> None:
-    content = FeatureEncoder(bundle(), threads=1).features(view("hotel_room", BED_DEG))
+    content = FeatureEncoder(bundle(), threads=1).features(view(BED_DEG))
     with pytest.raises(InvalidFeaturesError, match="object_azimuth"):
         read_features(content[:-4] + np.float32(9.0).tobytes(), bundle())
 
@@ -218,7 +198,7 @@ def furnished(*fixtures: tuple[str, float, float]) -> FloorPlan:
 
 
 def test_room_that_draws_the_seen_bed_wins_among_equal_rooms() -> None:
-    asked = query((view("hotel_room", BED_DEG), 0.0))
+    asked = query((view(BED_DEG), 0.0))
     for kind, expected in (("bed", 2), ("stove", None)):
         drawn = furnished((kind, 11.7, 2.2))
         grid = build_grid(drawn, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)

@@ -4,49 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
-from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size, sphere_size
 from lalaloc_core.localise.match import PlaceCost
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, WallDirection
 from lalaloc_core.localise.search.pipeline import localise
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph import StatedCamera, open_photograph
 from tests.core.questions import perfect_query
-from tests.core.taken import jpeg, sphere, take
+from tests.core.shipped import bundle, encoder, level_view
+from tests.core.taken import jpeg
 from tests.strategies import present
 
 HYPOTHESES = 72
-
-
-@cache
-def bundle() -> Bundle:
-    return Bundle.open(default_bundle())
-
-
-@cache
-def encoder() -> PhotographEncoder:
-    return PhotographEncoder(bundle(), threads=1)
-
-
-def view(name: str, heading_deg: float, tilt_deg: float | None = None) -> Photograph:
-    """Return a level view of a sphere, 80 degrees wide, whose tilt is stated or estimated."""
-    camera = Perspective.of_hfov(640, 480, math.radians(80.0))
-    return open_photograph(
-        jpeg(take(sphere(name), camera, heading_deg=heading_deg)),
-        sphere_size=sphere_size(bundle().manifest),
-        patch_size=patch_size(bundle().manifest),
-        stated=StatedCamera(projection="perspective", hfov_deg=80.0, pitch_deg=tilt_deg, roll_deg=tilt_deg),
-    )
 
 
 def rooms(*turned_deg: float) -> FloorPlan:
@@ -67,13 +43,13 @@ def apart_deg(first: float, second: float) -> float:
 @pytest.mark.parametrize(("name", "walls_deg"), [("living_room", 60.0), ("real/hotel_room", 30.0)])
 def test_direction_turns_with_the_camera(name: str, walls_deg: float) -> None:
     for heading in (50.0, 75.0, 100.0, 125.0):
-        walls = present(view(name, heading).wall_direction)
+        walls = present(level_view(name, heading).wall_direction)
         assert apart_deg(math.degrees(walls.value) + heading, walls_deg) < 2.0
         assert walls.source == "estimated"
 
 
 def test_direction_is_told_beside_a_stated_tilt() -> None:
-    free, stated = view("study", 25.0).wall_direction, view("study", 25.0, 0.0).wall_direction
+    free, stated = level_view("study", 25.0).wall_direction, level_view("study", 25.0, 0.0).wall_direction
     assert free is not None
     assert stated is not None
     assert apart_deg(math.degrees(free.value), math.degrees(stated.value)) < 0.1
@@ -153,7 +129,7 @@ def test_merged_plans_keep_the_directions_of_their_rooms() -> None:
 
 
 def test_features_keep_the_direction() -> None:
-    photograph = view("study", 25.0)
+    photograph = level_view("study", 25.0)
     content = FeatureEncoder(bundle(), threads=1).features(photograph)
     read = read_features(content, bundle()).wall_direction
     assert photograph.wall_direction is not None
@@ -171,7 +147,7 @@ def test_features_keep_the_direction() -> None:
 
 
 def test_query_has_the_directions_of_all_photographs_of_a_spot() -> None:
-    first, second = view("study", 0.0), view("study", 70.0)
+    first, second = level_view("study", 0.0), level_view("study", 70.0)
     asked = encoder().query(first, None, CameraHeight(1.5), others=[(second, math.radians(70.0))])
     assert len(asked.wall_directions) == 2
     one, other = (math.degrees(each.azimuth) for each in asked.wall_directions)

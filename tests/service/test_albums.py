@@ -243,13 +243,15 @@ def test_correction_is_certain_and_can_be_undone(
     wait_until_solved(client, solved)
     after = client.get(f"/albums/{solved}/photographs/{before['id']}").json()
     if room is None:
-        assert after["pin"]["place"] is None
+        assert (after["pin"]["state"], after["pin"]["place"]) == ("set_aside", None)
     else:
         expected = before["pin"]["place"]["room"] if room is ... else room
         assert (after["pin"]["state"], after["pin"]["place"]["room"]) == ("corrected", expected)
         assert after["pin"]["confidence"] == 1.0
     if "position" in correction:
         assert after["pin"]["place"]["position"] == correction["position"]
+    if "heading_deg" in correction:
+        assert after["pin"]["place"]["heading_deg"] == correction["heading_deg"]
     assert correct(client, solved, before["id"], None).json()["correction"] is None
     wait_until_solved(client, solved)
     assert client.get(f"/albums/{solved}/photographs/{before['id']}").json()["pin"]["state"] != "corrected"
