@@ -338,6 +338,16 @@ def document_of(response: httpx.Response, status: int = 200) -> Any:
     return response.json()
 
 
+def pages(client: httpx.Client, path: str, **query: Any) -> Iterator[dict[str, Any]]:
+    """Yield the pages of a list, each by the cursor of the one before."""
+    while True:
+        page = document_of(client.get(path, params=query))
+        yield page
+        if page["next_cursor"] is None:
+            return
+        query["cursor"] = page["next_cursor"]
+
+
 def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
     """Check that an answer has a JSON document per line, and return these."""
     assert response.status_code == 200, response.text

@@ -27,7 +27,7 @@ from service.settings import Settings
 from service.storage.records import ANONYMOUS, AuditEntry
 from service.storage.store import Store
 from service.storage.tables import API_KEYS, AUDIT_LOG
-from tests.service.conftest import StartApp, assert_problem, document_of, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, document_of, pages, upload, wait_for
 from tests.service.test_security import bearer, id_of, make_key
 
 NEW_KEY = {"tenant": "acme", "name": "camera 7", "scopes": ["read", "localise"]}
@@ -85,14 +85,7 @@ def test_key_is_created_listed_and_revoked(admin: httpx.Client) -> None:
 
 def test_pages_list_every_key_once(admin: httpx.Client) -> None:
     made = [_created(admin)["id"] for _ in range(5)]
-    found: list[str] = []
-    cursor: dict[str, str] = {}
-    while True:
-        page = admin.get("/admin/keys", params={"limit": 2, "tenant": "acme"} | cursor).json()
-        found += [key["id"] for key in page["keys"]]
-        if page["next_cursor"] is None:
-            break
-        cursor = {"cursor": page["next_cursor"]}
+    found = [key["id"] for page in pages(admin, "/admin/keys", limit=2, tenant="acme") for key in page["keys"]]
     assert found == made[::-1]
 
 
@@ -278,16 +271,9 @@ def test_log_is_read_in_pages_and_filtered(admin: httpx.Client) -> None:
     for number in range(5):
         admin.patch(f"/admin/tenants/t{number}", json={"cpu_share": 1.0})
     own = id_of(admin.headers["Authorization"])
-    found: list[str] = []
-    cursor: dict[str, str] = {}
     begin = datetime.now(UTC)
-    while True:
-        query = {"limit": "2", "actor": own, "until": begin.isoformat()} | cursor
-        page = admin.get("/admin/audit", params=query).json()
-        found += [entry["tenant"] for entry in page["entries"]]
-        if page["next_cursor"] is None:
-            break
-        cursor = {"cursor": page["next_cursor"]}
+    query = {"limit": "2", "actor": own, "until": begin.isoformat()}
+    found = [entry["tenant"] for page in pages(admin, "/admin/audit", **query) for entry in page["entries"]]
     assert found == ["t4", "t3", "t2", "t1", "t0"]
     assert [entry["tenant"] for entry in _entries(admin, tenant="t3")] == ["t3"]
     assert _entries(admin, actor="nobody") == []

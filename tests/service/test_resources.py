@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from service.errors import InvalidRequestError
 from service.routes.dependencies import cursor_text, parse_cursor
 from service.storage.records import Cursor
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, pages, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 NEVER = "0123456789abcdef" * 2
@@ -44,13 +44,7 @@ def listed(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 
 def _pages(client: httpx.Client, **params: Any) -> list[list[str]]:
-    pages, cursor = [], None
-    while True:
-        answer = client.get("/floorplans", params=params | ({} if cursor is None else {"cursor": cursor})).json()
-        pages.append([plan["id"] for plan in answer["floorplans"]])
-        cursor = answer["next_cursor"]
-        if cursor is None:
-            return pages
+    return [[plan["id"] for plan in page["floorplans"]] for page in pages(client, "/floorplans", **params)]
 
 
 @pytest.mark.parametrize(("limit", "sizes"), [(1, [1] * 7), (3, [3, 3, 1]), (7, [7]), (500, [7])])
@@ -58,9 +52,9 @@ def test_pages_have_every_plan_once_newest_first(
     listed: tuple[httpx.Client, list[str]], limit: int, sizes: list[int]
 ) -> None:
     client, ids = listed
-    pages = _pages(client, limit=limit)
-    assert [len(page) for page in pages] == sizes
-    assert [plan_id for page in pages for plan_id in page] == ids[::-1]
+    by_page = _pages(client, limit=limit)
+    assert [len(page) for page in by_page] == sizes
+    assert [plan_id for page in by_page for plan_id in page] == ids[::-1]
 
 
 def test_paging_is_stable_under_changes(start_app: StartApp, tmp_path: Path) -> None:
@@ -84,8 +78,8 @@ def test_plans_are_found_by_part_of_their_name(
     listed: tuple[httpx.Client, list[str]], name: str, found: list[int]
 ) -> None:
     client, ids = listed
-    pages = _pages(client, name=name, limit=2)
-    assert [plan_id for page in pages for plan_id in page] == [ids[index] for index in found]
+    by_page = _pages(client, name=name, limit=2)
+    assert [plan_id for page in by_page for plan_id in page] == [ids[index] for index in found]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from lalaloc_core.floorplan import FloorPlan
 from service.errors import UnknownVenueError
 from service.storage.database import Database
 from service.storage.plan_rows import plan_bytes
-from service.storage.records import NewPlan, Original
+from service.storage.records import NewPlan, Original, PlanRecord, VenueRecord
 from service.storage.store import Store
 from tests.importers.conftest import zip_file
 from tests.importers.test_ifc import ifc_flat, ifc_house
@@ -280,20 +280,18 @@ def test_file_that_cannot_be_added_changes_nothing(start_app: StartApp, tmp_path
         assert extend(client, venue_id, street(3, 2), **{"If-Match": tag}).json()["plans"] == 5
 
 
-def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
-    token = uuid.uuid4().hex
-    venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
-
-    def attempt(_number: int) -> tuple[str, int]:
-        extended, records = app_store.venue_imports.extend(
-            "t", venue.id, token, new_plans(), max_plans=9, max_venue_plans=9
-        )
-        return extended.revision_id, len(records)
-
+def assert_stored_once(attempt: Callable[[], tuple[VenueRecord, list[PlanRecord]]]) -> None:
+    """Check that one of four attempts at the same time stores three plans, and that all get the same revision."""
     with ThreadPoolExecutor(4) as threads:
-        found = list(threads.map(attempt, range(4)))
-    assert len({revision for revision, _ in found}) == 1
-    assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
+        found = list(threads.map(lambda _: attempt(), range(4)))
+    assert len({venue.revision_id for venue, _ in found}) == 1
+    assert sorted(len(records) for _, records in found) == [0, 0, 0, 3]
+
+
+def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
+    token, limits = uuid.uuid4().hex, {"max_plans": 9, "max_venue_plans": 9}
+    venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
+    assert_stored_once(lambda: app_store.venue_imports.extend("t", venue.id, token, new_plans(), **limits))
     extended = app_store.venues.get("t", venue.id)
     assert extended is not None
     assert extended.plans == 4
@@ -301,7 +299,7 @@ def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
     app_store.quota.recount()
     assert app_store.quota.account("t").used == used
     with pytest.raises(UnknownVenueError):
-        app_store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), max_plans=9, max_venue_plans=9)
+        app_store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), **limits)
 
 
 def new_plans(count: int = 3) -> list[NewPlan]:
@@ -341,13 +339,6 @@ def test_failure_between_two_plans_stores_none(tmp_path: Path, database_of: Data
 
 def test_attempts_at_the_same_time_store_one_venue(app_store: Store) -> None:
     venue_id = uuid.uuid4().hex
-
-    def attempt(_number: int) -> tuple[str, int]:
-        venue, records = app_store.venue_imports.add("t", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
-        return venue.revision_id, len(records)
-
-    with ThreadPoolExecutor(4) as threads:
-        found = list(threads.map(attempt, range(4)))
-    assert len({revision for revision, _ in found}) == 1
-    assert sorted(stored for _, stored in found) == [0, 0, 0, 3]
+    limits = {"max_plans": 9, "max_venues": 9}
+    assert_stored_once(lambda: app_store.venue_imports.add("t", venue_id, "house", new_plans(), **limits))
     assert len(app_store.plans.list_plans("t", limit=99)) == 3

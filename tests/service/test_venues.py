@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from service.storage import Store
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, pages, upload
 from tests.service.test_security import bearer, make_key
 
 JSON = {"Content-Type": "application/json"}
@@ -35,12 +35,7 @@ def make(client: httpx.Client, *members: dict[str, Any], **more: Any) -> dict[st
 
 def plans_of(client: httpx.Client, venue_id: str, **params: Any) -> list[dict[str, Any]]:
     """Return all plans of a venue, page by page."""
-    found, cursor = [], None
-    while True:
-        page = client.get(f"/venues/{venue_id}/plans", params=params | ({"cursor": cursor} if cursor else {})).json()
-        found += page["plans"]
-        if (cursor := page["next_cursor"]) is None:
-            return found
+    return [plan for page in pages(client, f"/venues/{venue_id}/plans", **params) for plan in page["plans"]]
 
 
 def test_created_venue_is_returned(client: httpx.Client, plans: list[str]) -> None:
