@@ -34,45 +34,35 @@ def _areas(plan: ImportedPlan) -> list[float]:
     return sorted((round(shape.area, 1) for shape in shapes(plan.document)), reverse=True)
 
 
-@pytest.mark.parametrize(
-    "layers",
-    [
-        ("Zimmer", "Küche", "Bäder", "Büros"),
-        ("A-AREA-ROOM", "Cuisine", "Salles de bain", "Bureaux"),
-        ("部屋", "台所", "浴室", "事務室"),
-        ("Rum", "Kök", "Badrum", "Kontor"),
-        ("Pokoje", "Kuchnia", "Łazienka", "Biuro"),
-    ],
-)
-def test_layers_named_by_use_are_rooms_in_other_languages(layers: tuple[str, ...]):
-    document: Any = new_dxf("R2010", units=4)
-    for index, layer in enumerate(layers):
-        x = 4200.0 * index
-        ring = [(x, 0.0), (x + 4000.0, 0.0), (x + 4000.0, 3000.0), (x, 3000.0)]
-        document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
-    plan = import_plan(dxf_file(document))
-    assert _areas(plan) == [12.0] * 4
-    assert {"kitchen", "bathroom", "office"} <= {room.get("type") for room in plan.document["rooms"]}
-
-
-@pytest.mark.parametrize(
-    ("layer", "kind"),
-    [
-        ("Küchen", "kitchen"),
-        ("Toiletter", "bathroom"),
-        ("Sypialnie", "bedroom"),
-        ("Łazienki", "bathroom"),
-        ("03_SCHLAFEN", "bedroom"),
-    ],
-)
-def test_plurals_name_the_use_of_rooms(layer: str, kind: str):
+def _drawn_rooms(*layers: str) -> Any:
+    """Return a drawing of rooms of 4 m x 3 m in a row, each on a layer."""
     document: Any = new_dxf("R2010", units=6)
-    for x, name in ((0.0, "ROOM"), (4.2, layer)):
+    for number, layer in enumerate(layers):
+        x = 4.2 * number
         ring = [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0)]
-        document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": name})
-    plan = import_plan(dxf_file(document))
-    assert _areas(plan) == [12.0, 12.0]
-    assert kind in {room.get("type") for room in plan.document["rooms"]}
+        document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
+    return document
+
+
+@pytest.mark.parametrize(
+    ("layers", "kinds"),
+    [
+        (("Zimmer", "Küche", "Bäder", "Büros"), {"kitchen", "bathroom", "office"}),
+        (("A-AREA-ROOM", "Cuisine", "Salles de bain", "Bureaux"), {"kitchen", "bathroom", "office"}),
+        (("部屋", "台所", "浴室", "事務室"), {"kitchen", "bathroom", "office"}),
+        (("Rum", "Kök", "Badrum", "Kontor"), {"kitchen", "bathroom", "office"}),
+        (("Pokoje", "Kuchnia", "Łazienka", "Biuro"), {"kitchen", "bathroom", "office"}),
+        (("ROOM", "Küchen"), {"kitchen"}),
+        (("ROOM", "Toiletter"), {"bathroom"}),
+        (("ROOM", "Sypialnie"), {"bedroom"}),
+        (("ROOM", "Łazienki"), {"bathroom"}),
+        (("ROOM", "03_SCHLAFEN"), {"bedroom"}),
+    ],
+)
+def test_layers_named_by_use_are_rooms_in_other_languages(layers: tuple[str, ...], kinds: set[str]):
+    plan = import_plan(dxf_file(_drawn_rooms(*layers)))
+    assert _areas(plan) == [12.0] * len(layers)
+    assert kinds <= {room.get("type") for room in plan.document["rooms"]}
 
 
 def test_outlines_of_separate_lines_on_a_layer_of_rooms_are_rooms():
@@ -295,12 +285,8 @@ def test_fixtures_belong_to_the_storey_of_their_layer():
 
 
 def test_fitted_text_is_in_the_middle_of_its_points():
-    document: Any = new_dxf("R2010", units=6)
+    document = _drawn_rooms("Rooms", "Rooms")
     space = document.modelspace()
-    for x in (0.0, 4.2):
-        space.add_lwpolyline(
-            [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0)], close=True, dxfattribs={"layer": "Rooms"}
-        )
     space.add_text("Küche").set_placement((4.4, 1.0), (8.0, 1.0), align=TextEntityAlignment.FIT)
     space.add_text("Bad").dxf.discard("insert")
     rooms = import_plan(dxf_file(document)).document["rooms"]

@@ -267,18 +267,14 @@ def test_building_of_low_spaces_alone_is_refused():
 
 def test_terminals_furniture_and_stairs_become_fixtures() -> None:
     model = _Model()
-
-    def box(x: float, y: float, width: float, depth: float) -> list[tuple[float, float]]:
-        return [(x, y), (x + width, y), (x + width, y + depth), (x, y + depth)]
-
     model.spaces(
-        model.prism("IfcSpace", box(0, 0, 4000, 3000), 0, 2500, Name="1"),
-        model.prism("IfcSpace", box(4200, 0, 2000, 3000), 0, 2500, Name="2"),
+        model.prism("IfcSpace", _box(0, 0, 4000, 3000), 0, 2500, Name="1"),
+        model.prism("IfcSpace", _box(4200, 0, 6200, 3000), 0, 2500, Name="2"),
     )
     elements = [
-        model.prism("IfcSanitaryTerminal", box(200, 200, 400, 600), 0, 450, Name="A1", PredefinedType="TOILETPAN"),
-        model.prism("IfcFurniture", box(1500, 500, 900, 900), 0, 450, Name="Chair"),
-        model.prism("IfcStairFlight", box(4300, 100, 1000, 2800), 0, 2600, Name="S"),
+        model.prism("IfcSanitaryTerminal", _box(200, 200, 600, 800), 0, 450, Name="A1", PredefinedType="TOILETPAN"),
+        model.prism("IfcFurniture", _box(1500, 500, 2400, 1400), 0, 450, Name="Chair"),
+        model.prism("IfcStairFlight", _box(4300, 100, 5300, 2900), 0, 2600, Name="S"),
     ]
     model.contain(*elements)
     plan = import_plan(model.content())
