@@ -314,9 +314,6 @@ class TestConfidence:
         found = self.model.fit_probability(stage, self.signals, heading_known=known)
         assert found == pytest.approx(1.0 / (1.0 + np.exp(-logit)))
 
-    def test_uncalibrated_stage_has_no_probability(self) -> None:
-        assert self.model.fit_probability("vdr", self.signals, heading_known=False) is None
-
     @pytest.mark.parametrize("cost", [0.0, 1e9, -1e9])
     def test_probability_is_bounded(self, cost: float) -> None:
         found = present(self.model.fit_probability("lpo", {**self.signals, "cost": cost}, heading_known=True))

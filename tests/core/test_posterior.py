@@ -408,21 +408,21 @@ def test_penalty_is_bounded_and_grows_with_distance(seed: int, radius_m: float, 
 
 class TestChecks:
     @pytest.mark.parametrize(
-        ("near", "message"),
+        ("hints", "message"),
         [
-            (Near(1.0, 1.0, 0.05), "radius_m: it is 0.05 m; it must be between 0.1 and 1000 m"),
-            (Near(1.0, 1.0, 2e3), "radius_m: it is 2000 m"),
-            (Near(math.nan, 1.0, 1.0), "near: .* is not a point"),
-            (Near(-6.0, 1.0, 5.0), r"near: \(-6, 1\) is 6 m from the nearest room of the plan; the limit is radius_m"),
+            (Hints(near=Near(1.0, 1.0, 0.05)), "radius_m: it is 0.05 m; it must be between 0.1 and 1000 m"),
+            (Hints(near=Near(1.0, 1.0, 2e3)), "radius_m: it is 2000 m"),
+            (Hints(near=Near(math.nan, 1.0, 1.0)), "near: .* is not a point"),
+            (
+                Hints(near=Near(-6.0, 1.0, 5.0)),
+                r"near: \(-6, 1\) is 6 m from the nearest room of the plan; the limit is radius_m",
+            ),
+            (Hints(rooms=frozenset()), "rooms: no room is named"),
         ],
     )
-    def test_invalid_mark_is_refused(self, plan: FloorPlan, near: Near, message: str) -> None:
+    def test_invalid_hints_are_refused(self, plan: FloorPlan, hints: Hints, message: str) -> None:
         with pytest.raises(InvalidHintError, match=message):
-            Hints(near=near).check(plan)
-
-    def test_empty_room_hint_is_refused(self, plan: FloorPlan) -> None:
-        with pytest.raises(InvalidHintError, match="rooms: no room is named"):
-            Hints(rooms=frozenset()).check(plan)
+            hints.check(plan)
 
     def test_rooms_are_found_by_id_then_by_name(self, plan: FloorPlan) -> None:
         assert [room.id for room in plan.rooms] == ["bedroom", "bedroom-2", "hall"]

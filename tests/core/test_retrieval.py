@@ -479,25 +479,18 @@ def test_likeliest_pairs_equal_a_complete_coarse_pass(
     assert compared < 8 * len(grid.poses)
 
 
-# A known heading with a tolerance has an odd number of hypotheses.
-@pytest.mark.parametrize("hypotheses", [HYPOTHESES, 9, 1])
-def test_coarse_costs_of_views_equal_their_definition(
-    building: Building, grid: PoseGrid, queries: list[Query], hypotheses: int
+# Spheres, and views, of which a known heading with a tolerance has an odd number of hypotheses.
+@pytest.mark.parametrize(
+    ("azimuths", "hypotheses"), [(SPHERE_AZIMUTHS, HYPOTHESES), *((VIEW_AZIMUTHS, n) for n in (HYPOTHESES, 9, 1))]
+)
+def test_coarse_costs_equal_their_definition(
+    building: Building, grid: PoseGrid, queries: list[Query], azimuths: int, hypotheses: int
 ) -> None:
-    layouts, binned = grid.layouts(building.plan), grid.binned(building.plan, VIEW_AZIMUTHS)
-    assert len(binned.walls) > 1
+    layouts, binned = grid.layouts(building.plan), grid.binned(building.plan, azimuths)
+    assert azimuths == SPHERE_AZIMUTHS or len(binned.walls) > 1
     for query in queries[:3]:
-        cost = matching_cost_of(building, view_of(query, hypotheses))
-        found = coarse_costs(binned, cost, grid.poses.room_index)
-        np.testing.assert_allclose(found, direct_coarse_costs(binned, cost, layouts), atol=1e-5)
-
-
-def test_coarse_costs_of_spheres_equal_their_definition(
-    building: Building, grid: PoseGrid, queries: list[Query]
-) -> None:
-    layouts, binned = grid.layouts(building.plan), grid.binned(building.plan, SPHERE_AZIMUTHS)
-    for query in queries[:3]:
-        cost = matching_cost_of(building, query)
+        asked = query if azimuths == SPHERE_AZIMUTHS else view_of(query, hypotheses)
+        cost = matching_cost_of(building, asked)
         found = coarse_costs(binned, cost, grid.poses.room_index)
         np.testing.assert_allclose(found, direct_coarse_costs(binned, cost, layouts), atol=1e-5)
 

@@ -530,21 +530,6 @@ def merged_plans() -> MergedPlans:
     return MergedPlans.of(PLANS, [grid_of(plan) for plan in PLANS], 1.5)
 
 
-def test_merged_costs_equal_those_of_each_plan(merged_plans: MergedPlans) -> None:
-    position = np.array([[1.3, 1.1]])
-    profile = profiles_at(PLANS[0], position, np.zeros(1, int), np.zeros(1), COLUMNS)
-    predicted = PredictedProfile(np.log(profile), np.full_like(profile, np.log(0.05)))
-    query = Query(np.zeros((1, 1)), np.zeros(1), 0.0, True, CameraHeight(1.5), predicted)
-    whole, _ = MatchingCost(merged_plans.plan, query, 0.3, WEIGHTS, CONFIG).costs(
-        merged_plans.grid.layouts(merged_plans.plan)
-    )
-    parts = []
-    for plan in PLANS:
-        grid = grid_of(plan)
-        parts.append(MatchingCost(plan, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
-    np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
-
-
 def opening_query() -> Query:
     """Return a query that sees a door in a third of the horizon."""
     plain = Query(np.zeros((1, 1)), np.zeros(1), 0.0, True, CameraHeight(1.5))
