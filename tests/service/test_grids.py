@@ -46,7 +46,7 @@ from service.settings import CONSTANTS, Settings
 from service.storage.records import NewPlan, Original, PlanRecord
 from service.storage.store import PlanLookup, Store
 from service.telemetry import Telemetry
-from tests.service.conftest import FLAT, OpenStore, StartApp, assert_problem, constants, localise, upload, wait_for
+from tests.service.conftest import FLAT, OpenStore, StartApp, constants, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 PLAN = FloorPlan.from_dict(FLAT)
@@ -560,28 +560,6 @@ def test_busy_database_does_not_serve_cached_plans(tmp_path: Path) -> None:
         store.database._answered_s = 0.0
         assert _looked_up(known, "default", "p") == record
     store.close()
-
-
-@pytest.fixture(scope="module")
-def postgres_app(start_app: StartApp, postgres: PostgresServer, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    url = postgres.new_database()
-    return lambda: start_app(tmp_path_factory.mktemp("data"), database_url=url, sweep_s=0.2)
-
-
-@pytest.mark.one_replica
-def test_queries_continue_during_an_outage(postgres_app: Any, postgres: PostgresServer, sphere: bytes) -> None:
-    with postgres_app() as client:
-        plan_id = upload(client)
-        assert localise(client, plan_id, sphere, refine="none").status_code == 200
-        postgres.stop()
-        try:
-            assert localise(client, plan_id, sphere, refine="none").status_code == 200
-            refused = client.get(f"/floorplans/{plan_id}")
-            assert_problem(refused, 503, "store-unavailable")
-            assert int(refused.headers["retry-after"]) > 0
-        finally:
-            postgres.start()
-        wait_for(lambda: client.get(f"/floorplans/{plan_id}").status_code == 200)
 
 
 # The whole service

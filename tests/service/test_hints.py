@@ -61,16 +61,6 @@ def test_strict_point_bounds_all_candidates(client: httpx.Client, plan_id: str, 
         assert np.hypot(candidate["position"]["x_m"] - 6.0, candidate["position"]["y_m"] - 1.0) <= 1.2 + 1e-3
 
 
-def test_room_hint_raises_its_candidates(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    def rooms_found(**fields: Any) -> list[str]:
-        found = localise(client, plan_id, sphere, refine="none", **fields).json()
-        return [candidate["room_id"] for candidate in found["candidates"]]
-
-    free, hinted = rooms_found(), rooms_found(rooms="hall")
-    assert hinted.index("hall") <= free.index("hall")
-    assert hinted.count("hall") >= free.count("hall")
-
-
 @pytest.mark.parametrize(
     ("fields", "field", "message"),
     [

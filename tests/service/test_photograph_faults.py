@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 
 import httpx
-import numpy as np
 import pytest
 
 from lalaloc_core.photograph.file_segments import END
 from tests.core.fault_photographs import CONTRADICTED, FAULTS, LIBRARY_WORDS, Fault, fault_id
-from tests.core.taken import EXAMPLES, jpeg, sphere
+from tests.core.taken import EXAMPLES, jpeg
 from tests.service.conftest import assert_problem
 from tests.service.test_photographs import PHONE, ask, shown
 
@@ -109,12 +108,6 @@ def test_warnings_about_photographs_of_a_sequence_name_them(client: httpx.Client
     assert text not in answer["poses"][0]["warnings"]
 
 
-def test_warnings_about_photographs_of_a_session_are_those_of_its_pose(client: httpx.Client, flat: str) -> None:
-    session = client.post("/sessions", json={"floorplan_id": flat}).json()["id"]
-    answer = client.post(f"/sessions/{session}/photographs", files={"photo": KITCHEN[:-2]}).json()
-    assert any("the file ends before" in text for text in answer["pose"]["warnings"])
-
-
 @pytest.mark.parametrize(
     ("content", "name"),
     [
@@ -153,20 +146,3 @@ def test_photograph_as_the_body_asks_for_a_form(client: httpx.Client, flat: str)
     assert "send fields in the body, which is multipart/form-data" in fault["message"]
     response = client.post("/localise", content=KITCHEN, headers={"Content-Type": "image/jpeg"})
     assert "send multipart/form-data" in assert_problem(response, 415, "unsupported-media")["detail"]
-
-
-def test_sphere_in_another_layout_is_converted_or_named(client: httpx.Client, flat: str) -> None:
-    pixels = sphere("kitchen")
-    whole = ask(client, flat, jpeg(pixels)).json()
-    height, width = pixels.shape[:2]
-    answer = ask(client, flat, jpeg(np.pad(pixels, ((height // 8, height // 8), (0, 0), (0, 0))))).json()
-    assert answer["view"]["projection"] == "equirectangular"
-    assert any("a sphere with bars at its borders" in text for text in answer["warnings"])
-    assert answer["room"] == whole["room"]
-    place = np.arange(width // 2) + 0.5 - width / 4
-    circle = (np.hypot(*np.meshgrid(place, place)) < width / 4)[..., None].astype(np.uint8)
-    two = np.hstack([pixels[:, : width // 2] * circle, pixels[:, width // 2 :] * circle])
-    detail = assert_problem(
-        ask(client, flat, jpeg(np.maximum(two, 60 * np.hstack([circle] * 2)))), 422, "invalid-photograph"
-    )
-    assert "dual fisheye picture of a 360° camera" in detail["detail"]

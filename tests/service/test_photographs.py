@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags
 
-from lalaloc_core.photograph.cameras import Fisheye, Perspective
+from lalaloc_core.photograph.cameras import Perspective
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload
@@ -100,18 +100,6 @@ def test_statements_are_used(
     assert (view["pitch"], view["roll"]) == ({"value_deg": 2.0, **tilt}, {"value_deg": -1.0, **tilt})
 
 
-def test_files_of_phones_are_read(client: httpx.Client, flat: str) -> None:
-    portrait = take(sphere("living_room"), Perspective.of_hfov(480, 640, math.radians(53.1)))
-    turned = ask(client, flat, jpeg(np.rot90(portrait).copy(), PHONE, orientation=6)).json()["view"]
-    assert turned["hfov"]["value_deg"] == pytest.approx(53.1, abs=0.2)
-    assert (turned["camera"]["width"], turned["camera"]["height"]) == (480, 640)
-    absurd = ask(client, flat, jpeg(shown(), PHONE | {Tag.FocalLengthIn35mmFilm: 60_000})).json()["view"]
-    assert absurd["hfov"]["source"] == "estimated"
-    assert any("FocalLengthIn35mmFilm is 60000 mm" in warning for warning in absurd["warnings"])
-    zero = ask(client, flat, jpeg(shown(), PHONE | {Tag.FocalLengthIn35mmFilm: 0})).json()["view"]
-    assert zero["hfov"]["source"] == "estimated"
-
-
 def test_heic_is_read(client: httpx.Client, flat: str) -> None:
     view = ask(client, flat, (FOLDER / "phone.heic").read_bytes()).json()["view"]
     assert view["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
@@ -121,11 +109,7 @@ def test_heic_is_read(client: httpx.Client, flat: str) -> None:
     ("fields", "reason"),
     [
         ({"intrinsics": '{"fx": 0, "fy": 400}'}, "intrinsics: fx is 0; it must be positive"),
-        ({"intrinsics": '{"fx": 400, "fy": 400, "cx": 9000}'}, "cx is 9000, outside of the upright picture of 640 x"),
-        ({"intrinsics": '{"fx": 400, "fy": 400}', "hfov_deg": "70"}, "hfov_deg and intrinsics exclude each other"),
         ({"hfov_deg": "0"}, "hfov_deg is 0; it must be between 10 and 360"),
-        ({"pitch_deg": "80"}, "pitch_deg is 80; it must be between -60 and 60"),
-        ({"projection": "fisheye"}, "a fisheye photograph needs hfov_deg"),
     ],
 )
 def test_impossible_statements_are_refused(
@@ -151,11 +135,6 @@ def test_malformed_statements_name_their_field(
 ) -> None:
     problem = assert_problem(ask(client, flat, jpeg(shown(), PHONE), **fields), 422, "invalid-request")
     assert [fault["field"] for fault in problem["errors"]] == [field]
-
-
-def test_white_picture_is_no_sphere(client: httpx.Client, flat: str) -> None:
-    white = jpeg(np.full((256, 512, 3), 255, np.uint8))
-    assert "is not a full 360° sphere" in assert_problem(ask(client, flat, white), 422, "invalid-photograph")["detail"]
 
 
 def test_venue_picture_and_feature_work(client: httpx.Client, flat: str) -> None:
@@ -243,13 +222,6 @@ def test_model_for_spheres_refuses_other_photographs(start_app: StartApp, tmp_pa
         plan_id = upload(client)
         problem = assert_problem(ask(client, plan_id, jpeg(shown(), PHONE)), 422, "invalid-photograph")
     assert "reads full 360° spheres only; send an equirectangular picture" in problem["detail"]
-
-
-def test_fisheye_circle_is_read(client: httpx.Client, flat: str) -> None:
-    circle = take(sphere("kitchen"), Fisheye.of_hfov(480, 480, math.radians(190.0)))
-    view = ask(client, flat, jpeg(circle), projection="fisheye", hfov_deg=190).json()["view"]
-    (arc,) = view["seen"]
-    assert arc["to_deg"] - arc["from_deg"] == pytest.approx(190.0, abs=1.0)
 
 
 def test_session_takes_photographs_of_any_projection(client: httpx.Client, flat: str) -> None:

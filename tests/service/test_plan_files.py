@@ -106,19 +106,11 @@ def test_picture_without_scale_gets_an_estimate_with_its_error_and_clues(client:
     assert any("is assumed" in warning for warning in plan["warnings"])
     twice = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, multiply=2.0)
     assert twice["import_report"]["metres_per_unit"] == pytest.approx(2.0 * drawn.metres_per_pixel)
-    part = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, crop="0,0,5000,5000")
-    assert len(part["rooms"]) == len(drawn.rooms)
-
-
-@pytest.mark.slow
-def test_picture_is_a_draft(client: httpx.Client) -> None:
-    drawn = draw_plan("thick", 1)
-    plan = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, name="Drawn")
-    assert plan["name"] == "Drawn"
-    assert len(plan["rooms"]) == len(drawn.rooms)
-    assert plan["import_report"]["is_draft"]
-    assert any("ceiling height" in line for line in plan["import_report"]["unsure"])
-    assert client.get(f"/floorplans/{plan['id']}/original").headers["content-type"] == "image/png"
+    part = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, crop="0,0,5000,5000", name="Drawn")
+    assert (part["name"], len(part["rooms"])) == ("Drawn", len(drawn.rooms))
+    assert part["import_report"]["is_draft"]
+    assert any("ceiling height" in line for line in part["import_report"]["unsure"])
+    assert client.get(f"/floorplans/{part['id']}/original").headers["content-type"] == "image/png"
 
 
 @pytest.mark.parametrize("format", ["native", "geojson", "dxf", "svg", "imdf", "pdf"])
@@ -253,9 +245,6 @@ def test_picture_that_looks_like_a_photograph_is_read_with_plan_true(client: htt
     ("content", "words"),
     [
         (b"hello there", "in no known format; supported formats are"),
-        (b"AC1032 dwg", "DWG drawing"),
-        (b"GIF89a....", "a GIF picture, which cannot be read: save it as PNG"),
-        (b"%PDF-1.7 nothing", "cannot be read"),
         (b'{"type": "FeatureCollection", "features": []}', "no features"),
         (b"   ", "the body is empty"),
     ],

@@ -328,7 +328,6 @@ def test_secrets_are_random_256_bits() -> None:
     secrets = {new_secret() for _ in range(1000)}
     assert len(secrets) == 1000
     assert {len(secret) for secret in secrets} == {43}
-    assert 43 * 6 >= 256
 
 
 def test_revoked_key_is_rejected_soon(guarded: Guarded) -> None:
@@ -504,7 +503,6 @@ def test_address_counters_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- Without the database ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.one_replica
 def test_known_keys_work_without_the_database(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, sphere: bytes
@@ -522,9 +520,9 @@ def test_known_keys_work_without_the_database(
             sleep(0.2)
             assert localise(client, plan_id, sphere, refine="none").status_code == 200
             assert client.get("/limits").status_code == 200
-            unknown = client.get("/limits", headers=bearer(new_key))
-            assert_problem(unknown, 503, "store-unavailable")
-            assert "retry-after" in unknown.headers
+            for refused in (client.get(f"/floorplans/{plan_id}"), client.get("/limits", headers=bearer(new_key))):
+                assert_problem(refused, 503, "store-unavailable")
+                assert int(refused.headers["retry-after"]) > 0
         finally:
             postgres.start()
         wait_for(lambda: client.get("/limits", headers=bearer(new_key)).status_code == 200, 10.0)
@@ -717,10 +715,9 @@ def test_public_address_without_keys_is_refused(host: str, settings: dict[str, A
         check_address(host, Settings(**settings))
 
 
-@pytest.mark.parametrize("command", [["service"]], ids=" ".join)
-def test_service_does_not_start_publicly_without_keys(command: list[str], tmp_path: Path) -> None:
+def test_service_does_not_start_publicly_without_keys(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", *command, "--host", "0.0.0.0", "--port", "0"],
+        [sys.executable, "-m", "service", "--host", "0.0.0.0", "--port", "0"],
         env={"LALALOC_DATA_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)},
         cwd=ROOT,
         capture_output=True,

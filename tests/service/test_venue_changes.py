@@ -25,7 +25,7 @@ from service.storage.tables import FLOORPLANS, TENANTS
 from service.venues import venue_plans
 from service.venues.plan_indices import Indexed
 from service.venues.venue_plans import VenuePlans
-from tests.service.conftest import FLAT, StartApp, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, upload
 from tests.service.test_venue_queries import STUDIO, ask, venue_of
 
 MODEL, VENUE, TENANT = ("m1", 0.5), "f" * 32, "default"
@@ -160,33 +160,6 @@ def test_other_changes_leave_the_rows_in_memory(replicas: list[Replica], monkeyp
     monkeypatch.setattr(first.store.venues, "searchable_plans", lambda *_: pytest.fail("read of the rows"))
     second.store.plans.add(TENANT, "a" * 32, NewPlan(FloorPlan.from_dict(FLAT), Original(b"{}")), limit=99)
     assert first.rows() == before
-
-
-@pytest.mark.one_replica
-def test_first_queries_share_one_index(
-    start_app: StartApp, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
-    built, build = [], PlanIndex.build
-    choosing, needs_choice = [], venue_plans.VenuePlans.needs_choice
-
-    def counted(*args: Any, **options: Any) -> PlanIndex:
-        built.append(1)
-        # Others need the index meanwhile.
-        wait_for(lambda: len(choosing) > 1)
-        return build(*args, **options)
-
-    def chosen(*args: Any) -> bool:
-        choosing.append(1)
-        return needs_choice(*args)
-
-    monkeypatch.setattr(PlanIndex, "build", counted)
-    monkeypatch.setattr(venue_plans.VenuePlans, "needs_choice", chosen)
-    with start_app(tmp_path, request_deadline_s=120.0) as client, ThreadPoolExecutor(4) as threads:
-        venue_id = venue_of(client, *(upload(client, {**STUDIO, "name": f"{number}"}) for number in range(4)))
-        answers = threads.map(lambda _: ask(client, venue_id, sphere, refine="none"), range(4))
-        assert [answer.status_code for answer in answers] == [200] * 4
-    assert len(built) == 1
 
 
 @pytest.mark.slow
