@@ -9,13 +9,20 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Camera, camera_axes
 from tests.painted import picture_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+# Exif metadata of the main camera of a phone, 67° wide.
+PHONE: dict[Any, Any] = {
+    ExifTags.Base.FocalLengthIn35mmFilm: 26,
+    ExifTags.Base.ExifImageWidth: 640,
+    ExifTags.Base.ExifImageHeight: 480,
+}
 
 
 @cache
@@ -61,3 +68,7 @@ def jpeg(
         if value is not None:
             tags[tag] = value
     return picture_file(pixels, "JPEG", quality=92, exif=tags)
+
+
+def opened(content: bytes, **stated: Any) -> Photograph:
+    return open_photograph(content, sphere_size=(128, 256), stated=StatedCamera(**stated))

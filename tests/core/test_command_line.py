@@ -21,10 +21,9 @@ from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.cli.printing import print_warnings
 from lalaloc_core.photograph.cameras import Perspective
-from tests.core.taken import jpeg, sphere, take
+from tests.core.taken import EXAMPLES, jpeg, sphere, take
 
 ROOT = Path(__file__).parents[2]
-EXAMPLES = ROOT / "examples"
 PLAN, KITCHEN, BEDROOM = (str(EXAMPLES / name) for name in ("flat.json", "kitchen.jpg", "bedroom.jpg"))
 LALALOC = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main; sys.exit(main())"]
 

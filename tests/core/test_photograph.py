@@ -16,7 +16,7 @@ from PIL import ExifTags
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig
-from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, open_photograph
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 from lalaloc_core.photograph.levelling import measure_bend
 from lalaloc_core.photograph.patches import UNSEEN, Patch, joined_patches, patch_azimuths
@@ -24,21 +24,16 @@ from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
 from tests.core.fault_photographs import FOLDER
-from tests.core.taken import EXAMPLES, jpeg, sphere, take
+from tests.core.taken import EXAMPLES, PHONE, jpeg, opened, sphere, take
 from tests.painted import picture_file
 
 Tag = ExifTags.Base
 MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
 ULTRAWIDE = Perspective.of_hfov(640, 480, math.radians(106.2))
-PHONE: dict[Any, Any] = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 640, Tag.ExifImageHeight: 480}
 GPANO = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
     '<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {}/></rdf:RDF></x:xmpmeta>'
 )
-
-
-def opened(content: bytes, **stated: Any) -> Photograph:
-    return open_photograph(content, sphere_size=(128, 256), stated=StatedCamera(**stated))
 
 
 def view_of(camera: Camera, name: str = "living_room", heading_deg: float = 0.0) -> np.ndarray:

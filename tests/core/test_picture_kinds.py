@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,10 +16,10 @@ from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.drawing.sketch_drawing import naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.photograph import StatedCamera, open_photograph
+from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
 from tests.strategies import present
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 PHOTOGRAPHS = sorted([*EXAMPLES.glob("*.jpg"), *EXAMPLES.glob("real/*.jpg")])
 
 

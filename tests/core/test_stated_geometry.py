@@ -10,19 +10,14 @@ import numpy as np
 import pytest
 from PIL import ExifTags
 
-from lalaloc_core.photograph import Intrinsics, Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph import Intrinsics
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
 from lalaloc_core.photograph.exif import read_exif_lens
 from lalaloc_core.photograph.stated_camera import fit_intrinsics
-from tests.core.taken import exif_of, jpeg, sphere, take
+from tests.core.taken import PHONE, exif_of, jpeg, opened, sphere, take
 
 Tag = ExifTags.Base
 CAMERA = Perspective.of_hfov(640, 480, math.radians(67.3))
-PHONE: dict[Any, Any] = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 640, Tag.ExifImageHeight: 480}
-
-
-def opened(content: bytes, **stated: Any) -> Photograph:
-    return open_photograph(content, sphere_size=(128, 256), stated=StatedCamera(**stated))
 
 
 def picture() -> np.ndarray:
