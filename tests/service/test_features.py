@@ -238,6 +238,7 @@ def test_service_can_refuse_photographs(start_app: StartApp, tmp_path: Path, dev
             ask(client, "photo", PHONE, floorplan_id=home),
             ask(client, "panorama", KITCHEN + bytes(MAX_BYTES), floorplan_id=home),
             ask(client, "photo", KITCHEN, PHONE, path="/localise/sequence", floorplan_id=home, motion="turn"),
+            ask(client, "film", PHONE, path="/localise/sequence", floorplan_id=home, motion="turn"),
             client.post(f"/sessions/{session}/photographs", files={"photo": PHONE}),
         ]
         for answer in refused:

@@ -12,7 +12,7 @@ import pytest
 from lalaloc_client import Client
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import jpeg
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.conftest import assert_problem
 
 pytestmark = needs_ffmpeg
 QUICK = {"refine": "none", "top_k": "1", "hfov_deg": "53", "motion": "turn"}
@@ -88,14 +88,6 @@ def test_unusable_film_is_an_invalid_film(client: httpx.Client, flat: str, film:
         assert problem["detail"].endswith("see docs/how-to/take-photographs.md")
     problem = assert_problem(send(client, flat, ("film", film + bytes(2_000_000))), 413, "upload-too-large")
     assert "LALALOC_MAX_FILM_BYTES" in problem["detail"]
-
-
-def test_service_for_features_refuses_films(
-    start_app: StartApp, tiny_view_bundle: Path, tmp_path: Path, film: bytes
-) -> None:
-    with start_app(tmp_path, bundle=tiny_view_bundle, require_features=True) as client:
-        plan_id = upload(client, FLAT)
-        assert_problem(send(client, plan_id, ("film", film)), 403, "features-required")
 
 
 @pytest.mark.slow

@@ -565,15 +565,6 @@ def test_busy_database_does_not_serve_cached_plans(tmp_path: Path) -> None:
 # The whole service
 
 
-def test_small_plan_is_ready_after_upload(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path) as client:
-        answer = client.post("/floorplans", json=FLAT).json()
-        assert (answer["status"], answer["grid"]["poses"]) == ("ready", 110)
-    with start_app(tmp_path, inline_grid_poses=0) as client:
-        plan_id = client.post("/floorplans", json=FLAT).json()["id"]
-        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
-
-
 @given(st.floats(0.0, 3.0))
 @example(2.399)
 @example(0.1)

@@ -8,10 +8,10 @@ import httpx
 import pytest
 
 from lalaloc_core.photograph.file_segments import END
-from tests.core.fault_photographs import CONTRADICTED, FAULTS, LIBRARY_WORDS, Fault, fault_id
-from tests.core.taken import EXAMPLES, jpeg
+from tests.core.fault_photographs import CONTRADICTED, FAULTS, Fault, fault_id
+from tests.core.taken import EXAMPLES
 from tests.service.conftest import assert_problem
-from tests.service.test_photographs import PHONE, ask, shown
+from tests.service.test_photographs import ask
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
 # All files are sent alone; routes for several differ in how they name a file, so a third of the files do for them.
@@ -106,27 +106,6 @@ def test_warnings_about_photographs_of_a_sequence_name_them(client: httpx.Client
     assert f"photo[1]: {text}" in answer["warnings"]
     assert text in answer["poses"][1]["warnings"]
     assert text not in answer["poses"][0]["warnings"]
-
-
-@pytest.mark.parametrize(
-    ("content", "name"),
-    [
-        (b"\xff\x0a\xfa\x7f", "a JPEG XL picture"),
-        (b"<!doctype html><title>Sign in</title>", "an HTML page"),
-        (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer; run `git lfs pull`"),
-        (bytes(1000), "a file of zeros"),
-        (jpeg(shown(), PHONE)[:300], "ends before its picture does"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(100), "a PNG picture that is damaged|not a readable JPEG, PNG or WEBP picture"),
-        (b"II*\0" + bytes(100), "a TIFF picture"),
-        (KITCHEN[:200] + bytes(2000), "a JPEG picture that is damaged|ends before its picture does"),
-    ],
-)
-def test_unusable_file_is_named_in_the_words_of_users(
-    client: httpx.Client, flat: str, content: bytes, name: str
-) -> None:
-    detail = assert_problem(ask(client, flat, content), 422, "invalid-photograph")["detail"]
-    assert any(word in detail for word in name.split("|")), detail
-    assert not any(word in detail for word in LIBRARY_WORDS), detail
 
 
 @pytest.mark.parametrize("size", [10, 40_000, 400_000])
