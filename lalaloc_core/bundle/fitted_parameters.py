@@ -41,20 +41,9 @@ class LogisticModel:
     cost_to_chance: float = 0.0
     answer_to_chance: float = 0.0
 
-    def probability(
-        self,
-        *,
-        log_odds: float,
-        cost: float,
-        uncertainty: float,
-        latent_distance: float,
-        cost_to_chance: float = 0.0,
-        answer_to_chance: float = 0.0,
-    ) -> float:
-        """Return the probability for some signals."""
-        logit = self.bias + self.log_odds * log_odds + self.cost * cost
-        logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
-        logit += self.cost_to_chance * cost_to_chance + self.answer_to_chance * answer_to_chance
+    def probability(self, **signals: float) -> float:
+        """Return the probability for some signals, each by the name of its weight."""
+        logit = self.bias + sum(getattr(self, name) * value for name, value in signals.items())
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
 
 

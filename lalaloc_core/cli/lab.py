@@ -12,7 +12,6 @@ import json
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -63,11 +62,7 @@ def add_options(parser: argparse.ArgumentParser, command: Command) -> None:
         elif isinstance(usual, str | int | float | Path):
             meaning += f" (default: {usual})"
         parser.add_argument(f"--{key.replace('_', '-')}", dest=entry.name, help=meaning, **given)
-    parser.set_defaults(run=partial(_run, command))
-
-
-def _run(command: Command, arguments: argparse.Namespace) -> None:
-    command.run(configured(command, arguments.words, vars(arguments)))
+    parser.set_defaults(run=lambda arguments: command.run(configured(command, arguments.words, vars(arguments))))
 
 
 def configured(command: Command, words: list[str], options: dict[str, list[str] | None]) -> Any:

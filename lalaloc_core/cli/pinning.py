@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -75,21 +75,16 @@ def _progress_bars() -> Iterator[Callable[[str, int, int], None]]:
     from tqdm import tqdm
 
     bars: dict[str, Any] = {}
+    with ExitStack() as shown:
 
-    def show(stage: str, done: int, count: int) -> None:
-        if stage not in bars:
-            close()
-            bars[stage] = tqdm(total=count, desc=stage, unit="photograph", disable=None, leave=False)
-        bars[stage].update(done - bars[stage].n)
+        def show(stage: str, done: int, count: int) -> None:
+            if stage not in bars:
+                shown.close()
+                bar = tqdm(total=count, desc=stage, unit="photograph", disable=None, leave=False)
+                bars[stage] = shown.enter_context(bar)
+            bars[stage].update(done - bars[stage].n)
 
-    def close() -> None:
-        for bar in bars.values():
-            bar.close()
-
-    try:
         yield show
-    finally:
-        close()
 
 
 def _check_out(out: Path, sources: Iterable[Path | None], *, replace: bool) -> None:

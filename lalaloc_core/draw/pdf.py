@@ -54,7 +54,7 @@ def write_pdf(pages: Iterable[str], path: Path, dpi: int) -> None:
             image.load_jpeg(io.BytesIO(jpeg(np.asarray(picture))), inline=True)
             image.set_matrix(pypdfium2.PdfMatrix().scale(width, height))
             page.insert_obj(image)
-            for text in drawn_texts(svg):
+            for text in _texts(fromstring(svg), np.eye(3), "start"):
                 layer.insert(page, text, scale, height)
             page.gen_content()
             page.close()
@@ -64,11 +64,6 @@ def write_pdf(pages: Iterable[str], path: Path, dpi: int) -> None:
     finally:
         document.close()
     path.write_bytes(content.getvalue())
-
-
-def drawn_texts(svg: str) -> Iterator[DrawnText]:
-    """Yield the texts of a drawing, in its order."""
-    yield from _texts(fromstring(svg), np.eye(3), "start")
 
 
 def _texts(element: Element, frame: Float[np.ndarray, "3 3"], anchor: str) -> Iterator[DrawnText]:

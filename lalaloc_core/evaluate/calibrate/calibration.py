@@ -130,11 +130,9 @@ class _Queries:
         }
 
     def localise(self, name: str, known: bool) -> list[Prediction]:
-        info = self._run_info(name, known)
-        if self._config.out is not None:
-            return run_evaluation(RunFolder(self._config.out / f"{name}-{'known' if known else 'searched'}"), info)
-        with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
-            return run_evaluation(RunFolder(Path(folder)), info)
+        with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as scratch:
+            folder = (self._config.out or Path(scratch)) / f"{name}-{'known' if known else 'searched'}"
+            return run_evaluation(RunFolder(folder), self._run_info(name, known))
 
     def answers(self, *, known: bool) -> Answers:
         """Return the predictions to fit the confidence on."""

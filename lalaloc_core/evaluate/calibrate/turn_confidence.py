@@ -189,6 +189,7 @@ class _Turn:
         grid: PoseGrid = model.grid(plan, height_m)
         found = localise(plan, grid, model.encoder.layouts, query, refiner=model.refiner, config=_CONFIG)
         stages = {stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()}
+        information = found.best[found.stage].information
         return Prediction(
             scene=scene,
             camera=str(number),
@@ -197,9 +198,5 @@ class _Turn:
             truth=Pose.at(shot.position_m, shot.room_index, shot.heading),
             stages=stages,
             signals={stage: dataclasses.asdict(signals) for stage, signals in found.signals.items()},
-            information=_rows(found.best[found.stage].information),
+            information=None if information is None else tuple(map(tuple, information.tolist())),
         )
-
-
-def _rows(matrix: np.ndarray | None) -> tuple[tuple[float, ...], ...] | None:
-    return None if matrix is None else tuple(tuple(map(float, row)) for row in matrix)

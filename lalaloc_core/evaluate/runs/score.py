@@ -156,11 +156,7 @@ def position_errors_m(predictions: Sequence[Prediction], stage: str | None = Non
 
 def heading_errors_deg(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
     """Return the absolute heading errors (degrees) of the poses after a stage, as `position_errors_m`."""
-
-    def error_deg(pose: Pose, truth: Pose) -> float:
-        return abs(np.degrees(float(wrap_angle(np.radians(pose.heading_deg - truth.heading_deg)))))
-
-    return _errors(predictions, stage, error_deg)
+    return _errors(predictions, stage, lambda pose, truth: abs(np.degrees(wrap_angle(pose.heading - truth.heading))))
 
 
 def _errors(
@@ -242,7 +238,7 @@ def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stag
     error = _infinite(position_errors_m(predictions, stage))
     heading = _infinite(heading_errors_deg(predictions, stage))
     return StageScores(
-        median_cm=_centimetres(bootstrap.median(error)),
+        median_cm=bootstrap.median(100.0 * error),
         within_1cm=bootstrap.share(error < 0.01),
         within_5cm=bootstrap.share(error < 0.05),
         within_10cm=bootstrap.share(error < 0.10),
@@ -277,13 +273,9 @@ def _slices(bootstrap: _Bootstrap, predictions: Sequence[Prediction]) -> dict[st
             n=len(error_m),
             within_1m=part.share(error_m < 1.0),
             within_10cm=part.share(error_m < 0.10),
-            median_cm=_centimetres(part.median(error_m)),
+            median_cm=part.median(100.0 * error_m),
         )
     return dict(sorted(slices.items(), key=lambda item: item[1].within_1m.value))
-
-
-def _centimetres(metres: Estimate) -> Estimate:
-    return Estimate(value=100.0 * metres.value, low=100.0 * metres.low, high=100.0 * metres.high)
 
 
 def _infinite(errors: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -330,7 +322,7 @@ def count_outcomes(predictions: Sequence[Prediction], stage: str | None = None) 
 def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Prediction]:
     """Return up to `count` queries: first those without an answer, then by decreasing error."""
     errors_m = position_errors_m(predictions)
-    order = np.argsort(-np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")
+    order = np.argsort(-_infinite(errors_m), kind="stable")
     return [predictions[index] for index in order[:count]]
 
 

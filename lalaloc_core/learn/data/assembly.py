@@ -220,12 +220,6 @@ def chain_rings(lines: Sequence[tuple[int, int]]) -> list[list[int]]:
     return rings
 
 
-def signed_area(polygon: Float[np.ndarray, "n 2"]) -> float:
-    """Return the area inside a ring; positive for counter-clockwise rings."""
-    following = np.roll(polygon, -1, axis=0)
-    return float(polygon[:, 0] @ following[:, 1] - polygon[:, 1] @ following[:, 0]) / 2.0
-
-
 def largest_simple_part(polygon: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "m 2"], float]:
     """Return the largest simple polygon within a ring that may cross itself, and its share of the enclosed area."""
     shape = shapely.Polygon(polygon)

@@ -210,15 +210,8 @@ class HeldoutScenes:
         if not _FOLDER.is_dir():
             raise DatasetError("out-of-distribution homes are in the repository, not in installations", path=_FOLDER)
 
-    @property
-    def description(self) -> str:
-        """Name of the data set in results."""
-        return "out-of-distribution homes"
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """The only appearance."""
-        return (Appearance("full"),)
+    description = "out-of-distribution homes"
+    appearances = (Appearance("full"),)
 
     def scenes(self, split: Split) -> Sequence[str]:
         """Return the names of the homes."""

@@ -14,6 +14,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -45,9 +46,6 @@ EXCLUDED_BY_PAPER: dict[Split, tuple[int, ...]] = {
     "validation": (3086, 3117, 3121, 3239),
     "test": (3307,),
 }
-
-# "Invalid scenes" in the errata of the data set; scenes listed only here are kept so that results are comparable.
-ERRATA = (1155, 1192, 1714, 1816, 1852, 3398)
 
 
 def scene_numbers(split: Split) -> tuple[int, ...]:
@@ -92,6 +90,7 @@ class Structured3D:
     """
 
     root: Path
+    appearances = tuple(Appearance(furniture, lighting) for furniture, lighting in product(FURNITURE, LIGHTING))
 
     @cached_property
     def synthetic(self) -> Synthetic | None:
@@ -118,11 +117,6 @@ class Structured3D:
     def sphere_size(self) -> tuple[int, int]:
         """Required (height, width) of every sphere."""
         return SPHERE_SIZE if self.synthetic is None else (self.synthetic.height, self.synthetic.width)
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """All combinations of furniture and lighting."""
-        return [Appearance(furniture, lighting) for furniture in FURNITURE for lighting in LIGHTING]
 
     def scenes(self, split: Split) -> Sequence[str]:
         """Return the names of a split's scenes on disk."""

@@ -31,7 +31,6 @@ from lalaloc_core.learn.data.assembly import (
     chain_rings,
     is_number,
     read_json,
-    signed_area,
 )
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening
 
@@ -185,7 +184,7 @@ class _Reader:
         if not rings:
             raise self._error(f"floor plane {plane}: {fault}", room) from fault
         corners_m = [np.array([self._junction_mm(junction, room) for junction in ring]) / _MM_PER_M for ring in rings]
-        outer = int(np.argmax([abs(signed_area(corners[:, :2])) for corners in corners_m]))
+        outer = int(np.argmax([shapely.Polygon(corners).area for corners in corners_m]))
         return corners_m[outer], tuple(corners[:, :2] for k, corners in enumerate(corners_m) if k != outer)
 
     def _chained(self, lines: list[int], room: str) -> tuple[list[list[int]], OpenRingError | None]:

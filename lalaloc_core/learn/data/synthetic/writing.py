@@ -143,8 +143,12 @@ class _Job:
         return self.settings.root / (scene_name(self.number) + PART_SUFFIX)
 
 
-def _write_scene(job: _Job, stop: Event | None = None) -> int:
-    """Render and write one scene, and return its number of spheres; a failure, or `stop`, leaves no files."""
+# Set when a worker process starts, because an event can be passed at no other time.
+_stop: Event | None = None
+
+
+def _write_scene(job: _Job) -> int:
+    """Render and write one scene, and return its number of spheres; a failure, or `_stop`, leaves no files."""
     settings, split = job.settings, SPLIT_NUMBERS[job.split]
     home, rng = home_of(split, settings.seed, job.number)
     renderer = split_renderer_cache(split, settings.seed, settings.textures).renderer(
@@ -156,7 +160,7 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
             job.part.mkdir()
             write_annotation(job.part, home.plan, home.openings)
             for shot in shots:
-                if stop is not None and stop.is_set():
+                if _stop is not None and _stop.is_set():
                     return 0
                 _write_room(job.part / RENDERING_FOLDER / str(shot.room_index) / "panorama", shot, renderer)
             job.part.rename(job.folder)
@@ -224,7 +228,7 @@ def _write_in_processes(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
     stop = context.Event()
     pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
     try:
-        yield from pool.map(_work, jobs)
+        yield from pool.map(_write_scene, jobs)
     except BrokenProcessPool as error:
         raise DatasetError(
             "a worker process died; use fewer --workers if memory is short", path=jobs[0].settings.root
@@ -233,10 +237,6 @@ def _write_in_processes(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
         # After an interruption or an error the workers abandon their scenes.
         stop.set()
         pool.shutdown(cancel_futures=True)
-
-
-# Set when a worker process starts, because an event can be passed at no other time.
-_stop: Event | None = None
 
 
 def _start_worker(stop: Event) -> None:
@@ -253,7 +253,3 @@ def _die_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _work(job: _Job) -> int:
-    return _write_scene(job, _stop)
