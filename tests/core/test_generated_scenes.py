@@ -20,8 +20,7 @@ from lalaloc_core.learn.data.synthetic.altered_photographs import (
     OutdoorPhotograph,
     UpsideDown,
 )
-from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
-from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
+from lalaloc_core.learn.data.synthetic.altered_plans import CopiedScenes, ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.render.profile import render_layout
 

@@ -21,7 +21,7 @@ import numpy as np
 from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.bench.speed import spheres_of_home
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.synthetic.foreign import without_openings
+from lalaloc_core.learn.data.synthetic.altered_plans import without_openings
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
 from lalaloc_core.photograph.cameras import Perspective
 

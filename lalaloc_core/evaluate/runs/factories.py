@@ -21,8 +21,7 @@ from lalaloc_core.learn.data.dataset import Appearance, Dataset
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.folder import HeldoutScenes
 from lalaloc_core.learn.data.synthetic.altered_photographs import DisturbedScenes, MismatchedScenes
-from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
-from lalaloc_core.learn.data.synthetic.foreign import ForeignScenes, UnopenedScenes
+from lalaloc_core.learn.data.synthetic.altered_plans import CopiedScenes, ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import ViewScenes
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder

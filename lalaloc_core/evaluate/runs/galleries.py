@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotated import GalleryKey
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.learn.data.folder import HeldoutScenes
-from lalaloc_core.learn.data.synthetic.foreign import office_plan, without_openings
+from lalaloc_core.learn.data.synthetic.altered_plans import office_plan, without_openings
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 

@@ -1,8 +1,8 @@
 """Generated data sets, and writing them to disk.
 
 Begin with `generated.py`: homes of the generator, rendered on demand. For calibration, `altered_photographs.py`
-degrades or replaces their photographs, `foreign.py` asks for them in other plans, and `copied.py`
-puts copies of a home into one plan; `writing.py` implements `lalaloc lab synth`.
+degrades or replaces their photographs, and `altered_plans.py` asks for them in other plans; `writing.py` implements
+`lalaloc lab synth`.
 """
 
 from lalaloc_core.learn.data.synthetic.altered_photographs import MismatchedScenes
