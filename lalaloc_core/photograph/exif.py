@@ -136,7 +136,7 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes | str] = (), *, wid
         focal = zoom * lens / side_mm * long
     # Makers disagree whether the equivalent focal length includes digital zoom.
     doubt = 0.5 * math.log(zoom) if film is not None else 0.0
-    camera = _camera_of(exif)
+    camera = " ".join(_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)).strip()
     is_wide = film is None or film <= _MAX_FISHEYE_MM
     angle_deg = next((angle for pattern, angle in _FISHEYES if pattern.match(camera)), None) if is_wide else None
     return ExifLens(
@@ -146,12 +146,6 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes | str] = (), *, wid
         camera="" if angle_deg is None else camera,
         warnings=tuple(warnings),
     )
-
-
-def _camera_of(exif: Image.Exif) -> str:
-    """Return maker and model as they are printed."""
-    texts = (str(exif.get(tag, ""))[:40] for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
-    return " ".join("".join(filter(str.isprintable, text)).strip() for text in texts).strip()
 
 
 def _film_side_mm(ratio: float) -> float:
@@ -164,7 +158,8 @@ def _film_side_mm(ratio: float) -> float:
 def _sensor_side_mm(exif: Image.Exif, tags: dict[int, object], lens_mm: float, warnings: list[str]) -> float | None:
     """Return the longer side of the sensor, from the pixels per unit on it or the model."""
     density = finite_number(tags.get(ExifTags.Base.FocalPlaneXResolution))
-    unit_mm = _UNITS_MM.get(_integer(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)))
+    unit = finite_number(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    unit_mm = None if unit is None else _UNITS_MM.get(round(unit))
     sides = [
         finite_number(tags.get(tag)) or 0.0 for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)
     ]
@@ -222,22 +217,13 @@ def finite_number(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _integer(value: object) -> int:
-    number = finite_number(value)
-    return 0 if number is None else round(number)
-
-
 def read_taken(exif: Image.Exif, *, width: int, height: int) -> Taken:
     """Read time and camera of an upright picture of `width` x `height` pixels."""
     make, model = (_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
-    return Taken(at=_time(exif), make=make, model=model, width=width, height=height)
-
-
-def _time(exif: Image.Exif) -> datetime | None:
-    """Return when a photograph was taken; the time of the file's last change is not used."""
     tags = exif.get_ifd(ExifTags.IFD.Exif)
+    # The time of the file's last change is not used.
     times = (read_time(*(_text(tags.get(tag)) for tag in names)) for names in _TIMES)
-    return next(filter(None, times), None)
+    return Taken(at=next(filter(None, times), None), make=make, model=model, width=width, height=height)
 
 
 def read_time(text: str, subseconds: str = "", offset: str = "") -> datetime | None:

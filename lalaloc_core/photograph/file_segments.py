@@ -28,7 +28,7 @@ _MAX_CHUNKS = 20_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 # Length before and checksum after each chunk.
 _CHUNK_FRAME = 12
-_XMP, _XMP_EXTENSION = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+XMP, _XMP_EXTENSION = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
 # GUID, total length and offset before each part of an extension.
 _GUID_BYTES, _EXTENSION_HEAD = 32, 40
 _PNG_XMP = b"XML:com.adobe.xmp\0"
@@ -183,8 +183,8 @@ def _jpeg_packets(content: bytes) -> list[bytes]:
         if marker != APP1:
             continue
         segment = content[position + 2 : position + int.from_bytes(content[position : position + 2], "big")]
-        if segment.startswith(_XMP):
-            packets.append(segment[len(_XMP) :])
+        if segment.startswith(XMP):
+            packets.append(segment[len(XMP) :])
         elif segment.startswith(_XMP_EXTENSION):
             part = segment[len(_XMP_EXTENSION) :]
             offset = int.from_bytes(part[_EXTENSION_HEAD - 4 : _EXTENSION_HEAD], "big")

@@ -17,11 +17,10 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 from PIL import ExifTags, Image
 
-from lalaloc_core.photograph.file_segments import APP1, START, START_OF_SCAN, markers, png_chunks
+from lalaloc_core.photograph.file_segments import APP1, START, START_OF_SCAN, XMP, markers, png_chunks
 from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
 from lalaloc_core.shown_text import printable
 
-_XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _EXIF = b"Exif\0\0"
 _PNG_XMP = b"XML:com.adobe.xmp\0\0\0\0\0"
 _MAX_SEGMENT = 65_533
@@ -63,7 +62,7 @@ def placed_copy(content: bytes, place: Place) -> tuple[bytes, bytes | None]:
         packet = next((packet for packet in file.packets if packet), None)
         xmp = _xmp(packet, place)
         stated = _exif(exif, place)
-    if kind == "JPEG" and len(_XMP) + len(xmp) <= _MAX_SEGMENT:
+    if kind == "JPEG" and len(XMP) + len(xmp) <= _MAX_SEGMENT:
         return _in_jpeg(content, stated, xmp), None
     if kind == "PNG":
         return _in_png(content, stated, xmp), None
@@ -167,13 +166,13 @@ def _in_jpeg(content: bytes, exif: bytes | None, xmp: bytes) -> bytes:
             position = at - 2
             break
         body = content[at + 2 : end]
-        replaced = body.startswith(_XMP) or (exif is not None and body.startswith(_EXIF))
+        replaced = body.startswith(XMP) or (exif is not None and body.startswith(_EXIF))
         if not (marker == APP1 and replaced):
             target = first if marker == _APP0 or (marker == APP1 and body.startswith(_EXIF)) else kept
             target.append(bytes([0xFF, marker]) + content[at:end])
         position = end
     new = [] if exif is None else [_segment(exif if exif.startswith(_EXIF) else _EXIF + exif)]
-    return b"".join([START, *first, *new, _segment(_XMP + xmp), *kept, content[position:]])
+    return b"".join([START, *first, *new, _segment(XMP + xmp), *kept, content[position:]])
 
 
 def _segment(body: bytes) -> bytes:

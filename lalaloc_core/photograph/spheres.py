@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from lalaloc_core.conventions import column_azimuths, row_elevations
+from lalaloc_core.conventions import column_azimuths, row_elevations, unit_rays
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
@@ -108,19 +108,16 @@ def level(
     azimuth, elevation = column_azimuths(width) + turn, row_elevations(height)
     out = np.empty_like(pixels)
     for top in range(0, height, _ROWS):
-        block = elevation[top : top + _ROWS, None]
-        rays = np.stack(
-            np.broadcast_arrays(np.cos(block) * np.sin(azimuth), np.cos(block) * np.cos(azimuth), np.sin(block))
-        )
-        out[top : top + _ROWS] = _sample(pixels, np.einsum("ij,jrc->irc", axes, rays))
+        rays = unit_rays(azimuth, elevation[top : top + _ROWS, None])
+        out[top : top + _ROWS] = _sample(pixels, rays @ axes.T)
     return out
 
 
-def _sample(pixels: UInt8[np.ndarray, "h w 3"], rays: Float[np.ndarray, "3 r c"]) -> UInt8[np.ndarray, "r c 3"]:
+def _sample(pixels: UInt8[np.ndarray, "h w 3"], rays: Float[np.ndarray, "r c 3"]) -> UInt8[np.ndarray, "r c 3"]:
     """Return the colours along unit rays in the camera's frame (right, forward, up)."""
     height, width = pixels.shape[:2]
-    column = (np.arctan2(rays[0], rays[1]) / (2.0 * np.pi) + 0.5) * width - 0.5
-    row = (0.5 - np.arcsin(np.clip(rays[2], -1.0, 1.0)) / np.pi) * height - 0.5
+    column = (np.arctan2(rays[..., 0], rays[..., 1]) / (2.0 * np.pi) + 0.5) * width - 0.5
+    row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / np.pi) * height - 0.5
     left, above = np.floor(column).astype(int), np.floor(row).astype(int)
     across, down = (column - left)[..., None], (row - above)[..., None]
     blended = sum(

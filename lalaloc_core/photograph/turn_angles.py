@@ -113,7 +113,7 @@ def angles_of_turn(views: Sequence[TurnView], steps: Sequence[Step] | None = Non
     """Return the angles of photographs of one spot, in the order in which they were taken.
 
     Groups that do not overlap are joined by `steps` from each photograph to the next, by default by equal steps if the
-    photographs go once around; see `turn_order`.
+    photographs go once around; see `usual_steps`.
     """
     attitudes = [_attitude_of(view) for view in views]
     cameras = [view.camera for view in views]

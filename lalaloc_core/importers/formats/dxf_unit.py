@@ -23,7 +23,8 @@ from lalaloc_core.importers.drawing.vector_drawing import Drawing
 
 # (metres, value of the option `units`) by $INSUNITS; DXF reference.
 _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
-_USUAL_EXTENT_M = (4.0, 120.0)
+# Extents (m) of drawings beyond which the unit is doubted.
+_EXTENT_M = (4.0, 1000.0)
 _MAX_DIMENSIONS = 1000
 # A unit is meant within so many standard deviations of the estimated scale, or this share of it.
 _NEAR_STDS, _NEAR = 3.0, 0.1
@@ -55,7 +56,7 @@ def find_unit(
         )
     own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
     factor, source = drawing_scale(options, "the DXF", own=own)
-    if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
+    if not _EXTENT_M[0] <= extent * factor <= _EXTENT_M[1]:
         hint = "check units"
         if fitting is not None and own_unit and fitting != own_unit[1]:
             hint = f"it looks like {UNIT_NAMES[fitting]}: set units={fitting}"
