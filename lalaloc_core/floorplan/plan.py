@@ -14,49 +14,19 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, heading_from_degrees, heading_to_degrees
-from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, Anchor, anchor_document, read_anchor
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, heading_to_degrees
+from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, Anchor, anchor_document
 from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
-from lalaloc_core.floorplan.json_values import (
-    DEFAULT_LIMITS,
-    NO_LIMITS,
-    PlanLimits,
-    check_keys,
-    json_kind,
-    read_json,
-    read_name,
-    read_optional,
-)
-from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
-from lalaloc_core.floorplan.plan_document import (
-    DEFAULT_CAMERA_HEIGHT_M,
-    MAX_CAMERA_HEIGHT_STD_M,
-    TOLERANCES_M,
-    Fixture,
-    FixturePlaces,
-    ceiling_warnings,
-    read_camera_height,
-    read_ceiling,
-    read_fixtures,
-    read_opening_trust,
-    read_openings,
-    read_rooms,
-    state_types,
-    trust_warnings,
-    with_types_of_fixtures,
-)
+from lalaloc_core.floorplan.json_values import DEFAULT_LIMITS, NO_LIMITS, PlanLimits, read_json
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace
+from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, Fixture, FixturePlaces, read_plan, state_types
 from lalaloc_core.floorplan.room_types import type_fields
-from lalaloc_core.floorplan.rooms import Room, check_size, frozen, overlap_warnings
+from lalaloc_core.floorplan.rooms import Room, frozen
 
 # Plans with more rooms use a spatial index to find the room of a position.
 _FEW_ROOMS = 32
 # Directions of walls, one for each degree of a quarter turn.
 _DIRECTIONS = 90
-_PLAN_KEYS = {
-    "name", "rooms", "ceiling_height_m", "camera_height_m", "camera_height_std_m", "north_deg", "anchor", "openings",
-    "opening_kinds", "opening_trust", "opening_tolerance_m", "fixtures",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +78,7 @@ class FloorPlan:
         Raises:
             InvalidFloorPlanError: the plan is invalid; the message names the room and the problem.
         """
-        return cls._read(document, limits, None)
+        return cls(**read_plan(document, limits, None))
 
     @classmethod
     def from_stored(cls, text: str, warnings: Sequence[str] | None) -> FloorPlan:
@@ -119,58 +89,7 @@ class FloorPlan:
         Raises:
             InvalidFloorPlanError: `text` is not the JSON of a plan.
         """
-        return cls._read(read_json(text, NO_LIMITS.max_depth), NO_LIMITS, warnings)
-
-    @classmethod
-    def _read(cls, document: Any, limits: PlanLimits, warnings: Sequence[str] | None) -> FloorPlan:
-        if not isinstance(document, Mapping):
-            raise InvalidFloorPlanError(f"a plan must be an object, not {json_kind(document)}")
-        check_keys(document, _PLAN_KEYS)
-        name = read_name(document.get("name", "floor plan"), limits, label="the plan's name")
-        ceiling = document.get("ceiling_height_m")
-        default_ceiling_m = None if ceiling is None else read_ceiling(ceiling, None, limits)
-        rooms = read_rooms(document.get("rooms"), default_ceiling_m, limits)
-        check_size(rooms, limits)
-        openings = read_openings(document.get("openings"), rooms, limits)
-        opening_trust = read_opening_trust(document, openings)
-        tolerance_m = read_optional(document.get("opening_tolerance_m"), "opening_tolerance_m", *TOLERANCES_M, " m")
-        tolerance_m = DEFAULT_OPENING_TOLERANCE_M if tolerance_m is None else tolerance_m
-        faces, unplaced = place_openings(openings, rooms, tolerance_m, limits)
-        if openings and not faces:
-            raise InvalidFloorPlanError(
-                f"all openings are more than {tolerance_m:g} m from every wall (opening_tolerance_m); check that "
-                "openings and rooms are in the same units"
-            )
-        stated_deg = read_optional(document.get("north_deg"), "north_deg", -360.0, 360.0, "")
-        north = None if stated_deg is None else heading_from_degrees(stated_deg)
-        # Rounding restores degrees that were converted to radians.
-        north_deg = None if north is None else round(heading_to_degrees(north), 9)
-        anchor = read_anchor(document.get("anchor"), north_deg, rooms)
-        if anchor is not None:
-            north = heading_from_degrees(anchor.north_deg)
-        fixtures = read_fixtures(document.get("fixtures"), limits)
-        if warnings is None:
-            off_wall = [f"{label(openings[k], k)} is not on a wall" for k in unplaced]
-            ceilings = ceiling_warnings(rooms, default_ceiling_m)
-            warnings = (*ceilings, *overlap_warnings(rooms, limits), *off_wall, *trust_warnings(document))
-        return cls(
-            name=name,
-            rooms=with_types_of_fixtures(rooms, fixtures, document["rooms"]),
-            camera_height_m=read_camera_height(document.get("camera_height_m"), rooms, limits),
-            warnings=tuple(warnings),
-            north=north,
-            openings=openings,
-            opening_trust=opening_trust,
-            opening_tolerance_m=tolerance_m,
-            opening_faces=faces,
-            camera_height_std_m=read_optional(
-                document.get("camera_height_std_m"), "camera_height_std_m", 0.0, MAX_CAMERA_HEIGHT_STD_M, " m"
-            ),
-            states_camera_height=document.get("camera_height_m") is not None,
-            anchor=anchor,
-            fixtures=fixtures,
-            ceiling_height_m=default_ceiling_m,
-        )
+        return cls(**read_plan(read_json(text, NO_LIMITS.max_depth), NO_LIMITS, warnings))
 
     def anchor_within(self, venue_anchor: Anchor | None) -> Anchor | None:
         """Return the plan's own anchor, else the venue's.

@@ -1,4 +1,4 @@
-"""Readers for the parts of a plan's document: rooms, openings, fixtures, and the camera height."""
+"""Reading of a plan's document: rooms, openings, fixtures, north and place, and the camera height."""
 
 from __future__ import annotations
 
@@ -12,8 +12,15 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import FIXTURE_KINDS, OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.conventions import (
+    FIXTURE_KINDS,
+    OPENING_CLASSES,
+    ROOM_TYPES,
+    heading_from_degrees,
+    heading_to_degrees,
+)
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import read_anchor
 from lalaloc_core.floorplan.json_values import (
     PlanLimits,
     check_keys,
@@ -27,12 +34,16 @@ from lalaloc_core.floorplan.json_values import (
     read_points,
     read_segment,
 )
-from lalaloc_core.floorplan.openings import Opening
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, label, place_openings
 from lalaloc_core.floorplan.room_types import room_types_from_name, types_by_fixtures
-from lalaloc_core.floorplan.rooms import Room, frozen
+from lalaloc_core.floorplan.rooms import Room, check_size, frozen, overlap_warnings
 
 DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M = 1.5, 2.5
 MAX_CAMERA_HEIGHT_STD_M = 2.0
+_PLAN_KEYS = {
+    "name", "rooms", "ceiling_height_m", "camera_height_m", "camera_height_std_m", "north_deg", "anchor", "openings",
+    "opening_kinds", "opening_trust", "opening_tolerance_m", "fixtures",
+}  # fmt: skip
 _ROOM_KEYS = {"id", "name", "type", "types", "polygon", "holes", "walls", "ceiling_height_m"}
 # Free-standing walls can reach this far outside the floor: drawings let a stub begin on the axis of another wall.
 _WALL_OVERSHOOT_M = 0.01
@@ -42,6 +53,58 @@ _OPENING_KEYS = {"kind", "line", "sill_m", "head_m", "name", "rooms"}
 # Distances of openings from their walls, from the rounding of drawings to the thickest walls.
 TOLERANCES_M = (0.01, 1.5)
 _KEYS = {"kind", "outline"}
+
+
+def read_plan(document: Any, limits: PlanLimits, warnings: Sequence[str] | None) -> dict[str, Any]:
+    """Read and check the fields of a `FloorPlan`; `warnings` are those of its first check, None to compute them."""
+    if not isinstance(document, Mapping):
+        raise InvalidFloorPlanError(f"a plan must be an object, not {json_kind(document)}")
+    check_keys(document, _PLAN_KEYS)
+    name = read_name(document.get("name", "floor plan"), limits, label="the plan's name")
+    ceiling = document.get("ceiling_height_m")
+    default_ceiling_m = None if ceiling is None else read_ceiling(ceiling, None, limits)
+    rooms = read_rooms(document.get("rooms"), default_ceiling_m, limits)
+    check_size(rooms, limits)
+    openings = read_openings(document.get("openings"), rooms, limits)
+    opening_trust = read_opening_trust(document, openings)
+    tolerance_m = read_optional(document.get("opening_tolerance_m"), "opening_tolerance_m", *TOLERANCES_M, " m")
+    tolerance_m = DEFAULT_OPENING_TOLERANCE_M if tolerance_m is None else tolerance_m
+    faces, unplaced = place_openings(openings, rooms, tolerance_m, limits)
+    if openings and not faces:
+        raise InvalidFloorPlanError(
+            f"all openings are more than {tolerance_m:g} m from every wall (opening_tolerance_m); check that "
+            "openings and rooms are in the same units"
+        )
+    stated_deg = read_optional(document.get("north_deg"), "north_deg", -360.0, 360.0, "")
+    north = None if stated_deg is None else heading_from_degrees(stated_deg)
+    # Rounding restores degrees that were converted to radians.
+    north_deg = None if north is None else round(heading_to_degrees(north), 9)
+    anchor = read_anchor(document.get("anchor"), north_deg, rooms)
+    if anchor is not None:
+        north = heading_from_degrees(anchor.north_deg)
+    fixtures = read_fixtures(document.get("fixtures"), limits)
+    if warnings is None:
+        off_wall = [f"{label(openings[k], k)} is not on a wall" for k in unplaced]
+        ceilings = ceiling_warnings(rooms, default_ceiling_m)
+        warnings = (*ceilings, *overlap_warnings(rooms, limits), *off_wall, *trust_warnings(document))
+    return {
+        "name": name,
+        "rooms": with_types_of_fixtures(rooms, fixtures, document["rooms"]),
+        "camera_height_m": read_camera_height(document.get("camera_height_m"), rooms, limits),
+        "warnings": tuple(warnings),
+        "north": north,
+        "openings": openings,
+        "opening_trust": opening_trust,
+        "opening_tolerance_m": tolerance_m,
+        "opening_faces": faces,
+        "camera_height_std_m": read_optional(
+            document.get("camera_height_std_m"), "camera_height_std_m", 0.0, MAX_CAMERA_HEIGHT_STD_M, " m"
+        ),
+        "states_camera_height": document.get("camera_height_m") is not None,
+        "anchor": anchor,
+        "fixtures": fixtures,
+        "ceiling_height_m": default_ceiling_m,
+    }
 
 
 def read_rooms(raw_rooms: Any, default_ceiling_m: float | None, limits: PlanLimits) -> tuple[Room, ...]:

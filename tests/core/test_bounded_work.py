@@ -145,7 +145,7 @@ def test_stored_plan_skips_the_overlap_search(monkeypatch: pytest.MonkeyPatch) -
     def refuse(*_: object) -> None:
         raise AssertionError("looked for overlaps")
 
-    monkeypatch.setattr("lalaloc_core.floorplan.plan.overlap_warnings", refuse)
+    monkeypatch.setattr("lalaloc_core.floorplan.plan_document.overlap_warnings", refuse)
     again = FloorPlan.from_stored(text, plan.warnings)
     assert again.warnings == plan.warnings
     assert again.to_dict() == plan.to_dict()
