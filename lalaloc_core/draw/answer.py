@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,7 +17,7 @@ from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_ma
 from lalaloc_core.draw.outline import Outline, layout_outline, photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.answers.documents import Answer
+from lalaloc_core.localise.answers.documents import Answer, Position, PossiblePose
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, probability_map
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.shown_text import probability_text
@@ -37,23 +38,13 @@ _MAX_CHARACTERS = 52
 _SOURCES = {"given": "given", "photograph": "from the compass", "searched": "estimated"}
 
 
-@dataclass(frozen=True)
-class DrawnCandidate:
-    """Another candidate pose, with its probability if known."""
-
-    x_m: float
-    y_m: float
-    heading_deg: float
-    room: str
-    probability: float | None
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnAnswer:
     """The contents of an answer's picture.
 
     Attributes:
         camera: the predicted pose, with its covariance if known.
+        rivals: the other candidates.
         heat: map of the posterior; None leaves the floors white.
     """
 
@@ -63,7 +54,7 @@ class DrawnAnswer:
     camera_height_m: float
     heading_source: str
     confidence: float | None
-    rivals: tuple[DrawnCandidate, ...] = ()
+    rivals: Sequence[PossiblePose] = ()
     heat: HeatMap | None = None
     photograph: Photograph | None = None
 
@@ -83,10 +74,6 @@ def drawn_answer(answer: Answer) -> DrawnAnswer:
     if answer.covariance_m2 is not None:
         (xx, xy), (_, yy) = answer.covariance_m2
         covariance = (xx, xy, yy)
-    rivals = tuple(
-        DrawnCandidate(pose.position.x_m, pose.position.y_m, pose.heading_deg, pose.room, pose.probability)
-        for pose in answer.candidates[1:]
-    )
     x_m, y_m = answer.position.x_m, answer.position.y_m
     return DrawnAnswer(
         plan=plan,
@@ -95,7 +82,7 @@ def drawn_answer(answer: Answer) -> DrawnAnswer:
         camera_height_m=answer.camera_height_m,
         heading_source=_SOURCES[answer.heading_source],
         confidence=answer.confidence,
-        rivals=rivals,
+        rivals=answer.candidates[1:],
         heat=posterior_map(plan, probability_map(plan, grid.poses, evidence.found.posterior), grid.step_m),
         photograph=None if evidence.photograph.is_sphere else evidence.photograph,
     )
@@ -176,7 +163,7 @@ def _marks(answer: DrawnAnswer) -> str:
     parts = []
     for number, rival in reversed(list(enumerate(_shown(answer), start=2))):
         parts.append(
-            f'<g class="rival" transform="translate({rival.x_m:.4f} {-rival.y_m:.4f})">'
+            f'<g class="rival" transform="translate({rival.position.x_m:.4f} {-rival.position.y_m:.4f})">'
             f'<circle r="{0.9 * size:.4f}" fill="#fff" stroke="{FOUND}" stroke-width="{0.16 * size:.4f}"/>'
             f'<path d="M0 {-0.9 * size:.4f}V{-1.7 * size:.4f}" stroke="{FOUND}" stroke-width="{0.22 * size:.4f}" '
             f'transform="rotate({rival.heading_deg:.2f})"/>'
@@ -226,13 +213,14 @@ def _sized(photograph: UInt8[np.ndarray, "h w 3"], *, is_sphere: bool) -> UInt8[
     return np.asarray(Image.fromarray(photograph).resize(size, Image.Resampling.BICUBIC))
 
 
-def _shown(answer: DrawnAnswer) -> list[DrawnCandidate]:
+def _shown(answer: DrawnAnswer) -> list[PossiblePose]:
     """Return the other places; candidates within 1 m of the answer or of a better one are the same place."""
-    places: list[DrawnCandidate] = []
+    places: list[PossiblePose] = []
     for rival in answer.rivals:
-        if _distance_m(rival, answer.camera) < RIGHT_WITHIN_M:
+        spot = rival.position
+        if _distance_m(spot, answer.camera) < RIGHT_WITHIN_M:
             continue
-        near = next((i for i, place in enumerate(places) if _distance_m(rival, place) < RIGHT_WITHIN_M), None)
+        near = next((i for i, place in enumerate(places) if _distance_m(spot, place.position) < RIGHT_WITHIN_M), None)
         if near is None:
             places.append(rival)
         elif rival.probability is not None:
@@ -240,7 +228,7 @@ def _shown(answer: DrawnAnswer) -> list[DrawnCandidate]:
     return [place for place in places if place.probability is None or place.probability >= _MIN_PROBABILITY]
 
 
-def _distance_m(first: DrawnCandidate, second: DrawnCandidate | Marker) -> float:
+def _distance_m(first: Position, second: Position | Marker) -> float:
     return math.hypot(first.x_m - second.x_m, first.y_m - second.y_m)
 
 

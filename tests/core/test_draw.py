@@ -13,11 +13,12 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.draw import canvas, rasterise
-from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
+from lalaloc_core.draw.answer import DrawnAnswer, Picture, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, heat_image, posterior_map
 from lalaloc_core.draw.outline import layout_outline
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.answers.documents import Position, PossiblePose
 from lalaloc_core.localise.belief import ProbabilityMap
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 from lalaloc_core.render.sweep import profiles_at
@@ -42,6 +43,18 @@ EYE_M = 1.5
 MIDDLE = np.array([2.0, 3.0])
 
 
+def rival(x_m: float, y_m: float, heading_deg: float, room: str, probability: float | None) -> PossiblePose:
+    return PossiblePose(
+        position=Position(x_m=x_m, y_m=y_m),
+        heading_deg=heading_deg,
+        room=room,
+        room_id=room,
+        probability=probability,
+        cost=0.0,
+        latent_distance=0.0,
+    )
+
+
 def answer(**changes: Any) -> DrawnAnswer:
     values: dict = {
         "plan": PLAN,
@@ -50,10 +63,7 @@ def answer(**changes: Any) -> DrawnAnswer:
         "camera_height_m": EYE_M,
         "heading_source": "given",
         "confidence": 0.7,
-        "rivals": (
-            DrawnCandidate(5.0, 4.0, 210.0, "<kitchen> & more", 0.2),
-            DrawnCandidate(7.0, 1.0, 0.0, "hall", 0.0),
-        ),
+        "rivals": (rival(5.0, 4.0, 210.0, "<kitchen> & more", 0.2), rival(7.0, 1.0, 0.0, "hall", 0.0)),
     }
     return DrawnAnswer(**(values | changes))
 
@@ -205,7 +215,7 @@ def test_photograph_picture_needs_a_photograph() -> None:
 
 
 def test_picture_without_confidence() -> None:
-    bare = answer(confidence=None, rivals=(DrawnCandidate(5.0, 4.0, 210.0, "kitchen", None),))
+    bare = answer(confidence=None, rivals=(rival(5.0, 4.0, 210.0, "kitchen", None),))
     words = " ".join(ElementTree.fromstring(draw_answer(bare, picture="plan")).itertext())
     assert "within 1 m" not in words
     assert "kitchen" in words
@@ -213,7 +223,7 @@ def test_picture_without_confidence() -> None:
 
 def test_near_candidates_are_drawn_as_one_place() -> None:
     rivals = [(2.5, 3.5, 0.1), (5.0, 4.0, 0.2), (5.0, 4.9, 0.05), (7.0, 1.0, 0.04)]
-    places = answer(rivals=tuple(DrawnCandidate(x_m, y_m, 0.0, "kitchen", share) for x_m, y_m, share in rivals))
+    places = answer(rivals=tuple(rival(x_m, y_m, 0.0, "kitchen", share) for x_m, y_m, share in rivals))
     root = ElementTree.fromstring(draw_answer(places, picture="plan"))
     assert [element.get("class") for element in root.iter()].count("rival") == 2
     texts = {text.strip() for text in root.itertext()}
