@@ -22,9 +22,9 @@ from lalaloc_core.learn.training.warm_start import (
     bundle_weights,
     check_same_networks,
     find_checkpoint,
-    load_trained_decoder,
-    load_trained_layout_encoder,
     sphere_count,
+    trained_decoder,
+    trained_layout_encoder,
     training_totals,
 )
 from lalaloc_core.nets import ImageEncoder, load_layout_encoder
@@ -63,9 +63,9 @@ def export_run(
     return export_bundle(
         out,
         (image or layout).config,
-        load_trained_layout_encoder(teacher, last=last_layout),
+        trained_layout_encoder(layout),
         image_encoder,
-        load_trained_decoder(teacher, last=last_layout),
+        trained_decoder(layout),
         name=name,
         version=version,
         training={**training, **(notes or {})},

@@ -24,9 +24,10 @@ from lalaloc_core.learn.training.stages import (
     photograph_loss,
     sample_styles,
     sphere_batches,
+    structure_losses,
 )
 from lalaloc_core.nets import LayoutNetwork
-from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
+from lalaloc_core.nets.image_features import ImageFeatures, first_rows
 from lalaloc_core.nets.layout_network import RingLayoutEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 
@@ -76,7 +77,9 @@ class ImageStage(TrainingStage[ImageStageConfig]):
             latent = self.teacher.head(seen_ring)
             known = seen.repeat_interleave(self.config.profile_columns // seen.shape[1], dim=1)
             if features.structure is not None:
-                terms |= self._structure_losses(features.structure, batch, known)
+                assert isinstance(self.encoder, TrunkImageEncoder)
+                kind = torch.where(known, batch["opening_kind"], UNKNOWN)
+                terms |= structure_losses(settings, self.encoder, features.structure, kind, batch)
                 if settings.edges_weight:
                     terms["edges"] = edges_loss(settings, features.structure, batch["edges"], walls, known)
             terms |= photograph_terms
@@ -119,26 +122,6 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         weight = opening_weight(settings, self.encoder, self.photographs)
         loss = photograph_loss(settings, features.walls.rows(rows), logits, known, photographs, weight)
         return first_rows(features, len(image)), {"photographs": loss}
-
-    def _structure_losses(
-        self, features: StructureFeatures, batch: Batch, known: Bool[Tensor, "b w"]
-    ) -> dict[str, Tensor]:
-        settings, room_type = self.settings, batch["room_type"]
-        kind = torch.where(known, batch["opening_kind"], UNKNOWN)
-        assert isinstance(self.encoder, TrunkImageEncoder)
-        self.encoder.update_class_shares(kind, room_type)
-        terms = {}
-        if settings.opening_weight:
-            share = self.encoder.opening_share
-            loss = losses.opening(features.opening_logits, kind, share, settings.opening_balance)
-            terms["opening"] = settings.opening_weight * loss
-        if settings.ceiling_weight:
-            above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
-            loss = losses.ceiling(features.log_ceiling, features.log_ceiling_scale, above_m)
-            terms["ceiling"] = settings.ceiling_weight * loss
-        if settings.room_type_weight:
-            terms["room_type"] = settings.room_type_weight * losses.room_type(features.room_type_logits, room_type)
-        return terms
 
     def _augment(self, image: Tensor) -> Tensor:
         """Apply the configured photometric augmentation; its random numbers depend on the seed and the first step."""

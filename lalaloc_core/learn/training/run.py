@@ -23,8 +23,8 @@ from lalaloc_core.learn.training.warm_start import (
     check_same_networks,
     find_checkpoint,
     has_views,
-    load_trained_layout_encoder,
     load_warm_start,
+    trained_layout_encoder,
 )
 from lalaloc_core.nets import LayoutNetwork
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
@@ -75,9 +75,9 @@ def _load_teacher(config: TrainConfig, folder: Path, teacher: Path | None, origi
     if origin is not None and teacher is None and not (folder / "layout.pt").exists():
         start = load_warm_start(origin, "layout", config)
         dataclasses.replace(start.checkpoint, stage="layout").save(folder / "layout.pt")
-    teacher = teacher or folder
-    check_same_networks("layout", config, find_checkpoint("layout", teacher).config, str(teacher))
-    return load_trained_layout_encoder(teacher)
+    checkpoint = find_checkpoint("layout", teacher or folder)
+    check_same_networks("layout", config, checkpoint.config, str(teacher or folder))
+    return trained_layout_encoder(checkpoint)
 
 
 def _build_stage(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
 from lalaloc_core.errors import ConfigError
@@ -99,6 +99,33 @@ def sphere_batches(
         renderer = source.renderer(device, sizes.image_height, sizes.image_width)
         return DeferredRenderer(renderer).render_batches(batches)
     return batches
+
+
+def structure_losses(
+    settings: ImageStageConfig,
+    encoder: HorizonEncoder,
+    features: StructureFeatures,
+    kind: Int[Tensor, "b w"],
+    batch: Batch,
+) -> dict[str, Tensor]:
+    """Return the weighted losses of openings, ceiling and room type by name, those whose weight is not 0.
+
+    `kind` is the class of the opening at each azimuth, `batch_streams.UNKNOWN` where it is not seen.
+    """
+    room_type = batch["room_type"]
+    encoder.update_class_shares(kind, room_type)
+    terms = {}
+    if settings.opening_weight:
+        share = encoder.opening_share
+        loss = losses.opening(features.opening_logits, kind, share, settings.opening_balance)
+        terms["opening"] = settings.opening_weight * loss
+    if settings.ceiling_weight:
+        above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
+        loss = losses.ceiling(features.log_ceiling, features.log_ceiling_scale, above_m)
+        terms["ceiling"] = settings.ceiling_weight * loss
+    if settings.room_type_weight:
+        terms["room_type"] = settings.room_type_weight * losses.room_type(features.room_type_logits, room_type)
+    return terms
 
 
 def photograph_loss(

@@ -30,6 +30,7 @@ from lalaloc_core.learn.training.stages import (
     photograph_loss,
     sample_styles,
     sphere_batches,
+    structure_losses,
 )
 from lalaloc_core.localise.encode.view_encoder import MIN_SEEN
 from lalaloc_core.nets.object_network import ObjectNetwork
@@ -101,26 +102,13 @@ class ViewStage(TrainingStage[ImageStageConfig]):
     def _rendered_losses(
         self, features: ViewFeatures, seen: Bool[Tensor, "b w"], rows: slice, batch: Batch
     ) -> dict[str, Tensor]:
-        settings, structure = self.settings, features.structure
-        part = middle(self.config)
-        kind = torch.where(seen[rows], batch["opening_kind"][:, part], UNKNOWN)
-        self.encoder.update_class_shares(kind, batch["room_type"])
+        settings, part = self.settings, middle(self.config)
         log_profile = batch["profile_m"][:, part].log()
         walls = losses.laplace_mixture(features.walls.rows(rows), log_profile, seen[rows])
         shape = losses.wall_shape(features.walls.rows(rows), log_profile, seen[rows])
-        above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
-        ceiling = losses.ceiling(structure.log_ceiling[rows], structure.log_ceiling_scale[rows], above_m)
-        openings = losses.opening(
-            structure.opening_logits[rows], kind, self.encoder.opening_share, settings.opening_balance
-        )
-        room_type = losses.room_type(structure.room_type_logits[rows], batch["room_type"])
-        return {
-            "profile": settings.profile_weight * walls,
-            "shape": settings.shape_weight * shape,
-            "opening": settings.opening_weight * openings,
-            "ceiling": settings.ceiling_weight * ceiling,
-            "room_type": settings.room_type_weight * room_type,
-        }
+        kind = torch.where(seen[rows], batch["opening_kind"][:, part], UNKNOWN)
+        structure = structure_losses(settings, self.encoder, features.structure.rows(rows), kind, batch)
+        return {"profile": settings.profile_weight * walls, "shape": settings.shape_weight * shape} | structure
 
     def _cut(self, images: UInt8[Tensor, "n h w 3"]) -> UInt8[Tensor, "n h2 w2 3"]:
         rows, columns = images.shape[1:3]

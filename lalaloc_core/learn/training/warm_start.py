@@ -214,17 +214,15 @@ def find_checkpoint(stage: str, folder: Path, *, last: bool = False) -> Checkpoi
     return Checkpoint.load(best if best.exists() and not last else path, stage=path.stem)
 
 
-def load_trained_layout_encoder(folder: Path, *, last: bool = False) -> LayoutNetwork:
-    """Load a run's layout encoder: the best by validation, or the last."""
-    checkpoint = find_checkpoint("layout", folder, last=last)
+def trained_layout_encoder(checkpoint: Checkpoint) -> LayoutNetwork:
+    """Return the layout encoder of a checkpoint."""
     encoder = build_layout_encoder(checkpoint.config)
     encoder.load_state_dict(checkpoint.inference_weights["layout_encoder"])
     return encoder
 
 
-def load_trained_decoder(folder: Path, *, last: bool = False) -> LayoutDecoder | None:
-    """Load the decoder trained with `load_trained_layout_encoder`; None if there is none."""
-    checkpoint = find_checkpoint("layout", folder, last=last)
+def trained_decoder(checkpoint: Checkpoint) -> LayoutDecoder | None:
+    """Return the decoder that was trained with the layout encoder of a checkpoint; None if there is none."""
     if "decoder" not in checkpoint.inference_weights:
         return None
     decoder = LayoutDecoder(checkpoint.config.layout_sizes.latent_size)
