@@ -6,13 +6,3 @@ derivatives by the pose. It runs on numpy and on torch alike, for the encoders a
 poses.
 `reference.py` is a slow ray tracer that tests compare with (extra `oracle`). Photographs are rendered by `learn/synth`.
 """
-
-from lalaloc_core.render.profile import (
-    RenderedLayout,
-    back_project,
-    cast_rays,
-    layout_depth,
-    render_layout,
-    wall_profile,
-)
-from lalaloc_core.render.sweep import profiles_at

@@ -1,7 +1,7 @@
 """Furniture of rooms: pieces, and their placement.
 
-Begin with `furnish.py`, which furnishes a room and lists the pieces of each kind of room. `pieces.py` defines a piece,
-`pieces_living.py` and `pieces_service.py` make them, `built_in.py` has fixed furniture.
+Begin with `furnish.py`, which furnishes a room. `pieces.py` defines a piece, `catalogue.py` makes them and lists those
+of each kind of room, `built_in.py` has fixed furniture.
 Needs no torch.
 """
 

@@ -11,17 +11,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box
-from lalaloc_core.learn.synth.furniture.pieces_living import shelf_run, wardrobe_run
-from lalaloc_core.learn.synth.furniture.pieces_service import (
+from lalaloc_core.learn.synth.furniture.catalogue import (
     COUNTER_DEPTH_M,
     bathtub,
     counter_run,
     fridge,
+    shelf_run,
     shower,
     toilet,
+    wardrobe_run,
     washbasin,
 )
+from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box
 
 _MIN_RUN_M = 1.2
 _MAX_RUN_M = 6.0

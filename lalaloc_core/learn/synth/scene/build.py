@@ -16,8 +16,7 @@ from lalaloc_core.learn.synth.records import Row
 from lalaloc_core.learn.synth.scene.doors import add_door
 from lalaloc_core.learn.synth.scene.lighting import Lighting, light_room, relit, sample_backdrop
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.learn.synth.scene.render_scene import Fact, Lights, Prisms, RenderScene, VisibleRooms
-from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
+from lalaloc_core.learn.synth.scene.render_scene import Fact, Lights, Prisms, RenderScene, SceneTables, VisibleRooms
 from lalaloc_core.learn.synth.scene.shells import (
     ScenePart,
     Shells,
@@ -89,7 +88,13 @@ class _Builder:
         backdrop = sample_backdrop(rng)
         exposure = sample_staged_exposure(rng) if streams.is_staged else sample_exposure(rng, bright=self._is_bright)
         return tables.to_scene(
-            self._shot, lights=lights, sun=sun, backdrop=backdrop, exposure=exposure, facts=self._facts
+            self._shot.camera_height_m,
+            self._shot.heading,
+            lights=lights,
+            sun=sun,
+            backdrop=backdrop,
+            exposure=exposure,
+            facts=self._facts,
         )
 
     def _openings_of(self, room_index: int) -> list[Opening]:

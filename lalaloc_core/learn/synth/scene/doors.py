@@ -16,7 +16,7 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, rectangle, wall_frame
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
+from lalaloc_core.learn.synth.scene.render_scene import SceneTables
 from lalaloc_core.learn.synth.scene.surfaces import HouseStyle
 
 # Wider doors have two leaves.

@@ -14,8 +14,7 @@ from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, Prism
 from lalaloc_core.learn.synth.furniture.pieces import Finish
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.scene.lighting import Lighting
-from lalaloc_core.learn.synth.scene.render_scene import VisibleRooms
-from lalaloc_core.learn.synth.scene.scene_tables import SceneTables
+from lalaloc_core.learn.synth.scene.render_scene import SceneTables, VisibleRooms
 from lalaloc_core.learn.synth.scene.surfaces import Colour, HouseStyle, bright, paint, pale, vivid
 
 # Trims reach this far beyond the ends of their wall, the floor and the ceiling: no crack is seen.
