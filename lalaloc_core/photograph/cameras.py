@@ -15,6 +15,8 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lalaloc_core.conventions import unit_rays
+
 # Place of OpenCV's origin, the centre of the first pixel.
 HALF_PIXEL = 0.5
 # Newton steps that undo distortions; each doubles the number of correct digits.
@@ -264,8 +266,14 @@ def _unit(right: np.ndarray, forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def camera_axes(*, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
     """Return the camera's right, forward and up as rows, in a level frame with the same heading."""
-    forward = [0.0, math.cos(pitch), math.sin(pitch)]
-    unrolled_right, unrolled_up = np.array([1.0, 0.0, 0.0]), np.array([0.0, -math.sin(pitch), math.cos(pitch)])
-    right = math.cos(roll) * unrolled_right - math.sin(roll) * unrolled_up
-    up = math.sin(roll) * unrolled_right + math.cos(roll) * unrolled_up
-    return np.stack([right, np.array(forward), up])
+    return level_axes(np.array([[0.0, pitch, roll]]))[0]
+
+
+def level_axes(angles: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Return right, forward and up (rows) of cameras in a level frame, by heading, pitch and roll (radians)."""
+    turn, rise, lean = np.moveaxis(angles, -1, 0)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    right = np.stack([cosine, -sine, np.zeros_like(turn)], axis=-1)
+    above = np.stack([-sine * np.sin(rise), -cosine * np.sin(rise), np.cos(rise)], axis=-1)
+    cosine, sine = np.cos(lean)[..., None], np.sin(lean)[..., None]
+    return np.stack([cosine * right - sine * above, unit_rays(turn, rise), sine * right + cosine * above], axis=-2)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, Perspective, camera_axes
+from lalaloc_core.photograph.cameras import HALF_PIXEL, Camera, Perspective, level_axes
 
 # Longer side (pixels) at which segments are found, in pictures that are larger by more than the slack.
 _LONG_SIDE, _SLACK = 480, 1.1
@@ -190,18 +190,10 @@ def _attitude(modes: Sequence[_Mode]) -> Attitude:
 
 def _directions(angles: Float[np.ndarray, "*a 3"]) -> Float[np.ndarray, "*a 3 3"]:
     """Return the vertical and the two horizontal directions in the camera's frame, one per row."""
-    (sin_pitch, sin_roll, sin_yaw), (cos_pitch, cos_roll, cos_yaw) = (
-        np.moveaxis(part, -1, 0) for part in (np.sin(angles), np.cos(angles))
-    )
-    right, up = (cos_roll, sin_roll * sin_pitch), (sin_roll, -cos_roll * sin_pitch)
-    rows = [
-        (-sin_roll * cos_pitch, sin_pitch, cos_roll * cos_pitch),
-        *(
-            (x * right[0] + y * right[1], y * cos_pitch, x * up[0] + y * up[1])
-            for x, y in ((sin_yaw, cos_yaw), (cos_yaw, -sin_yaw))
-        ),
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    pitch, roll, yaw = np.moveaxis(angles, -1, 0)
+    # Seen from the first horizontal direction, the camera looks along minus its azimuth.
+    axes = level_axes(np.stack([-yaw, pitch, roll], axis=-1))
+    return axes[..., ::-1].swapaxes(-1, -2)
 
 
 def _errors(lines: Lines, directions: Float[np.ndarray, "*a d 3"]) -> Float[np.ndarray, "*a n d"]:
@@ -239,11 +231,9 @@ def _starts(lines: Lines) -> Float[np.ndarray, "s 3"]:
     score = weight @ np.log(upright + _OUTLIERS + 0.4 / math.pi) + prior
     found = []
     for index in np.argsort(-score)[:_STARTS]:
-        axes = camera_axes(pitch=float(pitch[index]), roll=float(roll[index]))
-        level = np.stack([np.sin(_YAWS), np.cos(_YAWS), np.zeros_like(_YAWS)], axis=-1)
-        first = _densities(_errors(lines, (level @ axes.T).astype(np.float32)), sigma)
-        across = np.stack([np.cos(_YAWS), -np.sin(_YAWS), np.zeros_like(_YAWS)], axis=-1)
-        second = _densities(_errors(lines, (across @ axes.T).astype(np.float32)), sigma)
+        angles = np.stack(np.broadcast_arrays(pitch[index], roll[index], _YAWS), axis=-1)
+        directions = _directions(angles).astype(np.float32)
+        first, second = (_densities(_errors(lines, directions[:, row]), sigma) for row in (1, 2))
         horizontal = float(_SHARES[1]) * first + float(_SHARES[2]) * second
         full = weight @ np.log(upright[:, index, None] + horizontal + _OUTLIERS)
         best = int(np.argmax(full))

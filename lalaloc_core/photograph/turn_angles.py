@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.photograph.cameras import Camera, Perspective
+from lalaloc_core.conventions import unit_rays, wrap_angle
+from lalaloc_core.photograph.cameras import Camera, Perspective, level_axes
 from lalaloc_core.photograph.levelling import Attitude, estimate_attitude, lines_of
 from lalaloc_core.photograph.overlap import (
     Features,
@@ -279,7 +279,9 @@ class _Fit:
         )
         between = one + other
         between /= np.linalg.norm(between, axis=1, keepdims=True)
-        moved = _centres(second[:, 0]) - _centres(first[:, 0])
+        # Cameras are on a circle of radius 1, and look outwards.
+        start, end = (unit_rays(angles[:, 0], np.zeros(len(angles))) for angles in (first, second))
+        moved = end - start
         moved -= (moved * between).sum(axis=1, keepdims=True) * between
         length = np.linalg.norm(moved, axis=1)
         along = moved / np.maximum(length, _STEP)[:, None]
@@ -328,22 +330,6 @@ class _Fit:
             parts.append((slope[hit], len(base) + hit, np.full(len(hit), column)))
         value, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
         return csr_array((value, (row, column)), shape=(len(base) + len(prior), len(values)))
-
-
-def level_axes(angles: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return right, forward and up (rows) of cameras in a level frame, by heading, pitch and roll (radians)."""
-    (turn, rise, lean), zero = angles.T, np.zeros(len(angles))
-    cosine, sine = np.cos(turn), np.sin(turn)
-    right = np.stack([cosine, -sine, zero], axis=-1)
-    ahead = np.stack([sine * np.cos(rise), cosine * np.cos(rise), np.sin(rise)], axis=-1)
-    above = np.stack([-sine * np.sin(rise), -cosine * np.sin(rise), np.cos(rise)], axis=-1)
-    cosine, sine = np.cos(lean)[:, None], np.sin(lean)[:, None]
-    return np.stack([cosine * right - sine * above, ahead, sine * right + cosine * above], axis=1)
-
-
-def _centres(heading: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 3"]:
-    """Return the centres of cameras on the circle of radius 1, looking outwards."""
-    return np.stack([np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=-1)
 
 
 def _stretched(rays: Float[np.ndarray, "m 3"], log_focal: float) -> Float[np.ndarray, "m 3"]:

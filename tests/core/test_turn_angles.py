@@ -17,10 +17,10 @@ from lalaloc_core.localise.answers.turns import Turn
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.cameras import Perspective
+from lalaloc_core.photograph.cameras import Perspective, level_axes
 from lalaloc_core.photograph.overlap import Features, Link, Step, agreeing_links, headings_in_order, usual_steps
 from lalaloc_core.photograph.patches import PatchSize
-from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn, level_axes
+from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 from tests.core.taken import jpeg, sphere, take
 

@@ -117,16 +117,12 @@ def _rise(position_m: Float[np.ndarray, "n 3"], floor: tuple[int, int]) -> float
 
 def _rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
     """Return rotations from the body to the world; columns are the axes of the body."""
-    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    if not (length > 0.5).all():
+    # Imported late: few walks come with a file of odometry.
+    from scipy.spatial.transform import Rotation
+
+    if not (np.linalg.norm(quaternions, axis=1) > 0.5).all():
         raise InvalidMotionError("a pose of the odometry has no rotation: qx qy qz qw must have the length 1")
-    x, y, z, w = (quaternions / length).T
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+    return Rotation.from_quat(quaternions).as_matrix()
 
 
 def tum_line(time_s: float, position_m: tuple[float, float], z_m: float, heading: float) -> str:
