@@ -34,10 +34,10 @@ import httpx
 import numpy as np
 
 from benchmarks import harness
+from benchmarks.buildings import building_of
 from examples.truth import PLAN_PATH, read_poses
 from lalaloc_core.evaluate.bench.service_latency import PHONE_FIELD_DEG, phone_photograph
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
-from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.photograph import open_picture

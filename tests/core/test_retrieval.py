@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
+from benchmarks.buildings import Building, building_of
 from lalaloc_core.bundle import Manifest, MatchingWeights
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.localise.belief import suppress
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder

@@ -1,4 +1,4 @@
-"""Procedural homes: rooms, doors, windows, and large buildings made of them.
+"""Procedural homes: rooms, doors and windows.
 
 Begin with `plans.py`, which draws a home: `partition.py` divides it into rooms, `openings.py` connects them.
 Homes are numbered by split. Needs no torch.
