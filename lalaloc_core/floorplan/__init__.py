@@ -6,7 +6,7 @@ the layout renderer, and `earth.py` relates a plan to latitude and longitude.
 """
 
 from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, anchor_document
-from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
+from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.floorplan.json_values import DEFAULT_LIMITS, PlanLimits
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan import FloorPlan

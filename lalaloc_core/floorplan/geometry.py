@@ -1,94 +1,15 @@
-"""A plan's walls and openings as arrays for the renderer: padded per room, or in one table without padding."""
+"""A plan's walls and openings as arrays for the renderer, in one table; walls also padded per room."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
-from array_api_compat import array_namespace, device
 from jaxtyping import Bool, Float, Int, UInt8
 
-from lalaloc_core.conventions import WALL_CODE, Array
 from lalaloc_core.floorplan.openings import Opening, OpeningFace
 from lalaloc_core.floorplan.rooms import Room, frozen
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PlanGeometry:
-    """Padded arrays over the rooms of one plan, indexed by a pose's room. Lengths in metres.
-
-    Rows of `walls_m` are padded by repeating a room's first wall, rows of openings with kind 0 (wall).
-
-    Attributes:
-        walls_m: (r, n, 4) wall segments (x0, y0, x1, y1).
-        wall_count: (r,) number of walls without padding.
-        opening_kind: (r, m) codes as in `conventions.OPENING_CLASSES`.
-        opening_wall: (r, m) index of the room's own wall that the opening lies on, -1 in the padding.
-        opening_share: (r, m, 2) start and end of the opening as shares of the wall's length.
-        sill_m, head_m: (r, m) heights of the opening; -inf and inf if the plan does not give them.
-        behind: (r, m) index of the room behind, -1 for none.
-        exit_m: (r, m, 4) the opening on the wall of the room behind; on the room's own wall if there is none.
-    """
-
-    walls_m: Float[Array, "r n 4"]
-    wall_count: Int[Array, "r"]
-    opening_kind: Int[Array, "r m"]
-    opening_wall: Int[Array, "r m"]
-    opening_share: Float[Array, "r m 2"]
-    sill_m: Float[Array, "r m"]
-    head_m: Float[Array, "r m"]
-    behind: Int[Array, "r m"]
-    exit_m: Float[Array, "r m 4"]
-
-    def like(self, array: Array) -> PlanGeometry:
-        """Convert to the array library, device and float type of another array."""
-        xp, target = array_namespace(array), device(array)
-        if type(self.walls_m) is type(array) and self.walls_m.dtype == array.dtype and device(self.walls_m) == target:
-            return self
-
-        def convert(value: Array) -> Array:
-            is_float = array_namespace(value).isdtype(value.dtype, "real floating")
-            # Torch warns about read-only memory.
-            source = value.copy() if isinstance(value, np.ndarray) else value
-            return xp.asarray(source, dtype=array.dtype if is_float else xp.int64, device=target)
-
-        return replace(self, **{field.name: convert(getattr(self, field.name)) for field in fields(self)})
-
-
-def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Sequence[OpeningFace]) -> PlanGeometry:
-    """Build the padded arrays of a plan."""
-    longest = max(len(room.walls_m) for room in rooms)
-    walls_m = np.stack([pad_walls(room.walls_m, longest) for room in rooms])
-    by_room: list[list[OpeningFace]] = [[] for _ in rooms]
-    for face in faces:
-        by_room[face.room].append(face)
-    shape = (len(rooms), max(map(len, by_room)))
-    kind, wall, behind = (np.full(shape, value) for value in (WALL_CODE, -1, -1))
-    sill_m, head_m = np.full(shape, -np.inf), np.full(shape, np.inf)
-    exit_m, share = np.zeros((*shape, 4)), np.zeros((*shape, 2))
-    for room, group in enumerate(by_room):
-        for k, face in enumerate(group):
-            source = openings[face.opening]
-            cell = (room, k)
-            kind[cell], wall[cell], behind[cell] = source.code, face.wall, face.behind
-            sill_m[cell] = -np.inf if source.sill_m is None else source.sill_m
-            head_m[cell] = np.inf if source.head_m is None else source.head_m
-            share[cell] = face.start, face.end
-            exit_m[cell] = rooms[room].wall_part(face.wall, face.start, face.end).ravel()
-            if face.behind >= 0:
-                exit_m[cell] = rooms[face.behind].wall_part(face.exit_wall, face.exit_start, face.exit_end).ravel()
-    return PlanGeometry(
-        walls_m=frozen(walls_m),
-        wall_count=frozen(np.array([len(room.walls_m) for room in rooms])),
-        opening_kind=frozen(kind),
-        opening_wall=frozen(wall),
-        opening_share=frozen(share),
-        sill_m=frozen(sill_m),
-        head_m=frozen(head_m),
-        behind=frozen(behind),
-        exit_m=frozen(exit_m),
-    )
 
 
 def pad_walls(walls_m: Float[np.ndarray, "n 4"], length: int) -> Float[np.ndarray, "length 4"]:
@@ -132,7 +53,7 @@ class WallTable:
         is_free = np.zeros(len(walls_m), bool)
         for room, end in zip(rooms, first[1:], strict=True):
             is_free[end - len(room.inner_walls_m) : end] = True
-        # Sorted stably: the last of several faces with the same start wins, as in `render.layout`.
+        # Sorted stably: the last of several faces with the same start wins.
         faces = sorted(faces, key=lambda face: first[face.room] + face.wall + face.start)
         sources = [openings[face.opening] for face in faces]
         wall = np.array([first[face.room] + face.wall for face in faces], np.float64)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, heading_to_degrees
 from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, Anchor, anchor_document
-from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
+from lalaloc_core.floorplan.geometry import WallTable, pad_walls
 from lalaloc_core.floorplan.json_values import DEFAULT_LIMITS, NO_LIMITS, PlanLimits, read_json
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, Fixture, FixturePlaces, read_plan, state_types
@@ -164,22 +164,17 @@ class FloorPlan:
         return tuple(map(tuple, faces))
 
     @cached_property
-    def geometry(self) -> PlanGeometry:
-        """Walls and openings as padded arrays, for the layout renderer."""
-        return build_geometry(self.rooms, self.openings, self.opening_faces)
-
-    @cached_property
     def wall_table(self) -> WallTable:
         """Walls and openings in one table without padding, for rendering many poses."""
         return WallTable.build(self.rooms, self.openings, self.opening_faces)
 
-    @property
+    @cached_property
     def walls_m(self) -> Float[np.ndarray, "rooms n 4"]:
         """Wall segments of every room, padded to one length by repeating each room's first wall.
 
         `render.profile` takes `plan.walls_m[room_index]`, the walls of each pose's room.
         """
-        return self.geometry.walls_m
+        return frozen(self.room_walls(np.arange(len(self.rooms))))
 
     def room_walls(self, room_index: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n 4"]:
         """Return `walls_m[room_index]`, padded only to the largest number of walls in these rooms."""

@@ -1,8 +1,7 @@
 """Layout renderer: bare walls, floor and ceiling of a plan from the pose of a camera, in closed form.
 
 Begin with `sweep.py`, which renders many poses of a plan at once, for numpy only; search and training use it.
-`profile.py` casts rays from poses at walls, adds floor, ceiling, openings and the rooms behind them, and computes
-derivatives by the pose. It runs on numpy and on torch alike, for the encoders and for refinement. `sampling.py` draws
-poses.
+`profile.py` casts rays from poses at walls, adds floor and ceiling, and computes derivatives by the pose. It runs on
+numpy and on torch alike, for the encoders and for refinement. `sampling.py` draws poses.
 `reference.py` is a slow ray tracer that tests compare with (extra `oracle`). Photographs are rendered by `learn/synth`.
 """

@@ -29,7 +29,8 @@ from lalaloc_core.learn.dataset_names import GALLERIES
 from lalaloc_core.learn.metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.encode.view_encoder import ViewEncoder
-from lalaloc_core.render.profile import render_layout, wall_profile
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.sweep import sweep_layouts
 from tests.core.questions import prediction_of
 from tests.strategies import present
 
@@ -205,8 +206,8 @@ class TestGalleries:
         scene, hall = dataset.load("hall-0"), read_annotation(root / "hall.json")
         (camera,) = scene.cameras
         plan, rooms = scene.plan, np.array([camera.room_index])
-        view = render_layout(
-            camera.position_m[None], np.array([camera.heading]), rooms, plan.geometry, WIDTH, camera.camera_height_m
+        view = sweep_layouts(
+            camera.position_m[None], np.array([camera.heading]), rooms, plan.wall_table, WIDTH, camera.camera_height_m
         )
         assert np.count_nonzero(view.kind[0] != hall.classes(WIDTH)) <= 6
         assert plan.opening_kinds == {"door", "window", "passage"}

@@ -22,7 +22,7 @@ from lalaloc_core.learn.data.synthetic.altered_photographs import (
 )
 from lalaloc_core.learn.data.synthetic.altered_plans import CopiedScenes, ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.render.profile import render_layout
+from lalaloc_core.render.sweep import sweep_layouts
 
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)
 FURNISHED = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
@@ -67,7 +67,7 @@ def test_every_photograph_identifies_its_copy() -> None:
             whole, room = divmod(camera.room_index, rooms)
             away = np.arange(4) - whole
             places, copies = camera.position_m + away[:, None] * np.array([step_m, 0.0]), room + rooms * np.arange(4)
-            seen = render_layout(places, np.zeros(4), copies, plan.geometry, 128, camera.camera_height_m).kind
+            seen = sweep_layouts(places, np.zeros(4), copies, plan.wall_table, 128, camera.camera_height_m).kind
             lacking = (seen[whole] == OPENING_CLASSES.index("door")) & (seen != seen[whole])
             assert all(lacking[copy].sum() >= 2 for copy in range(4) if copy != whole)
             photographs += 1

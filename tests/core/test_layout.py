@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,16 +19,9 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.plans import VALIDATION, generate_home
 from lalaloc_core.localise.match import Layouts, layouts_at
 from lalaloc_core.localise.match.pose_grid import layouts_of_plans
-from lalaloc_core.render.profile import (
-    RenderedLayout,
-    free_travel_m,
-    log_distance_gradient,
-    log_profile_gradient,
-    render_layout,
-    wall_profile,
-)
+from lalaloc_core.render.profile import free_travel_m, log_distance_gradient, log_profile_gradient, wall_profile
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
-from lalaloc_core.render.sweep import SweptLayouts, profiles_at, sweep_layouts
+from lalaloc_core.render.sweep import profiles_at, sweep_layouts
 from tests.core.reference_views import reference_view
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, scene_of, seeds, spiral
 
@@ -37,18 +31,29 @@ TWO_ROOMS = plan_document(rectangle(4.0, 3.0), rectangle(4.0, 3.0, corner=(4.2, 
 DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
 
 
+class View(NamedTuple):
+    """Layouts, with the distances behind openings of all rays: the wall's distance where no room is behind."""
+
+    distance_m: np.ndarray
+    kind: np.ndarray
+    behind_m: np.ndarray
+
+
 def view_along(
     plan: FloorPlan, position_m: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M
-) -> RenderedLayout:
-    count = len(azimuths_deg)
-    positions = np.tile(position_m, (count, 1)).astype(float)
-    room = plan.room_index_at(positions)
-    # With a single column a pose's ray is along its heading.
-    return render_layout(positions, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
+) -> View:
+    positions = np.tile(position_m, (len(azimuths_deg), 1)).astype(float)
+    poses = PoseSet(positions, plan.room_index_at(positions))
+    # Of an odd number of columns that in the middle is along the heading.
+    view = render(plan, poses, np.radians(azimuths_deg), 2 * COLUMNS + 1, eye_m)
+    return View(*(values[:, [COLUMNS]] for values in view))
 
 
-def render(plan: FloorPlan, poses, heading, columns=COLUMNS) -> RenderedLayout:
-    return render_layout(poses.position_m, heading, poses.room_index, plan.geometry, columns, EYE_M)
+def render(plan: FloorPlan, poses: PoseSet, heading: np.ndarray, columns: int = COLUMNS, eye_m: float = EYE_M) -> View:
+    swept = sweep_layouts(poses.position_m, heading, poses.room_index, plan.wall_table, columns, eye_m)
+    behind_m = swept.distance_m.copy()
+    behind_m[swept.row, swept.column] = swept.behind_m
+    return View(swept.distance_m, swept.kind, behind_m)
 
 
 @pytest.mark.slow
@@ -76,35 +81,14 @@ def test_view_matches_shapely_ray_by_ray(plan: FloorPlan, seed: int) -> None:
 
 @given(seeds())
 @settings(max_examples=10)
-def test_view_matches_the_wall_profile_and_torch(seed: int) -> None:
+def test_only_doors_and_passages_show_what_is_behind(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plan = generate_home(rng).plan
     poses, heading = random_poses(plan, 4, rng), rng.uniform(-math.pi, math.pi, 4)
     view = render(plan, poses, heading)
-    profile = wall_profile(poses.position_m, heading, plan.walls_m[poses.room_index], COLUMNS)
-    np.testing.assert_array_equal(view.distance_m, profile)
     assert (view.behind_m >= view.distance_m).all()
     open_kinds = np.isin(view.kind, [DOOR_CODE, PASSAGE_CODE])
     np.testing.assert_array_equal(view.behind_m[~open_kinds], view.distance_m[~open_kinds])
-    position, angle, room = map(torch.tensor, (poses.position_m, heading, poses.room_index))
-    eye = torch.full((4,), EYE_M, dtype=torch.float64)
-    in_torch = render_layout(position, angle, room, plan.geometry, COLUMNS, eye)
-    np.testing.assert_array_equal(in_torch.kind.numpy(), view.kind)
-    np.testing.assert_allclose(in_torch.distance_m.numpy(), view.distance_m, rtol=1e-12)
-    np.testing.assert_allclose(in_torch.behind_m.numpy(), view.behind_m, rtol=1e-9)
-
-
-def test_gradients_match_differences() -> None:
-    plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
-    position = torch.tensor([[1.1, 1.3], [6.3, 1.6]], dtype=torch.float64, requires_grad=True)
-    heading = torch.tensor([0.3, 2.0], dtype=torch.float64, requires_grad=True)
-
-    def distances(position_m: torch.Tensor, heading: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        view = render_layout(position_m, heading, torch.tensor([0, 1]), plan.geometry, 16, EYE_M)
-        assert (view.behind_m > view.distance_m).any()
-        return view.distance_m, view.behind_m
-
-    assert torch.autograd.gradcheck(distances, (position, heading))
 
 
 def test_door_shows_the_far_wall_of_the_next_room() -> None:
@@ -154,32 +138,11 @@ def test_room_without_openings_has_walls_only() -> None:
     assert (view.behind_m == view.distance_m).all()
 
 
-def test_padding_changes_nothing() -> None:
-    """Padding repeats the first wall; its door is met on every copy."""
-    many = [[0.1 * k, 3.0 + 0.01 * (k % 2)] for k in range(40, -1, -1)]
-    document = plan_document(rectangle(4.0, 3.0, corner=(0.0, -4.0)), [[0.0, 0.0], [4.0, 0.0], *many])
-    document["openings"] = [{"kind": "door", "line": [[1.0, -4.0], [3.0, -4.0]]}]
-    plan = FloorPlan.from_dict(document)
-    assert plan.geometry.wall_count.tolist() == [4, 43]
-    position = torch.tensor([[2.0, -2.0]], dtype=torch.float64)
-    view = render_layout(position, torch.full((1,), math.pi), torch.tensor([0]), plan.geometry, 1, EYE_M)
-    assert int(view.kind[0, 0]) == DOOR_CODE
-
-
-def full_behind_m(view: SweptLayouts) -> np.ndarray:
-    """Return the distances behind openings in the form of `RenderedLayout`: the wall's distance for other rays."""
-    behind_m = view.distance_m.copy()
-    behind_m[view.row, view.column] = view.behind_m
-    return behind_m
-
-
 def assert_the_same(plan: FloorPlan, poses: PoseSet, heading: np.ndarray, misses: float = 0.0) -> None:
     """Check that both renderers agree on all rays but a share `misses` that graze a corner, where rounding decides."""
     swept = sweep_layouts(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS, EYE_M)
-    cast = render_layout(poses.position_m, heading, poses.room_index, plan.geometry, COLUMNS, EYE_M)
-    differs = ~np.isclose(swept.distance_m, cast.distance_m, rtol=1e-4) | (swept.kind != cast.kind)
-    differs |= ~np.isclose(full_behind_m(swept), cast.behind_m, rtol=1e-3)
-    assert differs.mean() <= misses
+    cast_m = wall_profile(poses.position_m, heading, plan.walls_m[poses.room_index], COLUMNS)
+    assert (~np.isclose(swept.distance_m, cast_m, rtol=1e-4)).mean() <= misses
     assert (np.diff(swept.row) >= 0).all()
 
 
@@ -313,41 +276,3 @@ class TestProfiles:
             direction = np.array([[np.sin(azimuth), np.cos(azimuth)]])
             position = position + direction * free_travel_m(position, direction, plan.walls_m[:1], 0.03)[:, None]
         assert plan.rooms[0].shape.exterior.distance(shapely.Point(position[0])) > 0.03 - 1e-9
-
-
-@given(rows_of_rooms(), seeds())
-@settings(max_examples=20)
-def test_gradient_through_an_opening(plan: FloorPlan, seed: int) -> None:
-    scene = scene_of(plan, 4, seed)
-    position, heading = torch.tensor(scene.poses.position_m), torch.tensor(scene.heading)
-    room = torch.tensor(scene.poses.room_index)
-
-    def log_behind(unknowns: torch.Tensor) -> torch.Tensor:
-        return render_layout(unknowns[:, :2], unknowns[:, 2], room, plan.geometry, COLUMNS, EYE_M).behind_m.log()
-
-    pose = torch.cat([position, heading[:, None]], dim=1)
-    view = render_layout(position, heading, room, plan.geometry, COLUMNS, EYE_M)
-    row, column = torch.nonzero(view.behind_m > view.distance_m, as_tuple=True)
-    if not len(row):
-        return
-    azimuth = heading[row] + torch.tensor(column_azimuths(COLUMNS))[column]
-    direction = torch.stack([azimuth.sin(), azimuth.cos()], dim=1)
-    behind_m = view.behind_m[row, column]
-    for unknown in range(3):
-        tangent = torch.zeros_like(pose)
-        tangent[:, unknown] = 1.0
-        slope = torch.func.jvp(log_behind, (pose,), (tangent,))[1][row, column]
-        end = position[row] + behind_m[:, None] * direction
-        walls = torch.tensor(plan.walls_m).flatten(0, 1)
-        # Only the wall that the ray ends on.
-        met = _wall_at(end, walls)
-        found = log_distance_gradient(position[row], azimuth[:, None], met[:, None])
-        torch.testing.assert_close(found.log_m[:, 0], behind_m.log(), rtol=1e-6, atol=1e-6)
-        torch.testing.assert_close(found.by_pose[:, unknown, 0], slope, rtol=1e-5, atol=1e-5)
-
-
-def _wall_at(point_m: torch.Tensor, walls_m: torch.Tensor) -> torch.Tensor:
-    start, edge = walls_m[:, :2], walls_m[:, 2:] - walls_m[:, :2]
-    offset = point_m[:, None] - start[None]
-    share = ((offset * edge).sum(dim=2) / edge.square().sum(dim=1)).clamp(0.0, 1.0)
-    return walls_m[torch.linalg.vector_norm(offset - share[:, :, None] * edge, dim=2).argmin(dim=1)]

@@ -42,8 +42,8 @@ def test_opening_belongs_to_both_rooms_of_a_wall() -> None:
     first, second = plan.opening_faces
     assert (first.room, first.behind, second.room, second.behind) == (0, 1, 1, 0)
     np.testing.assert_allclose(plan.rooms[0].wall_part(first.wall, first.start, first.end), [[4.0, 1.0], [4.0, 1.9]])
-    np.testing.assert_allclose(plan.geometry.exit_m[0, 0][[0, 2]], [4.2, 4.2])
-    assert plan.geometry.opening_kind.tolist() == [[1], [1]]
+    np.testing.assert_allclose(plan.wall_table.exit_m[0][[0, 2]], [4.2, 4.2])
+    assert plan.wall_table.opening_kind.tolist() == [1, 1]
     assert plan.warnings == ()
 
 
@@ -329,8 +329,8 @@ def test_all_plan_fields_round_trip() -> None:
     assert again.to_dict() == plan.to_dict()
     assert again.opening_faces == plan.opening_faces
     assert (again.opening_kinds, again.camera_height_std_m) == ({"door", "window"}, 0.05)
-    for name, values in vars(plan.geometry).items():
-        np.testing.assert_array_equal(getattr(again.geometry, name), values)
+    for name, values in vars(plan.wall_table).items():
+        np.testing.assert_array_equal(getattr(again.wall_table, name), values)
         assert not values.flags.writeable
 
 

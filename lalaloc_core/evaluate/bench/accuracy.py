@@ -33,8 +33,8 @@ from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.photograph import StatedCamera
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.render.profile import render_layout
 from lalaloc_core.render.sampling import PoseSet
+from lalaloc_core.render.sweep import sweep_layouts
 
 # Limits for minor figures, for those that repeat their queries six times, and for spots that are localised six times.
 _MINOR_HOMES, _REPEATED_HOMES, _SPOT_HOMES = 100, 50, 65
@@ -208,7 +208,7 @@ def _measured(encoders: PhotographEncoder, scene: Scene, camera: Camera) -> Azim
     log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
     place = camera.position_m[None], heading, room
-    view = render_layout(*place, scene.plan.geometry, len(log_m), camera.camera_height_m)
+    view = sweep_layouts(*place, scene.plan.wall_table, len(log_m), camera.camera_height_m)
     return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0], scores)
 
 

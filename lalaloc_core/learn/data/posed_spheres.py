@@ -25,7 +25,7 @@ from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotog
 from lalaloc_core.learn.data.assembly import path_below, read_json
 from lalaloc_core.learn.data.dataset import Appearance, Camera, FilePhotograph, Scene, Split
 from lalaloc_core.learn.data.drawn_rooms import drawn_room
-from lalaloc_core.render.profile import render_layout
+from lalaloc_core.render.sweep import sweep_layouts
 
 VIEWS_FILE = "views.json"
 # Every n-th room validates.
@@ -153,8 +153,8 @@ def _annotated(plan: FloorPlan, camera: Camera) -> AnnotatedPhotograph:
 
 def _class_spans(plan: FloorPlan, camera: Camera) -> tuple[ClassSpan, ...]:
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
-    view = render_layout(camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
-    kind = view.kind[0]
+    place = camera.position_m[None], heading, room
+    (kind,) = sweep_layouts(*place, plan.wall_table, _COLUMNS, camera.camera_height_m).kind
     first = np.flatnonzero(kind != np.roll(kind, 1))
     return tuple(
         (OPENING_CLASSES[kind[left]], left / _COLUMNS, right / _COLUMNS)

@@ -31,8 +31,7 @@ from lalaloc_core.learn.training.batches import (
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.learn.training.sources import Group, Source, SphereSample, group_around
-from lalaloc_core.render.profile import render_layout
-from lalaloc_core.render.sweep import profiles_at
+from lalaloc_core.render.sweep import faces_met, profiles_at
 
 T = TypeVar("T")
 
@@ -230,20 +229,14 @@ def seen_openings(
 
     Walls are `UNKNOWN` in a plan that may lack openings; elevations are NaN at walls and where heights are unknown.
     """
-    view = render_layout(
-        camera.position_m[None].astype(np.float32),
-        np.array([heading], np.float32),
-        np.array([camera.room_index]),
-        plan.geometry,
-        columns,
-        camera.camera_height_m,
-    )
-    kind = view.kind[0].astype(np.int64)
+    walls, place = plan.wall_table, (camera.position_m[None], np.array([heading]), np.array([camera.room_index]))
+    distance_m, face = (of_pose[0] for of_pose in faces_met(*place, walls, columns, camera.camera_height_m))
+    # Rays that meet no opening have the index -1, so the last value is that of walls.
+    kind = np.append(walls.opening_kind, WALL_CODE).astype(np.int64)[face]
     if not plan.opening_kinds.issuperset(OPENING_CLASSES[1:]):
         kind[kind == WALL_CODE] = UNKNOWN
-    height_m = np.stack([view.sill_m[0], view.head_m[0]])
-    is_known = np.isfinite(height_m) & (view.kind[0] != WALL_CODE)
-    edges = np.arctan2(np.where(is_known, height_m, np.nan) - camera.camera_height_m, view.distance_m[0])
+    height_m = np.stack([np.append(values, np.nan)[face] for values in (walls.sill_m, walls.head_m)])
+    edges = np.arctan2(np.where(np.isfinite(height_m), height_m, np.nan) - camera.camera_height_m, distance_m)
     return kind, edges.astype(np.float32)
 
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.learn.data.synthetic.generated import DerivedScenes
-from lalaloc_core.render.profile import render_layout
+from lalaloc_core.render.sweep import sweep_layouts
 
 # Copies, and their gap (m), not a multiple of the grid step, so that the grid has another offset in each copy.
 _COPIES, _APART_M = 4, 3.17
@@ -87,10 +87,9 @@ def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
     return seen
 
 
-def _visible_kinds(plan: FloorPlan, camera: Camera) -> Int[np.ndarray, "w"]:
-    room, heading = np.array([camera.room_index]), np.zeros(1)
-    view = render_layout(camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
-    return view.kind[0]
+def _visible_kinds(plan: FloorPlan, camera: Camera) -> UInt8[np.ndarray, "w"]:
+    place = camera.position_m[None], np.zeros(1), np.array([camera.room_index])
+    return sweep_layouts(*place, plan.wall_table, _COLUMNS, camera.camera_height_m).kind[0]
 
 
 def _with_moved_doors(
