@@ -28,7 +28,6 @@ from lalaloc_core.conventions import Array, column_azimuths, row_elevations, uni
 CORNER_TOLERANCE = 1e-5
 # A wall whose line passes the camera nearer than this (m, times the wall's length) is edge-on and invisible.
 EDGE_ON = 1e-9
-_PARALLEL = 1e-12
 # Length (m) of rays that meet no wall, from poses outside every room: keeps all values finite.
 _MAX_DISTANCE_M = 1e6
 
@@ -101,39 +100,6 @@ def inverse_crossings(
     count = walls_m.shape[1]
     inverse_m, begins, ends = products[:, :count], products[:, count : 2 * count], products[:, 2 * count :]
     return InverseCrossings(xp.where(begins * ends <= 0.0, inverse_m, xp.zeros_like(inverse_m)), by_x, by_y)
-
-
-class Crossings(NamedTuple):
-    """Intersections of rays with the lines through walls.
-
-    Attributes:
-        distance_m: distance along the ray; inf if it misses the wall or meets it behind its origin.
-        share: position along the wall, 0 at its start and 1 at its end.
-        determinant: determinant of the linear system; positive where the ray leaves a room to the wall's left.
-    """
-
-    distance_m: Array
-    share: Array
-    determinant: Array
-
-
-def cross_walls(direction: tuple[Array, Array], start_m: tuple[Array, Array], edge_m: tuple[Array, Array]) -> Crossings:
-    """Intersect rays with walls.
-
-    All arguments are (x, y) components that broadcast against each other: the rays' unit vectors, from the rays'
-    origins to the walls' starts, and from the walls' starts to their ends.
-    """
-    (direction_x, direction_y), (start_x, start_y), (edge_x, edge_y) = direction, start_m, edge_m
-    xp = array_namespace(direction_x, start_x)
-    # Solve t * direction = start + s * edge by Cramer's rule.
-    determinant = direction_x * edge_y - direction_y * edge_x
-    parallel = xp.abs(determinant) < _PARALLEL
-    # Avoiding a division by zero in the unused branch keeps NaN out of the gradients.
-    inverse = 1.0 / xp.where(parallel, xp.ones_like(determinant), determinant)
-    t = (start_x * edge_y - start_y * edge_x) * inverse
-    s = (start_x * direction_y - start_y * direction_x) * inverse
-    hit = ~parallel & (t > 0.0) & (s >= -CORNER_TOLERANCE) & (s <= 1.0 + CORNER_TOLERANCE)
-    return Crossings(xp.where(hit, t, xp.full_like(t, xp.inf)), s, determinant)
 
 
 def wall_profile(

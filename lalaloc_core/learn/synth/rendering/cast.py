@@ -14,9 +14,10 @@ from torch import Tensor
 
 from lalaloc_core.learn.synth.rendering.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
 from lalaloc_core.learn.synth.scene.render_scene import Decals, SceneRecords
-from lalaloc_core.render.profile import cross_walls
+from lalaloc_core.render.profile import CORNER_TOLERANCE
 
 _TINY = 1e-9
+_PARALLEL = 1e-12
 _MAX_DECALS_PER_COLUMN = 10
 
 
@@ -183,13 +184,20 @@ def _before(
 
 
 def _cross_walls(walls_m: Float[Tensor, "b n 4"], direction: Float[Tensor, "b c 2"]) -> _Crossings:
+    """Solve t * direction = start + share * edge by Cramer's rule; rooms lie to the left of their walls."""
     x, y = walls_m[:, None, :, 0], walls_m[:, None, :, 1]
     ex, ey = walls_m[:, None, :, 2] - x, walls_m[:, None, :, 3] - y
-    crossings = cross_walls((direction[:, :, None, 0], direction[:, :, None, 1]), (x, y), (ex, ey))
+    dx, dy = direction[:, :, None, 0], direction[:, :, None, 1]
+    determinant = dx * ey - dy * ex
+    parallel = determinant.abs() < _PARALLEL
+    inverse = 1.0 / torch.where(parallel, 1.0, determinant)
+    t = (x * ey - y * ex) * inverse
+    share = (x * dy - y * dx) * inverse
+    hit = ~parallel & (t > 0.0) & (share >= -CORNER_TOLERANCE) & (share <= 1.0 + CORNER_TOLERANCE)
     return _Crossings(
-        distance_m=crossings.distance_m,
-        along_m=crossings.share * torch.sqrt(ex**2 + ey**2),
-        leaving=crossings.determinant > 0.0,
+        distance_m=torch.where(hit, t, torch.inf),
+        along_m=share * torch.sqrt(ex**2 + ey**2),
+        leaving=determinant > 0.0,
     )
 
 
