@@ -44,9 +44,9 @@ class DrawnPin:
     state: str
 
 
-def pins_svg(plan: FloorPlan, pins: Sequence[DrawnPin], extent: float | None = None) -> str:
-    """Draw pins in metres, y pointing down; `extent` (m) scales the marks (default: the plan's)."""
-    radius = (extent_m(plan) if extent is None else extent) / _PINS_PER_EXTENT
+def pins_svg(plan: FloorPlan, pins: Sequence[DrawnPin]) -> str:
+    """Draw pins in metres, y pointing down; the plan's extent scales the marks."""
+    radius = extent_m(plan) / _PINS_PER_EXTENT
     placed: list[tuple[float, float]] = []
     for pin in pins:
         placed.append(_free((pin.x_m, -pin.y_m), placed, radius))
