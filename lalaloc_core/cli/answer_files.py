@@ -7,7 +7,6 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.plan_files import check_picture_name, write_file, write_picture
@@ -17,6 +16,7 @@ from lalaloc_core.shown_text import no_formula
 if TYPE_CHECKING:
     from lalaloc_core.draw.plan import Marker
     from lalaloc_core.floorplan import FloorPlan
+    from lalaloc_core.floorplan.earth import Anchor
 
 _COLUMNS = ("photograph", "room", "x_m", "y_m", "heading_deg", "within_95_m", "confidence", "error")
 
@@ -89,46 +89,26 @@ def _cells(answer: dict[str, Any]) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class EarthPlace:
-    """Place on Earth, and azimuth from true north; degrees."""
-
-    latitude: float
-    longitude: float
-    azimuth_deg: float | None
-
-
-def place_on_earth(plan: FloorPlan, place_m: tuple[float, float], heading_deg: float | None) -> EarthPlace | None:
-    """Return a place of a plan, and the azimuth of a heading there; None without an anchor."""
-    import numpy as np
-
-    if plan.anchor is None:
-        return None
-    ((longitude, latitude),) = plan.anchor.to_earth(np.array([place_m])).tolist()
-    azimuth_deg = None if heading_deg is None else plan.anchor.true_azimuth_deg(place_m, heading_deg)
-    return EarthPlace(latitude, longitude, azimuth_deg)
-
-
-def place_feature(place: EarthPlace, properties: dict[str, Any]) -> dict[str, Any]:
-    """Return a place as a GeoJSON Feature (RFC 7946)."""
-    azimuth_deg = None if place.azimuth_deg is None else round(place.azimuth_deg, 2)
+def place_feature(anchor: Anchor, answer: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
+    """Return the place of an answer or of a pin as a GeoJSON Feature (RFC 7946)."""
+    position = answer["position"]
+    latitude, longitude, azimuth_deg = anchor.place((position["x_m"], position["y_m"]), answer["heading_deg"])
     return {
         "type": "Feature",
-        "geometry": {"type": "Point", "coordinates": [round(place.longitude, 8), round(place.latitude, 8)]},
-        "properties": properties | {"azimuth_deg": azimuth_deg},
+        "geometry": {"type": "Point", "coordinates": [round(longitude, 8), round(latitude, 8)]},
+        "properties": properties | {"azimuth_deg": None if azimuth_deg is None else round(azimuth_deg, 2)},
     }
 
 
 def _collection(plan: FloorPlan, answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the places as a GeoJSON FeatureCollection (RFC 7946)."""
+    assert plan.anchor is not None
     features = []
     for answer in answers:
         if "error" in answer:
             continue
-        position, confidence = answer["position"], answer["confidence"]
-        place = place_on_earth(plan, (position["x_m"], position["y_m"]), answer["heading_deg"])
-        assert place is not None
+        confidence = answer["confidence"]
         share = None if confidence is None else round(confidence, 4)
         properties = {"photograph": answer["photograph"], "room": answer["room"], "confidence": share}
-        features.append(place_feature(place, properties))
+        features.append(place_feature(plan.anchor, answer, properties))
     return {"type": "FeatureCollection", "features": features}

@@ -40,8 +40,8 @@ class DrawnText:
     angle: float
 
 
-def write_pdf(pages: Iterable[str], path: Path, dpi: int) -> None:
-    """Write SVG drawings as pages of a PDF, whose text can be selected."""
+def draw_pdf(pages: Iterable[str], dpi: int) -> bytes:
+    """Return SVG drawings as pages of a PDF, whose text can be selected."""
     document = pypdfium2.PdfDocument.new()
     try:
         layer = _TextLayer(document)
@@ -63,7 +63,7 @@ def write_pdf(pages: Iterable[str], path: Path, dpi: int) -> None:
         document.save(content)
     finally:
         document.close()
-    path.write_bytes(content.getvalue())
+    return content.getvalue()
 
 
 def _texts(element: Element, frame: Float[np.ndarray, "3 3"], anchor: str) -> Iterator[DrawnText]:

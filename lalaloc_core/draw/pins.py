@@ -6,16 +6,17 @@ Pages are drawings (A4, 150 pixels per inch), so that text looks the same on eve
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Final
-
-import numpy as np
-from jaxtyping import UInt8
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
 
 from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, shortened, words, xml_text
 from lalaloc_core.draw.plan import extent_m, plan_part
+from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.photograph.photograph import open_picture
+from lalaloc_core.shown_text import probability_text
 
 # Blue, orange and green of Okabe and Ito's palette, distinct for colour-blind readers.
 PIN_COLOURS: Final = {"sure": "#0072b2", "uncertain": "#e69f00", "corrected": "#009e73"}
@@ -90,43 +91,42 @@ def _free(place: tuple[float, float], placed: Sequence[tuple[float, float]], rad
     return place
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ReportRow:
-    """A photograph of the report.
+    """A photograph of the report: its entry in `pins.json`, and a function that returns its file."""
 
-    Attributes:
-        plan: number of its plan; None if it is set aside.
-        room: name of its room, and `room_key`, by which rooms are told apart.
-        note: probability of the room, or why it is set aside.
-        picture: returns its pixels, no larger than `THUMBNAIL`; None if they cannot be read.
-    """
+    entry: Mapping[str, Any]
+    content: Callable[[], bytes]
 
-    number: int
-    name: str
-    date: str
-    plan: int | None
-    pin: DrawnPin | None
-    room: str
-    room_key: str
-    note: str
-    picture: Callable[[], UInt8[np.ndarray, "h w 3"] | None] = field(repr=False)
+    @property
+    def pin(self) -> DrawnPin | None:
+        """Its pin; None if it is set aside."""
+        named = {name: self.entry[name] for name in ("number", "heading_deg", "state")}
+        return None if self.entry["position"] is None else DrawnPin(**self.entry["position"], **named)
+
+
+def report_notes(counts: Mapping[str, int], camera_height_m: float | None) -> list[str]:
+    """Return the lines under the first plan: the number of photographs by state, and the height of the cameras."""
+    lines = [", ".join(f"{count} {state.replace('_', ' ')}" for state, count in counts.items() if count)]
+    if camera_height_m is not None:
+        lines.append(f"Cameras were {camera_height_m:.2f} m above the floor.")
+    return lines
 
 
 def report_pages(
-    title: str, plans: Sequence[FloorPlan], rows: Sequence[ReportRow], notes: Sequence[str]
+    title: str, plans: Mapping[str, FloorPlan], rows: Sequence[ReportRow], notes: Sequence[str]
 ) -> Iterator[str]:
     """Yield the pages as SVG: each plan, then each room with photographs, then what was set aside."""
-    for number, plan in enumerate(plans):
-        own = [row for row in rows if row.plan == number]
+    for number, (plan_id, plan) in enumerate(plans.items()):
+        own = [row for row in rows if row.entry["plan"] == plan_id]
         yield _plan_page(title, plan, own, len(rows), notes if number == 0 else ())
-    by_room: dict[str, list[ReportRow]] = {}
+    by_room: dict[tuple[str, str], list[ReportRow]] = {}
     for row in rows:
         if row.pin is not None:
-            by_room.setdefault(row.room_key, []).append(row)
-    for members in by_room.values():
-        plan = plans[members[0].plan or 0]
+            by_room.setdefault((row.entry["plan"], row.entry["room_id"]), []).append(row)
+    for (plan_id, _), members in by_room.items():
         for first in range(0, len(members), _COLUMNS * _ROWS):
-            yield _room_page(plan, members, members[first : first + _COLUMNS * _ROWS])
+            yield _room_page(plans[plan_id], members, members[first : first + _COLUMNS * _ROWS])
     aside = [row for row in rows if row.pin is None]
     for first in range(0, len(aside), _LINES // 2):
         yield _aside_page(aside[first : first + _LINES // 2])
@@ -151,7 +151,7 @@ def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: in
 
 
 def _room_page(plan: FloorPlan, members: Sequence[ReportRow], rows: Sequence[ReportRow]) -> str:
-    room = members[0].room
+    room = members[0].entry["room"]
     numbers = f"{len(members)} photograph{'s' if len(members) > 1 else ''}"
     parts = [_heading(room, f"{plan.name}, {numbers}")]
     pins = [row.pin for row in members if row.pin is not None]
@@ -167,7 +167,9 @@ def _room_page(plan: FloorPlan, members: Sequence[ReportRow], rows: Sequence[Rep
 
 def _photograph(row: ReportRow, box: tuple[float, float, float, float]) -> str:
     x, y, width, height = box
-    parts, shown = list[str](), row.picture()
+    parts, shown = list[str](), None
+    with suppress(InvalidPhotographError, OSError):
+        shown = open_picture(row.content(), max_size=THUMBNAIL)
     if shown is not None:
         scale = min(width / shown.shape[1], height / shown.shape[0])
         size = shown.shape[1] * scale, shown.shape[0] * scale
@@ -181,10 +183,11 @@ def _photograph(row: ReportRow, box: tuple[float, float, float, float]) -> str:
     parts.append(
         f'<g transform="translate({x + 34:.0f} {middle:.0f})" fill="{PIN_COLOURS[pin.state]}">{arrow}'
         f'<circle r="15" /><text y="6" font-size="17" fill="#fff" font-weight="bold" text-anchor="middle">'
-        f"{row.number}</text></g>"
+        f"{pin.number}</text></g>"
     )
-    parts.append(words(x + 76, middle - 4, shortened(row.name, 34), 20))
-    parts.append(words(x + 76, middle + 20, shortened(f"{row.date}   {row.note}".strip(), 52), 16, fill=MUTED))
+    parts.append(words(x + 76, middle - 4, shortened(row.entry["photograph"], 34), 20))
+    facts = f"{row.entry['taken'] or ''}   {probability_text(row.entry['confidence'], 0)} sure of the room"
+    parts.append(words(x + 76, middle + 20, shortened(facts.strip(), 52), 16, fill=MUTED))
     return "".join(parts)
 
 
@@ -192,8 +195,9 @@ def _aside_page(rows: Sequence[ReportRow]) -> str:
     parts = [_heading("Set aside", "photographs without a pin")]
     for line, row in enumerate(rows):
         y = _TOP + 40 + line * 66
-        parts.append(words(_MARGIN, y, f"{row.number}   {shortened(row.name, 70)}", 20))
-        parts.append(words(_MARGIN + 40, y + 26, shortened(row.note, 112), 16, fill=MUTED))
+        name = shortened(row.entry["photograph"], 70)
+        parts.append(words(_MARGIN, y, f"{row.entry['number']}   {name}", 20))
+        parts.append(words(_MARGIN + 40, y + 26, shortened(row.entry["reason"], 112), 16, fill=MUTED))
     return document(WIDTH, HEIGHT, "Set aside", parts)
 
 

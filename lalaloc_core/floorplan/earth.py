@@ -68,6 +68,11 @@ class Anchor:
         convergence_deg = frame.convergence_deg(self.to_earth(place)[0])
         return (azimuth_deg - self.north_deg + convergence_deg) % 360.0
 
+    def place(self, position_m: tuple[float, float], heading_deg: float | None) -> tuple[float, float, float | None]:
+        """Return latitude and longitude of a position (m) in the plan frame, and a heading there from true north."""
+        ((longitude, latitude),) = self.to_earth(np.array([position_m], dtype=float)).tolist()
+        return latitude, longitude, None if heading_deg is None else self.true_azimuth_deg(position_m, heading_deg)
+
     def moved(self, origin_m: tuple[float, float]) -> Anchor:
         """Return the anchor of the same plan with its origin moved to a position (m), its axes unrotated."""
         ((longitude, latitude),) = self.to_earth(np.array([origin_m], dtype=float))

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, ParseError, SubElement
 
@@ -52,21 +54,42 @@ class Place:
     direction_deg: float | None = None
 
 
+class PlacedHead(NamedTuple):
+    """Beginning of a copy, before the bytes of the file from `rest` on; and the XMP file beside it, if it needs one."""
+
+    head: bytes
+    rest: int
+    sidecar: bytes | None = None
+
+
 def placed_copy(content: bytes, place: Place) -> tuple[bytes, bytes | None]:
-    """Return a copy of a picture file with a place, and an XMP file to lie beside it; None if the copy has the place.
+    """Return a copy of a picture file with a place, and the XMP file beside it; None if the copy has the place."""
+    found = placed_head(content, place, PhotographLimits())
+    return found.head + content[found.rest :], found.sidecar
+
+
+def placed_head(content: bytes, place: Place, limits: PhotographLimits) -> PlacedHead:
+    """Return the beginning of a copy of a picture file with a place.
 
     Positions and directions that the file states are replaced, keywords are added to its own.
     """
-    with opened_picture(content, PhotographLimits()) as file:
+    with opened_picture(content, limits) as file:
         kind, exif = file.kind, file.exif
         packet = next((packet for packet in file.packets if packet), None)
         xmp = _xmp(packet, place)
         stated = _exif(exif, place)
     if kind == "JPEG" and len(XMP) + len(xmp) <= _MAX_SEGMENT:
-        return _in_jpeg(content, stated, xmp), None
+        return _in_jpeg(content, stated, xmp)
     if kind == "PNG":
-        return _in_png(content, stated, xmp), None
-    return content, xmp
+        return _in_png(content, stated, xmp)
+    return PlacedHead(b"", 0, xmp)
+
+
+def sidecar_name(name: str, taken: Container[str]) -> str:
+    """Return the name of the XMP file beside a copy; `taken` are names whose case is folded."""
+    # The name that all photo managers know; that with both suffixes for the second file of the same name.
+    known = str(PurePosixPath(name).with_suffix(".xmp"))
+    return f"{name}.xmp" if known.casefold() in taken else known
 
 
 def _exif(exif: Image.Exif, place: Place) -> bytes | None:
@@ -157,8 +180,8 @@ def _minutes(degrees: float, letters: str) -> str:
     return f"{whole},{60.0 * (abs(degrees) - whole):.8f}{letters[degrees < 0.0]}"
 
 
-def _in_jpeg(content: bytes, exif: bytes | None, xmp: bytes) -> bytes:
-    """Return a JPEG with other metadata: the bytes from the first scan on are copied."""
+def _in_jpeg(content: bytes, exif: bytes | None, xmp: bytes) -> PlacedHead:
+    """Return the head of a JPEG with other metadata: the bytes from the first scan on are copied."""
     kept, first, position = list[bytes](), list[bytes](), len(START)
     for marker, at in markers(content):
         end = at + int.from_bytes(content[at : at + 2], "big")
@@ -172,25 +195,27 @@ def _in_jpeg(content: bytes, exif: bytes | None, xmp: bytes) -> bytes:
             target.append(bytes([0xFF, marker]) + content[at:end])
         position = end
     new = [] if exif is None else [_segment(exif if exif.startswith(_EXIF) else _EXIF + exif)]
-    return b"".join([START, *first, *new, _segment(XMP + xmp), *kept, content[position:]])
+    return PlacedHead(b"".join([START, *first, *new, _segment(XMP + xmp), *kept]), position)
 
 
 def _segment(body: bytes) -> bytes:
     return bytes([0xFF, APP1]) + (len(body) + 2).to_bytes(2, "big") + body
 
 
-def _in_png(content: bytes, exif: bytes | None, xmp: bytes) -> bytes:
-    """Return a PNG with other metadata: all other chunks are copied."""
-    parts = [content[:8]]
+def _in_png(content: bytes, exif: bytes | None, xmp: bytes) -> PlacedHead:
+    """Return the head of a PNG with other metadata: all other chunks are copied."""
+    parts, copied = list[bytes](), 0
     for kind, begin, end in png_chunks(content):
-        is_xmp = kind == b"iTXt" and content[begin + 8 :].startswith(_PNG_XMP[:18])
+        is_xmp = kind == b"iTXt" and content.startswith(_PNG_XMP[:18], begin + 8)
         if is_xmp or (kind == b"eXIf" and exif is not None):
-            continue
-        parts.append(content[begin:end])
-        if kind == b"IHDR":
+            parts.append(content[copied:begin])
+            copied = end
+        elif kind == b"IHDR":
+            parts.append(content[copied:end])
+            copied = end
             parts += [] if exif is None else [_chunk(b"eXIf", exif.removeprefix(_EXIF))]
             parts.append(_chunk(b"iTXt", _PNG_XMP + xmp))
-    return b"".join(parts)
+    return PlacedHead(b"".join(parts), copied)
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

@@ -17,7 +17,7 @@ from PIL import ExifTags, Image
 
 from lalaloc_core.cli import main
 from lalaloc_core.draw.canvas import document, words
-from lalaloc_core.draw.pdf import write_pdf
+from lalaloc_core.draw.pdf import draw_pdf
 from lalaloc_core.photograph.placed_copy import Place, placed_copy
 from lalaloc_core.shown_text import no_formula, printable
 from tests.core.fault_photographs import FOLDER
@@ -78,12 +78,11 @@ def test_text_of_the_report_can_be_selected(pinned: tuple[Path, Path]) -> None:
     assert "broken.jpg" in pages[-1]
 
 
-def test_selected_text_lies_over_its_picture(tmp_path: Path) -> None:
+def test_selected_text_lies_over_its_picture() -> None:
     name = "Küche 厨房 ж"
     turned = f'<g transform="translate(500 600) rotate(90)">{words(0, 0, "turned", 40)}</g>'
     parts = [words(100, 200, name, 40), words(900, 300, "end", 40, anchor="end"), turned]
-    write_pdf([document(1000, 1000, "Page", parts)], tmp_path / "page.pdf", 72)
-    page = pypdfium2.PdfDocument(tmp_path / "page.pdf")[0]
+    page = pypdfium2.PdfDocument(draw_pdf([document(1000, 1000, "Page", parts)], 72))[0]
     text = page.get_textpage()
     assert text.get_text_range().splitlines()[:2] == [name, "end"]
     ink = np.asarray(page.render(scale=1).to_pil().convert("L")) < 128

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -12,7 +12,9 @@ from typing import Any
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.album.pins import Album, Pin, PinPose, moved_pins
+from lalaloc_core.photograph.placed_copy import Place
 
 _VERSION = 1
 _NOWHERE = dict.fromkeys(("plan", "room_id", "room", "position", "heading_deg"))
@@ -109,6 +111,17 @@ def pin_document(pin: Pin) -> dict[str, Any]:
         "suggestions": [{**_place(row.pose), "probability": _share(row.probability)} for row in pin.suggestions],
         "warnings": list(pin.warnings),
     }
+
+
+def stated_place(entry: Mapping[str, Any], plan: FloorPlan, anchor: Anchor | None) -> Place:
+    """Return the place of an entry of `pins.json`, as files state it; `anchor` can be that of the plan's venue."""
+    room, position, heading_deg = entry["room"], entry["position"], entry["heading_deg"]
+    latitude = longitude = direction_deg = None
+    if anchor is not None:
+        latitude, longitude, direction_deg = anchor.place((position["x_m"], position["y_m"]), heading_deg)
+    elif plan.north is not None and heading_deg is not None:
+        direction_deg = (heading_deg - math.degrees(plan.north)) % 360.0
+    return Place(room=room, level=plan.name, latitude=latitude, longitude=longitude, direction_deg=direction_deg)
 
 
 def common_document(album: Album) -> dict[str, Any]:
