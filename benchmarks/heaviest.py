@@ -362,11 +362,12 @@ def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool =
 def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
     if not (album := _create(caller, "/albums", _body({"floorplan_id": stored.plan_id}))):
         return
-    for first in range(0, size, _PHOTOGRAPHS):
-        # Bytes after the picture make it another one.
-        files = (("photo", _sphere() + str(first + number).encode()) for number in range(_PHOTOGRAPHS))
-        caller.send("POST", f"{album}/photographs", *form((), tuple(files)))
-    caller.send("GET", f"{album}/events")
+    for route in ("photographs", "copies"):
+        for first in range(0, size, _PHOTOGRAPHS):
+            # Bytes after the picture make it another one.
+            files = (("photo", _sphere() + str(first + number).encode()) for number in range(_PHOTOGRAPHS))
+            caller.send("POST", f"{album}/{route}", *form((), tuple(files)))
+        caller.send("GET", f"{album}/events")
     caller.send("GET", album)
     page = caller.send("GET", f"{album}/photographs")
     if page.status == 200 and (photographs := page.json()["photographs"]):
@@ -429,7 +430,8 @@ _PLAN, _VENUE = "/floorplans/{floorplan_id}", "/venues/{venue_id}"
 _SESSION, _KEY = "/sessions/{session_id}", "/admin/keys/{key_id}"
 _ALBUM = "/albums/{album_id}"
 _PINNED = f"{_ALBUM}/photographs/{{photograph_id}}"
-_ALBUMS = ("POST /albums", f"POST {_ALBUM}/photographs", f"GET {_ALBUM}/events", f"GET {_ALBUM}", f"DELETE {_ALBUM}")
+_ALBUMS = ("POST /albums", f"GET {_ALBUM}/events", f"GET {_ALBUM}", f"DELETE {_ALBUM}", f"POST {_ALBUM}/copies")
+_PHOTOGRAPHS_OF_ALBUM = f"POST {_ALBUM}/photographs", f"GET {_ALBUM}/photographs"
 _SESSIONS = ("POST /sessions", f"POST {_SESSION}/photographs")
 _TOO_LONG = frozenset({422})
 _EMPTY_FORM = "multipart/form-data; boundary=b"
@@ -515,7 +517,7 @@ LOADS = (
     Load(_SESSIONS, "two photographs, {homes} homes", partial(_follow_session, venue=True)),
     _read("/albums", "pages of 500", 500, limit=None),
     Load(
-        (*_ALBUMS, f"GET {_ALBUM}/photographs", f"GET {_PINNED}", f"PATCH {_PINNED}", f"DELETE {_PINNED}"),
+        (*_ALBUMS, *_PHOTOGRAPHS_OF_ALBUM, f"GET {_PINNED}", f"PATCH {_PINNED}", f"DELETE {_PINNED}"),
         f"album of 500 spheres, {VERTICES_PLAN}",
         _pin_album,
         500,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import threading
 from collections.abc import Callable, Iterator
@@ -35,13 +36,20 @@ class UploadedFile:
             self._file.seek(0)
             return self._file.read()
 
-    def chunks(self) -> Iterator[bytes]:
-        """Return the content in parts of bounded size."""
-        for offset in range(0, self._size, _CHUNK_BYTES):
+    def chunks(self, first: int = 0) -> Iterator[bytes]:
+        """Return the content from byte `first` on in parts of bounded size."""
+        for offset in range(first, self._size, _CHUNK_BYTES):
             with self._lock:
                 self._file.seek(offset)
                 chunk = self._file.read(_CHUNK_BYTES)
             yield chunk
+
+    def sha256(self) -> str:
+        """Return the digest of the content."""
+        digest = hashlib.sha256()
+        for chunk in self.chunks():
+            digest.update(chunk)
+        return digest.hexdigest()
 
     def close(self) -> None:
         """Delete the content."""

@@ -1,4 +1,4 @@
-"""Documents about the pins of an album: corrections as the store has them; pins as GeoJSON, CSV and SVG."""
+"""Documents about the pins of an album: corrections as the store has them; pins as GeoJSON, CSV, SVG and plain data."""
 
 from __future__ import annotations
 
@@ -128,6 +128,14 @@ def pins_svg(name: str, bounds_m: Bounds, photographs: Sequence[AlbumPhotographA
     marks = [_mark(photograph, photograph.pin, size_m) for photograph in photographs if photograph.pin is not None]
     end = tail.rindex("</svg>")
     return head, tail[:end] + "".join(marks) + tail[end:]
+
+
+def report_entry(photograph: AlbumPhotographAnswer, name: str) -> dict[str, Any]:
+    """Return a photograph that is solved as in the `pins.json` of `lalaloc pin`, for its copy and the report."""
+    row = dict.fromkeys(_COLUMNS) | _row(photograph)
+    position = None if row["x_m"] is None else {"x_m": row["x_m"], "y_m": row["y_m"]}
+    taken = (row["taken_at"] or "").replace("T", " ").partition(".")[0]
+    return row | {"photograph": name, "taken": taken, "plan": row["floorplan_id"], "position": position}
 
 
 def _row(photograph: AlbumPhotographAnswer) -> dict[str, Any]:

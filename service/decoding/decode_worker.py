@@ -1,11 +1,11 @@
 """Program of a decoding worker process, which opens uploaded photographs.
 
-It also finds the angles between photographs and rasterises drawings, which keep the interpreter busy for as long.
+It also copies photographs, finds the angles between them, and draws, which keep the interpreter busy for as long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Literal, NamedTuple
@@ -13,11 +13,12 @@ from typing import Any, Literal, NamedTuple
 import cv2
 import numpy as np
 
-from lalaloc_core.draw.canvas import rasterise
+from lalaloc_core.draw.canvas import jpeg, rasterise
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.film import Film, FilmLimits, read_film
 from lalaloc_core.photograph.photograph import Purpose, open_picture, warm_up
 from lalaloc_core.photograph.picture_files import PhotographLimits
+from lalaloc_core.photograph.placed_copy import Place, PlacedHead, placed_head
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import level_turn
 from service.workers.process import limit_memory, serve_jobs
@@ -26,7 +27,7 @@ from service.workers.process import limit_memory, serve_jobs
 class DecodeJob(NamedTuple):
     """Method of `Decoding` to call, and its arguments; uploaded files arrive as bytes."""
 
-    task: Literal["photograph", "film", "turn", "picture", "drawing"]
+    task: Literal["photograph", "film", "turn", "picture", "copy", "drawing", "report"]
     arguments: tuple[Any, ...]
 
 
@@ -66,9 +67,21 @@ class Decoding:
         assert view.sphere is not None
         return view.sphere
 
+    def copy(self, content: bytes, place: Place, max_size: tuple[int, int]) -> tuple[PlacedHead, bytes]:
+        """Return the beginning of a copy of a photograph with its place, and the picture within `max_size` as JPEG."""
+        head = placed_head(content, place, self.limits)
+        return head, jpeg(open_picture(content, max_size=max_size, limits=self.limits))
+
     def drawing(self, svg: str) -> bytes:
         """Turn a drawing into a PNG file."""
         return rasterise(svg)
+
+    def report(self, pages: Callable[[], Iterable[str]], dpi: int) -> bytes:
+        """Turn drawings into a PDF file."""
+        # PDFium is loaded by the workers that need it.
+        from lalaloc_core.draw.pdf import draw_pdf
+
+        return draw_pdf(pages(), dpi)
 
 
 def run_decoder(connection: Connection, decoding: Decoding, memory_bytes: int) -> None:

@@ -1,4 +1,4 @@
-"""Pools of worker processes, bounded in memory and time, that decode photographs and rasterise drawings.
+"""Pools of worker processes, bounded in memory and time, that decode and copy photographs, and draw.
 
 A picture that crashes its worker is tried once more; one that exceeds the time limit is not. Other jobs are not
 affected. No client keeps all workers busy.
@@ -7,18 +7,20 @@ affected. No client keeps all workers busy.
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Manifest
+from lalaloc_core.draw.pins import DPI, THUMBNAIL
 from lalaloc_core.errors import InvalidFilmError, InvalidPhotographError
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Photograph, StatedCamera
 from lalaloc_core.photograph.film import Film
 from lalaloc_core.photograph.photograph import Purpose
+from lalaloc_core.photograph.placed_copy import Place, PlacedHead
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from service import errors
 from service.capacity.fair_share import FairSemaphore
@@ -149,6 +151,14 @@ class Decoder:
         """Decode a photograph to show: upright within `max_size` (width, height), spheres level and of that size."""
         return await self._run_job(DecodeJob("picture", (content, stated, is_sphere, max_size)), context)
 
+    async def copy(self, content: UploadedFile, place: Place, context: QueryContext) -> tuple[PlacedHead, bytes]:
+        """Return the beginning of a copy of a photograph with its place, and a JPEG of it for the report."""
+        return await self._run_job(DecodeJob("copy", (content, place, THUMBNAIL)), context)
+
+    async def report(self, pages: Callable[[], Iterable[str]], context: QueryContext) -> bytes:
+        """Return the pages of a report as a PDF file; the function that draws them is picklable."""
+        return await self._run_job(DecodeJob("report", (pages, DPI)), context)
+
     async def rasterise(self, svg: str, context: QueryContext) -> bytes:
         """Return a drawing as a PNG file."""
         return await self._run_job(DecodeJob("drawing", (svg,)), context)
@@ -185,7 +195,9 @@ class Decoder:
             case "stalled" if job.task == "drawing":
                 # Drawings have a bounded size, so the machine is slow.
                 return errors.DeadlineExceededError(stall_s)
-            case "poisoned" | "fault" if job.task == "drawing":
+            case "stalled" if job.task == "report":
+                return errors.DeadlineExceededError(stall_s, "the report of so many photographs was not drawn")
+            case "poisoned" | "fault" if job.task in ("drawing", "report"):
                 return errors.DrawingFailedError(lost.reason)
             case "poisoned" | "stalled" | "fault":
                 kind = InvalidFilmError if job.task == "film" else InvalidPhotographError
@@ -202,4 +214,4 @@ class Decoder:
 
 def _is_long(job: DecodeJob) -> bool:
     """Return whether a job can take as long as a film."""
-    return job.task == "film" or (job.task == "turn" and len(job.arguments[0]) > _SHORT_TURN)
+    return job.task in ("film", "report") or (job.task == "turn" and len(job.arguments[0]) > _SHORT_TURN)

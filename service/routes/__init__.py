@@ -6,6 +6,7 @@ caller and look-ups; `descriptions.py` has the errors, headers and bodies that t
 
 from service.routes import (
     admin,
+    album_copies,
     album_photographs,
     albums,
     floorplans,
@@ -31,6 +32,7 @@ ROUTERS = tuple(
         sessions,
         albums,
         album_photographs,
+        album_copies,
         model_files,
         service_state,
         admin,

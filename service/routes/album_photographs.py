@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import json
 from collections.abc import Sequence
 from functools import partial
@@ -120,11 +119,11 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
         content, sha256 = await call.upload(read, file)
         same = await call.read(call.store.albums.same_picture, album.id, sha256)
         if same is not None:
-            return {"status": 200, "photograph": _photograph_answer(same)}
+            return {"status": 200, "photograph": photograph_answer(same)}
         place = await call.place(document.floorplan_id, document.venue_id)
         query = AlbumPhotographQuery(document=document, content=content, sha256=sha256, context=context)
         entry = await call.runtime.localiser.answer(place, query)
-        new = NewPhotograph(sha256=sha256, name=_clean(file.name), facts=entry.facts, entry=entry.entry)
+        new = NewPhotograph(sha256=sha256, name=clean_name(file.name), facts=entry.facts, entry=entry.entry)
         if index:
             await done[index - 1].wait()
         storage = call.settings.storage
@@ -133,7 +132,7 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
             lambda: call.store.albums.add_photograph(call.tenant, album.id, new, ttl_s=ttl_s, limit=limit)
         )
         call.runtime.albums.wake()
-        return {"status": 201 if is_new else 200, "photograph": _photograph_answer(record)}
+        return {"status": 201 if is_new else 200, "photograph": photograph_answer(record)}
 
     lines = BatchLines(call, AlbumLine, add, lambda index: done[index].set()).lines([(file, file) for file in files])
     return LinesResponse(lines, call.settings.requests.request_deadline_s)
@@ -141,14 +140,11 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
 
 def _read(file: UploadedFile, call: ApiCall, *, are_features: bool) -> tuple[Content, str]:
     """Return a photograph, and the digest of its file."""
-    digest = hashlib.sha256()
-    for chunk in file.chunks():
-        digest.update(chunk)
     if not are_features:
-        return file, digest.hexdigest()
+        return file, file.sha256()
     if len(file) > MAX_BYTES:
         raise InvalidFeaturesError(f"{FEATURES} has {len(file)} bytes; the limit is {MAX_BYTES}")
-    return read_features(file.read(), call.runtime.bundle), digest.hexdigest()
+    return read_features(file.read(), call.runtime.bundle), file.sha256()
 
 
 @router.get(
@@ -204,7 +200,7 @@ async def list_album_photographs(
 
 def _answers(records: Sequence[PhotographRecord], floorplan_id: str | None) -> list[AlbumPhotographAnswer]:
     """Return photographs with their pins; those of one plan, if it is named."""
-    photographs = [_photograph_answer(record) for record in records]
+    photographs = [photograph_answer(record) for record in records]
     if floorplan_id is None:
         return photographs
     return [row for row in photographs if row.pin and row.pin.place and _plan_of(row) == floorplan_id]
@@ -252,7 +248,7 @@ async def _drawing(
 def get_album_photograph(album_id: str, photograph_id: str, call: Call) -> Response:
     """Return a photograph with its correction and its pin."""
     record = _photograph_of(call, album_of(call, album_id), photograph_id)
-    return call.representation(*json_with_etag(_photograph_answer(record)))
+    return call.representation(*json_with_etag(photograph_answer(record)))
 
 
 @router.patch(
@@ -297,7 +293,7 @@ async def correct_album_photograph(album_id: str, photograph_id: str, call: Call
         correct = call.store.albums.correct
         record = correct(call.tenant, album.id, current.id, correction, ttl_s=ttl_s, expected=expected)
         path = call.path_of("get_album_photograph", album_id=album.id, photograph_id=record.id)
-        return call.change_answer(*json_with_etag(_photograph_answer(record)), path, created=False)
+        return call.change_answer(*json_with_etag(photograph_answer(record)), path, created=False)
 
     answer = await call.upload(store)
     call.runtime.albums.wake(corrected=call.tenant)
@@ -315,10 +311,26 @@ def delete_album_photograph(album_id: str, photograph_id: str, call: Call) -> No
     call.runtime.albums.wake()
 
 
-def _clean(name: str | None) -> str | None:
-    """Return the name of a file without folders and characters that cannot be shown or stored; None for no name."""
+def clean_name(name: str | None) -> str | None:
+    """Return the name of a file without folders and what cannot be shown or stored; None for no name, and for `..`."""
     shown = "".join(filter(str.isprintable, (name or "").replace("\\", "/").rpartition("/")[2]))
-    return shown[:_MAX_NAME] or None
+    return shown[:_MAX_NAME] if shown.strip(". ") else None
+
+
+def photograph_answer(record: PhotographRecord) -> AlbumPhotographAnswer:
+    """Return a stored photograph with its correction and its pin."""
+    correction = None if record.correction is None else correction_document(record.correction)
+    return AlbumPhotographAnswer(
+        id=record.id,
+        number=record.number,
+        revision=record.revision_id,
+        name=record.name,
+        sha256=record.sha256,
+        added_at=record.created_at,
+        view=PhotographFacts.model_validate_json(record.facts),
+        correction=correction,
+        pin=_pin_of(record),
+    )
 
 
 def _photograph_of(call: ApiCall, album: AlbumRecord, photograph_id: str) -> PhotographRecord:
@@ -335,18 +347,3 @@ def _plan_of(photograph: AlbumPhotographAnswer) -> str:
     assert photograph.pin is not None
     assert photograph.pin.place is not None
     return photograph.pin.place.floorplan_id
-
-
-def _photograph_answer(record: PhotographRecord) -> AlbumPhotographAnswer:
-    correction = None if record.correction is None else correction_document(record.correction)
-    return AlbumPhotographAnswer(
-        id=record.id,
-        number=record.number,
-        revision=record.revision_id,
-        name=record.name,
-        sha256=record.sha256,
-        added_at=record.created_at,
-        view=PhotographFacts.model_validate_json(record.facts),
-        correction=correction,
-        pin=_pin_of(record),
-    )

@@ -71,6 +71,7 @@ _SCOPES: Mapping[str, Mapping[str, Permission]] = {
     "/albums": {"GET": Permission.LOCALISE, "POST": Permission.LOCALISE},
     "/albums/{album_id}": {"GET": Permission.LOCALISE, "DELETE": Permission.LOCALISE},
     "/albums/{album_id}/events": {"GET": Permission.LOCALISE},
+    "/albums/{album_id}/copies": {"POST": Permission.LOCALISE},
     "/albums/{album_id}/photographs": {"GET": Permission.LOCALISE, "POST": Permission.LOCALISE},
     "/albums/{album_id}/photographs/{photograph_id}": {
         "GET": Permission.LOCALISE,

@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import threading
+import zipfile
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import httpx
+import pypdfium2
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from sqlalchemy import update
 
 from lalaloc_core.bundle import Bundle, default_bundle
@@ -194,7 +196,7 @@ def test_pins_are_read_and_written_beside_the_event_loop(
         threads.add(threading.current_thread().name.partition("_")[0])
         return work(*args, **options)
 
-    for name in ("_photograph_answer", "AlbumPhotographList", "pins_csv", "pins_geojson", "pins_svg"):
+    for name in ("photograph_answer", "AlbumPhotographList", "pins_csv", "pins_geojson", "pins_svg"):
         monkeypatch.setattr(album_photographs, name, partial(noted, getattr(album_photographs, name)))
     for media in ("application/json", "text/csv", "application/geo+json", "image/svg+xml"):
         assert client.get(f"/albums/{solved}/photographs", headers={"Accept": media}).status_code == 200
@@ -208,6 +210,45 @@ def test_pins_of_a_plan_without_an_anchor_have_no_geojson(client: httpx.Client, 
     wait_until_solved(client, album_id)
     response = client.get(f"/albums/{album_id}/photographs", headers={"Accept": "application/geo+json"})
     assert_problem(response, 409, "floorplan-unanchored")
+
+
+def copies(client: httpx.Client, album_id: str, files: list[tuple[str, bytes]]) -> zipfile.ZipFile:
+    answer = client.post(f"/albums/{album_id}/copies", files=[("photo", file) for file in files])
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "application/zip"), answer.text
+    return zipfile.ZipFile(io.BytesIO(answer.content))
+
+
+def test_copies_have_their_place_and_come_with_a_report(
+    client: httpx.Client, solved: str, pictures: list[bytes]
+) -> None:
+    first, second, _, foreign = pictures
+    files = [("a/1.jpg", first), ("b/1.jpg", second), ("again.jpg", first), ("foreign.jpg", foreign)]
+    archive = copies(client, solved, files)
+    assert archive.namelist() == ["photographs/1.jpg", "photographs/1 (2).jpg", "report.pdf", "notes.txt"]
+    room = photographs(client, solved)[0]["pin"]["place"]["room"]
+    with Image.open(archive.open("photographs/1.jpg")) as copy:
+        assert copy.getxmp()["xmpmeta"]["RDF"]["Description"]["Location"] == room
+        gps = copy.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+    # At the anchor, not where the file said.
+    assert (gps[ExifTags.GPS.GPSLatitude][0], gps[ExifTags.GPS.GPSLatitude][1] < 1) == (48, True)
+    pages = [page.get_textpage().get_text_range() for page in pypdfium2.PdfDocument(archive.read("report.pdf"))]
+    assert any(page.startswith(room) and "1.jpg" in page for page in pages[1:])
+    notes = archive.read("notes.txt").decode()
+    assert notes.startswith("'again.jpg' is sent twice: copied once\n'foreign.jpg' is not in the album")
+    refused = client.post(f"/albums/{solved}/copies", files={"features": ("1.jpg", first)})
+    assert "have no picture to copy" in json.dumps(assert_problem(refused, 422, "invalid-request"))
+
+
+def test_copy_of_a_hostile_file_is_harmless(client: httpx.Client, plan_id: str) -> None:
+    bomb = b'<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><x:xmpmeta xmlns:x="adobe:ns:meta/">&b;</x:xmpmeta>'
+    picture = picture_file(Image.open(EXAMPLES / NAMES[0]), "JPEG", quality=95, xmp=bomb)
+    album_id = create(client, plan_id)
+    add(client, album_id, [picture])
+    wait_until_solved(client, album_id)
+    archive = copies(client, album_id, [("../../evil.jpg", picture)])
+    assert archive.namelist() == ["photographs/evil.jpg", "report.pdf"]
+    assert b"ENTITY" in picture
+    assert b"ENTITY" not in archive.read("photographs/evil.jpg")
 
 
 def test_file_names_are_no_formulas(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
@@ -404,7 +445,8 @@ def test_albums_of_another_tenant_do_not_exist(
         path = f"/albums/{album_id}/photographs/{line['photograph']['id']}"
         album = f"/albums/{album_id}"
         both = [(method, address) for method in ("GET", "DELETE") for address in (album, path)]
-        for method, address in (*both, ("GET", f"{album}/events"), ("GET", f"{album}/photographs")):
+        more = ("GET", f"{album}/events"), ("GET", f"{album}/photographs"), ("POST", f"{album}/copies")
+        for method, address in (*both, *more):
             assert_problem(client.request(method, address, headers=other), 404, "unknown-album")
             assert_problem(client.request(method, address, headers=reader), 403, "insufficient-scope")
         assert client.get("/albums", headers=other).json()["albums"] == []
