@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shutil
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -286,6 +287,23 @@ def test_print_has_the_plan_and_a_page_per_room(desktop: Visit, grey: Path) -> N
     assert (texts[0][0], texts[-1][0]) == ("Pinned flat", "Set aside")
     assert {text[0] for text in texts[1:-1]} == {"living room", "kitchen", "bedroom"}
     assert any("kitchen.jpg" in line for text in texts for line in text if text[0] == "kitchen")
+
+
+@pytest.mark.slow
+def test_copies_are_downloaded_while_the_page_has_the_files(desktop: Visit) -> None:
+    page = pin_files(desktop, FILES[:2])
+    copies = page.get_by_role("button", name="Copies with their place, and a report")
+    with page.expect_download() as archive:
+        copies.click()
+    names = zipfile.ZipFile(archive.value.path()).namelist()
+    assert names == ["photographs/kitchen.jpg", "photographs/living_room.jpg", "report.pdf"]
+    page.reload()
+    copies.click()
+    expect(page.locator("#pin-error")).to_contain_text("This page has no file of 2 photographs")
+    page.locator("#photo-files").set_input_files(FILES[:2])
+    expect(page.locator("#problems")).to_contain_text("the folder has already: 2")
+    with page.expect_download():
+        copies.click()
 
 
 @pytest.mark.slow

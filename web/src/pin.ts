@@ -9,7 +9,7 @@ import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_ca
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { choicesOf, Floors, folderOption, type Row } from "./pin_floors";
 import { fanned, type PinActions, pinOf } from "./pin_map";
-import { added, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
+import { added, copied, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
 import { plainWords } from "./plain_words";
 import { boxOf, drawNames, drawPlan, lostAreas, unitOf } from "./plan_drawing";
@@ -42,6 +42,7 @@ class PinPage {
   private readonly saved = h("optgroup", { label: "Saved folders" });
   private readonly levels = byId<HTMLSelectElement>("level-choice");
   private readonly thumbnails = new Map<string, Thumbnail>();
+  private readonly files = new Map<string, File>();
   private readonly done: { id: string; before: Correction | null }[] = [];
   private readonly floors = new Floors();
   private readonly cards = new Map<string, Drawn<HTMLElement>>();
@@ -208,20 +209,25 @@ class PinPage {
       this.choice.value = `album:${album.id}`;
     }
     const most = (await api.limits()).max_album_photographs;
-    const free = Math.max(most - this.rows.length, 0),
-      left = photographs.length - free;
+    // Those that the folder has already do not count: they are sent again for their copies.
+    const known = new Set(this.rows.map(({ name }) => name));
+    const beyond = photographs.filter(({ name }) => !known.has(name)).slice(Math.max(most - this.rows.length, 0));
+    const wanted = photographs.filter((file) => !beyond.includes(file)),
+      left = beyond.length;
     if (left > 0) tell(`A folder has at most ${most} photographs; left out: ${left}. Choose the plan again for them.`);
     let sent = 0,
       copies = 0;
-    for await (const { file, line } of added(album.id, photographs.slice(0, free))) {
+    for await (const { file, line } of added(album.id, wanted)) {
       if (typeof line === "string") tell(`${file.name}: ${line}`);
       else if (!line.photograph) tell(`${file.name}: ${plainWords(line.problem?.detail ?? "not added")}`);
       else {
         if (line.status === 200) copies++;
+        // Features have no width: the service cannot tell whose they are.
+        if (line.photograph.view.width !== null) this.files.set(line.photograph.id, file);
         const picture = this.thumbnails.has(line.photograph.id) ? null : await thumbnailOf(file);
         if (picture !== null) this.thumbnails.set(line.photograph.id, picture);
       }
-      this.reading = `${++sent} of ${Math.min(photographs.length, free)} photographs read, `;
+      this.reading = `${++sent} of ${wanted.length} photographs read, `;
       byId("pin-state").textContent = `${this.reading}${sureOf(this.rows)} pinned for sure`;
       if (sent % 5 === 0) void this.guarded(() => this.follow());
     }
@@ -340,7 +346,25 @@ class PinPage {
       button(name, () => void this.guarded(() => save(name, media))),
     );
     const paper = button("Print", () => print());
-    show(place, ...kinds, paper);
+    const copies = button("Copies with their place, and a report", () => void this.guarded(() => this.saveCopies()));
+    show(place, ...kinds, paper, copies);
+  }
+
+  /** Download copies of the photographs and a report, and say how many the page cannot send. */
+  private async saveCopies(): Promise<void> {
+    const pictures = this.rows.filter(({ view }) => view.width !== null);
+    const files = pictures.flatMap(({ id }) => this.files.get(id) ?? []);
+    const missing = pictures.length - files.length,
+      stayed = this.rows.length - pictures.length;
+    if (files.length > 0) say(`Copying ${files.length} photographs…`);
+    let count = 0;
+    for await (const archive of copied(this.album!.id, files)) download(archive, `copies-${++count}.zip`);
+    const without = [
+      missing > 0 && `This page has no file of ${missing} photographs: add their folder again, nothing is added twice.`,
+      stayed > 0 && `Photographs that stayed on a device: ${stayed}. There, lalaloc pin makes copies.`,
+    ].filter((text) => text !== false);
+    if (without.length > 0) throw new InputError(without.join(" "));
+    say(`Copies of ${files.length} photographs and a report are downloaded.`);
   }
 
   /** Return the pins in a plan; without actions, for paper. */
