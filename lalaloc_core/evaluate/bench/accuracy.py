@@ -209,7 +209,7 @@ def _measured(encoders: PhotographEncoder, scene: Scene, camera: Camera) -> Azim
     heading, room = np.array([camera.heading]), np.array([camera.room_index])
     place = camera.position_m[None], heading, room
     view = sweep_layouts(*place, scene.plan.wall_table, len(log_m), camera.camera_height_m)
-    return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0], scores)
+    return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0].astype(int), scores)
 
 
 def bench_localisability(setting: Setting) -> dict[str, Any]:

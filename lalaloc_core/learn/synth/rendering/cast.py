@@ -195,9 +195,7 @@ def _cross_walls(walls_m: Float[Tensor, "b n 4"], direction: Float[Tensor, "b c 
     share = (x * dy - y * dx) * inverse
     hit = ~parallel & (t > 0.0) & (share >= -CORNER_TOLERANCE) & (share <= 1.0 + CORNER_TOLERANCE)
     return _Crossings(
-        distance_m=torch.where(hit, t, torch.inf),
-        along_m=share * torch.sqrt(ex**2 + ey**2),
-        leaving=determinant > 0.0,
+        distance_m=torch.where(hit, t, torch.inf), along_m=share * torch.sqrt(ex**2 + ey**2), leaving=determinant > 0.0
     )
 
 
