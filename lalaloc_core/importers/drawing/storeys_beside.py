@@ -139,8 +139,7 @@ def _levels(storeys: Sequence[BaseGeometry], letterings: Sequence[Lettering]) ->
         if index not in level_of and number not in taken and distance_m <= max(x1 - x0, y1 - y0):
             level_of[index] = titles[number][0]
             taken.add(number)
-    # From the top to the bottom, and from the left to the right.
-    drawn = sorted(range(len(storeys)), key=lambda index: _reading_order(storeys[index]))
+    drawn = _reading_order(storeys)
     named = [level_of.get(index, Level(f"Storey {drawn.index(index) + 1}")) for index in range(len(storeys))]
     counts = [sum(level.name == other.name for other in named[:index]) for index, level in enumerate(named)]
     return [
@@ -163,10 +162,17 @@ def title_of(text: str) -> Level | None:
     return Level(" ".join(text.split()), number)
 
 
-def _reading_order(storey: BaseGeometry) -> tuple[float, float]:
-    x0, y0, x1, y1 = storey.bounds
-    # Storeys whose middles differ by less than their height are in one row.
-    return -round(0.5 * (y0 + y1) / max(y1 - y0, 1.0)), 0.5 * (x0 + x1)
+def _reading_order(storeys: Sequence[BaseGeometry]) -> list[int]:
+    """Return the numbers of the storeys in rows from the top to the bottom, each from the left to the right."""
+    rows: list[list[int]] = []
+    for index in sorted(range(len(storeys)), key=lambda index: -storeys[index].bounds[3]):
+        _, y0, _, y1 = storeys[index].bounds
+        # A storey whose middle is beside the first one of a row belongs to the row.
+        if rows and 0.5 * (y0 + y1) > storeys[rows[-1][0]].bounds[1]:
+            rows[-1].append(index)
+        else:
+            rows.append([index])
+    return [index for row in rows for index in sorted(row, key=lambda index: storeys[index].bounds[0])]
 
 
 def _in_words(storeys: Sequence[BaseGeometry], in_file: Callable[[Box], Box], levels: Sequence[Level] = ()) -> str:
