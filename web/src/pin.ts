@@ -9,7 +9,7 @@ import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_ca
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { choicesOf, Floors, folderOption, type Row } from "./pin_floors";
 import { fanned, type PinActions, pinOf } from "./pin_map";
-import { added, copied, photographsOf, type Thumbnail, thumbnailOf } from "./pin_photographs";
+import { added, photographsOf, saveCopies, type Thumbnail, thumbnailOf, wantedOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
 import { plainWords } from "./plain_words";
 import { boxOf, drawNames, drawPlan, lostAreas, unitOf } from "./plan_drawing";
@@ -209,11 +209,8 @@ class PinPage {
       this.choice.value = `album:${album.id}`;
     }
     const most = (await api.limits()).max_album_photographs;
-    // Those that the folder has already do not count: they are sent again for their copies.
-    const known = new Set(this.rows.map(({ name }) => name));
-    const beyond = photographs.filter(({ name }) => !known.has(name)).slice(Math.max(most - this.rows.length, 0));
-    const wanted = photographs.filter((file) => !beyond.includes(file)),
-      left = beyond.length;
+    const wanted = wantedOf(photographs, this.rows, most),
+      left = photographs.length - wanted.length;
     if (left > 0) tell(`A folder has at most ${most} photographs; left out: ${left}. Choose the plan again for them.`);
     let sent = 0,
       copies = 0;
@@ -337,34 +334,16 @@ class PinPage {
     const place = byId("exports");
     place.hidden = this.rows.length === 0;
     if (place.childElementCount > 0) return;
-    const plan = (): string | undefined => (this.floors.venue === null ? undefined : (this.shown ?? undefined));
     const save = async (name: string, media: (typeof FILES)[keyof typeof FILES]): Promise<void> => {
-      const file = await api.albumFile(this.album!.id, media, media === FILES.SVG ? plan() : undefined);
-      download(file, `pins.${name.toLowerCase()}`);
+      const plan = media === FILES.SVG && this.floors.venue !== null ? this.shown : null;
+      download(await api.albumFile(this.album!.id, media, plan ?? undefined), `pins.${name.toLowerCase()}`);
     };
     const kinds = Object.entries(FILES).map(([name, media]) =>
       button(name, () => void this.guarded(() => save(name, media))),
     );
-    const paper = button("Print", () => print());
-    const copies = button("Copies with their place, and a report", () => void this.guarded(() => this.saveCopies()));
-    show(place, ...kinds, paper, copies);
-  }
-
-  /** Download copies of the photographs and a report, and say how many the page cannot send. */
-  private async saveCopies(): Promise<void> {
-    const pictures = this.rows.filter(({ view }) => view.width !== null);
-    const files = pictures.flatMap(({ id }) => this.files.get(id) ?? []);
-    const missing = pictures.length - files.length,
-      stayed = this.rows.length - pictures.length;
-    if (files.length > 0) say(`Copying ${files.length} photographs…`);
-    let count = 0;
-    for await (const archive of copied(this.album!.id, files)) download(archive, `copies-${++count}.zip`);
-    const without = [
-      missing > 0 && `This page has no file of ${missing} photographs: add their folder again, nothing is added twice.`,
-      stayed > 0 && `Photographs that stayed on a device: ${stayed}. There, lalaloc pin makes copies.`,
-    ].filter((text) => text !== false);
-    if (without.length > 0) throw new InputError(without.join(" "));
-    say(`Copies of ${files.length} photographs and a report are downloaded.`);
+    const copy = (): Promise<void> => saveCopies(this.album!.id, this.rows, this.files);
+    const copies = button("Copies with their place, and a report", () => void this.guarded(copy));
+    show(place, ...kinds, button("Print", () => print()), copies);
   }
 
   /** Return the pins in a plan; without actions, for paper. */

@@ -3,9 +3,10 @@
 import type { Picture, Schemas } from "../../clients/typescript/src/index";
 import { api } from "./api";
 import { device } from "./device/device";
-import { h } from "./dom";
+import { download, h } from "./dom";
 import { isPicture } from "./drops";
-import { InputError } from "./notices";
+import { InputError, say } from "./notices";
+import type { Row } from "./pin_floors";
 
 export interface Thumbnail {
   url: string;
@@ -31,6 +32,14 @@ export function photographsOf(files: File[]): { photographs: File[]; note: strin
   return { photographs, note };
 }
 
+/** Return the photographs to send to an album: those that it has do not count for its limit, and get copies. */
+export function wantedOf(photographs: File[], rows: Row[], limit: number): File[] {
+  const known = new Set(rows.map(({ name }) => name));
+  const fresh = photographs.filter(({ name }) => !known.has(name));
+  const beyond = new Set(fresh.slice(Math.max(limit - rows.length, 0)));
+  return photographs.filter((file) => !beyond.has(file));
+}
+
 /** Add photographs to an album; yield each with its line, or with the reason why there is none. */
 export async function* added(album: string, files: File[]): AsyncGenerator<{ file: File; line: Line | string }> {
   await device.start();
@@ -42,17 +51,29 @@ export async function* added(album: string, files: File[]): AsyncGenerator<{ fil
     for await (const line of api.addToAlbum(album, part)) yield { file: part[line.index]!, line };
 }
 
-/** Send photographs once more for copies with their place, and a report; yield an archive for each portion. */
-export async function* copied(album: string, files: File[]): AsyncGenerator<Blob> {
+/** Send photographs once more; download copies with their place and a report, and say how many the page cannot send. */
+export async function saveCopies(album: string, rows: Row[], known: ReadonlyMap<string, File>): Promise<void> {
   await device.start();
   if (device.isOn)
     throw new InputError("The service makes copies, but these photographs stay on your device: use lalaloc pin there.");
+  const pictures = rows.filter(({ view }) => view.width !== null);
+  const files = pictures.flatMap(({ id }) => known.get(id) ?? []);
+  const missing = pictures.length - files.length,
+    stayed = rows.length - pictures.length;
+  if (files.length > 0) say(`Copying ${files.length} photographs…`);
+  let count = 0;
   for (const part of portions(files)) {
     const body = new FormData();
     for (const file of part) body.append("photo", file);
     const answer = await api.request(`/albums/${album}/copies`, { method: "POST", body, timeoutMs: 0 });
-    yield await answer.blob();
+    download(await answer.blob(), `copies-${++count}.zip`);
   }
+  const without = [
+    missing > 0 && `This page has no file of ${missing} photographs: add their folder again, nothing is added twice.`,
+    stayed > 0 && `Photographs that stayed on a device: ${stayed}. There, lalaloc pin makes copies.`,
+  ].filter((text) => text !== false);
+  if (without.length > 0) throw new InputError(without.join(" "));
+  say(`Copies of ${files.length} photographs and a report are downloaded.`);
 }
 
 function* portions(files: File[]): Generator<File[]> {
