@@ -184,7 +184,7 @@ def test_huge_picture_is_refused_before_its_scale_is_asked(desktop: Visit, tmp_p
     Image.new("1", (8000, 5001), 1).save(tmp_path / "huge.png")
     page.locator("#plan-file").set_input_files(tmp_path / "huge.png")
     expect(page.locator("#plan-error")).to_contain_text("8000 × 5001 = 40008000 pixels; the limit is 40000000")
-    expect(page.locator("#plan-error")).to_contain_text("max_plan_pixels")
+    expect(page.locator("#plan-error")).to_contain_text("Make it smaller, to 99 % of its width.")
     expect(page.locator("#import-form")).to_be_empty()
     _scan().save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")

@@ -45,8 +45,8 @@ export async function checkPixels(file: File): Promise<void> {
   if (limits === null || width * height <= limits.max_plan_pixels) return;
   const share = Math.floor(100 * Math.sqrt(limits.max_plan_pixels / (width * height)));
   throw new InputError(
-    `“${file.name}” has ${width} × ${height} = ${width * height} pixels; the limit is ${limits.max_plan_pixels} ` +
-      `(max_plan_pixels). Make it smaller, to ${share} % of its width.`,
+    `“${file.name}” has ${width} × ${height} = ${width * height} pixels; the limit is ${limits.max_plan_pixels}. ` +
+      `Make it smaller, to ${share} % of its width.`,
   );
 }
 
