@@ -31,7 +31,6 @@ export interface SessionActions {
   opened: () => void;
 }
 
-
 /** Panel and layer on the plan of a session. */
 export class LiveSession {
   readonly layer = s("g", { class: "session" });

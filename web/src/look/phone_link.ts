@@ -9,7 +9,7 @@ export class PhoneLink {
   private readonly code = h("div", { class: "qr" });
   private readonly link = h("a", {});
   private readonly warning = h("p", { class: "hint" });
-  private readonly dialog = h(
+  private readonly dialog: HTMLDialogElement = h(
     "dialog",
     { id: "phone-dialog", "aria-labelledby": "phone-title" },
     h("h2", { id: "phone-title" }, "Open this plan on a phone"),
