@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.draw.plan import Marker, draw_rooms, plan_svg
 from lalaloc_core.floorplan import FloorPlan, OpeningFace
+from lalaloc_core.floorplan.plan_document import read_plan
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import FairSemaphore
 from service.errors import OverloadedError
@@ -155,14 +156,12 @@ def converted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     watch(BaseModel, "model_dump_json", lambda model: type(model).__name__)
     watch(FloorPlan, "to_dict", lambda plan: "plan")
-    read, parse = FloorPlan.from_stored, FloorPlan._read
 
-    def parsed(*args: Any) -> FloorPlan:
+    def parsed(*args: Any) -> dict[str, Any]:
         calls.append("parse")
-        return parse(*args)
+        return read_plan(*args)
 
-    assert read.__func__ is not None
-    monkeypatch.setattr(FloorPlan, "_read", parsed)
+    monkeypatch.setattr("lalaloc_core.floorplan.plan.read_plan", parsed)
     return calls
 
 

@@ -289,7 +289,7 @@ def assert_stored_once(attempt: Callable[[], tuple[VenueRecord, list[PlanRecord]
 
 
 def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
-    token, limits = uuid.uuid4().hex, {"max_plans": 9, "max_venue_plans": 9}
+    token, limits = uuid.uuid4().hex, dict[str, Any](max_plans=9, max_venue_plans=9)
     venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
     assert_stored_once(lambda: app_store.venue_imports.extend("t", venue.id, token, new_plans(), **limits))
     extended = app_store.venues.get("t", venue.id)

@@ -251,7 +251,7 @@ def _reached(rooms: Sequence[shapely.Polygon], lines: Sequence[shapely.LineStrin
     start, end = (np.array([line.coords[side] for line in lines]) for side in (0, -1))
     along = (end - start) / np.maximum(np.linalg.norm(end - start, axis=1, keepdims=True), 1e-9)
     middle, across = 0.5 * (start + end), _REACH_M * along[:, ::-1] * (-1.0, 1.0)
-    ways = shapely.linestrings(np.stack([middle - across, middle + across], axis=1))
+    ways = [shapely.LineString(ends) for ends in np.stack([middle - across, middle + across], axis=1)]
     room, _ = shapely.STRtree(ways).query(rooms, predicate="intersects")
     return np.unique(room).tolist()
 
