@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from random import random
-from time import monotonic
 from typing import Any, Unpack
 
 from lalaloc_client.albums import FORMAT_MEDIA, AddedPhotograph, Album, AlbumFormat, AlbumPhotograph
@@ -17,8 +16,6 @@ from lalaloc_client.blocking.transport import Transport
 from lalaloc_client.errors import AlbumFailedError, NotReadyError
 from lalaloc_client.options import ViewOptions, earlier_name
 from lalaloc_client.requests import NDJSON, Photograph, Request, json_request, query_request, resource_path, text_values
-
-_FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 
 
 class Albums(Transport):
@@ -151,19 +148,13 @@ class Albums(Transport):
             AlbumFailedError: the album could not be solved.
             NotReadyError: it was not solved in time.
         """
-        begin_s, pause_s = monotonic(), _FIRST_POLL_S
-        while True:
-            album = self.album(album_id)
-            if album.state == "failed":
-                raise AlbumFailedError(album_id, album.reason)
-            if album.state != "solving":
-                return album
-            spent_s = monotonic() - begin_s
-            if spent_s >= timeout_s:
-                raise NotReadyError(album_id, spent_s, album.progress, "album")
-            # The last poll is at the timeout.
-            sleep(min(pause_s, timeout_s - spent_s))
-            pause_s = min(1.5 * pause_s, _MAX_POLL_S)
+        path = resource_path("albums", album_id)
+        album, spent_s = self._polled(Album, path, lambda album: album.state != "solving", timeout_s)
+        if album.state == "failed":
+            raise AlbumFailedError(album_id, album.reason)
+        if album.state == "solving":
+            raise NotReadyError(album_id, spent_s, album.progress, "album")
+        return album
 
 
 def _photograph_path(album_id: str, photograph_id: str) -> str:

@@ -6,8 +6,6 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
-from time import monotonic
 from typing import Any, Literal
 
 import httpx
@@ -43,7 +41,6 @@ from lalaloc_client.requests import (
 from lalaloc_client.retry import Safety
 
 _SVG = PICTURE_MEDIA["svg"]
-_FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 # Pause between two streams of events until the service sends its own, as it does at the start of each stream.
 _RECONNECT_S = 3.0
 
@@ -208,22 +205,13 @@ class Plans(Albums):
             FloorPlanFailedError: the service could not prepare the plan.
             NotReadyError: the plan is still preparing after `timeout_s`.
         """
-        request = Request("GET", resource_path("floorplans", floorplan_id))
-        begin_s, pause_s = monotonic(), _FIRST_POLL_S
-        while True:
-            left_s = max(timeout_s - (monotonic() - begin_s), 0.0)
-            retry = replace(self._retry, total_s=min(self._retry.total_s, left_s))
-            plan = self._stored(FloorPlan, request, retry)
-            if plan.status == "ready":
-                return plan
-            if plan.status == "failed":
-                raise FloorPlanFailedError(floorplan_id, plan.reason)
-            spent_s = monotonic() - begin_s
-            if spent_s >= timeout_s:
-                raise NotReadyError(floorplan_id, spent_s, plan.progress)
-            # The last poll is at the timeout.
-            sleep(min(pause_s, timeout_s - spent_s))
-            pause_s = min(1.5 * pause_s, _MAX_POLL_S)
+        path = resource_path("floorplans", floorplan_id)
+        plan, spent_s = self._polled(FloorPlan, path, lambda plan: plan.status in ("ready", "failed"), timeout_s)
+        if plan.status == "failed":
+            raise FloorPlanFailedError(floorplan_id, plan.reason)
+        if plan.status != "ready":
+            raise NotReadyError(floorplan_id, spent_s, plan.progress)
+        return plan
 
     # Venues
 

@@ -38,6 +38,7 @@ _DEFAULT_MAX_QUERIES = 3
 _UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 # A stream without data for this long is dead: the service sends a heartbeat every 15 s.
 _STREAM_TIMEOUT_S = 30.0
+_FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 _FOREIGN_FEATURES = "urn:lalaloc:problem:foreign-features"
 
 
@@ -150,6 +151,22 @@ class Transport:
         """Send a request and return the stored object in the answer, with its entity tag."""
         response = self._send(request, retry)
         return replace(parse(kind, response.content), etag=response.headers.get("etag"))
+
+    def _polled(
+        self, kind: type[StoredT], path: str, is_done: Callable[[StoredT], bool], timeout_s: float
+    ) -> tuple[StoredT, float]:
+        """Request a stored object until it is done or the time is over; return it as it then is, and the time (s)."""
+        begin_s, pause_s = monotonic(), _FIRST_POLL_S
+        while True:
+            left_s = max(timeout_s - (monotonic() - begin_s), 0.0)
+            retry = replace(self._retry, total_s=min(self._retry.total_s, left_s))
+            stored = self._stored(kind, Request("GET", path), retry)
+            spent_s = monotonic() - begin_s
+            if is_done(stored) or spent_s >= timeout_s:
+                return stored, spent_s
+            # The last poll is at the timeout.
+            sleep(min(pause_s, timeout_s - spent_s))
+            pause_s = min(1.5 * pause_s, _MAX_POLL_S)
 
     def _listed(self, kind: type[RowT], path: str, **params: object) -> Iterator[RowT]:
         """Yield what a listing has, page by page; the field of a page is called as the end of the path."""

@@ -343,7 +343,12 @@ class PinPage {
     );
     const copy = (): Promise<void> => saveCopies(this.album!.id, this.rows, this.files);
     const copies = button("Copies with their place, and a report", () => void this.guarded(copy));
-    show(place, ...kinds, button("Print", () => print()), copies);
+    show(
+      place,
+      ...kinds,
+      button("Print", () => print()),
+      copies,
+    );
   }
 
   /** Return the pins in a plan; without actions, for paper. */

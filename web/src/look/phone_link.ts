@@ -16,7 +16,11 @@ export class PhoneLink {
     this.code,
     h("p", {}, this.link),
     this.warning,
-    h("div", { class: "ask" }, button("Close", () => this.dialog.close())),
+    h(
+      "div",
+      { class: "ask" },
+      button("Close", () => this.dialog.close()),
+    ),
   );
 
   constructor() {
