@@ -382,16 +382,17 @@ def test_worker_that_never_gets_ready_is_killed(log: Path, gate: Path) -> None:
         assert pool.state.fault == "the worker did not start within 1 s"
 
 
-def test_kill_during_start_only_delays_a_job(log: Path) -> None:
-    with _pool(log, start_s=2.0) as pool:
-        answer = pool.submit(("echo", 1), _LONG_S)
-        wait_for(lambda: pool.state.warmed_up)
-        assert answer.result(_LONG_S) == 1
+def test_kill_during_start_only_delays_a_job(log: Path, gate: Path) -> None:
+    gate.touch()
+    slow = {"target": worker_jobs.run_after_gate, "arguments": (str(log), str(gate))}
+    with _pool(log, start_s=2.0, **slow) as pool:
+        assert pool.submit(("echo", 1), _LONG_S).result(_LONG_S) == 1
+        gate.unlink()
         _kill(_pids())
         answer = pool.submit(("echo", 2), _LONG_S)
-        for _ in range(2):
-            # Polled often, because an idle machine starts a worker within a tenth of a second.
-            while not (len(_pids()) == 1 and not pool.state.ready):
-                sleep(0.002)
+        for starts in (2, 3):
+            # The worker waits for the gate.
+            wait_for(lambda starts=starts: _count(log, "start") == starts)
             _kill(_pids())
+        gate.touch()
         assert answer.result(_LONG_S) == 2

@@ -334,21 +334,16 @@ class PinPage {
     const place = byId("exports");
     place.hidden = this.rows.length === 0;
     if (place.childElementCount > 0) return;
-    const save = async (name: string, media: (typeof FILES)[keyof typeof FILES]): Promise<void> => {
-      const plan = media === FILES.SVG && this.floors.venue !== null ? this.shown : null;
-      download(await api.albumFile(this.album!.id, media, plan ?? undefined), `pins.${name.toLowerCase()}`);
+    const save = async (name: string, kind: (typeof FILES)[keyof typeof FILES]): Promise<void> => {
+      const plan = kind === FILES.SVG && this.floors.venue !== null ? this.shown : null;
+      download(await api.albumFile(this.album!.id, kind, plan ?? undefined), `pins.${name.toLowerCase()}`);
     };
-    const kinds = Object.entries(FILES).map(([name, media]) =>
-      button(name, () => void this.guarded(() => save(name, media))),
-    );
+    const all = Object.entries(FILES);
+    const kinds = all.map(([name, kind]) => button(name, () => void this.guarded(() => save(name, kind))));
     const copy = (): Promise<void> => saveCopies(this.album!.id, this.rows, this.files);
-    const copies = button("Copies with their place, and a report", () => void this.guarded(copy));
-    show(
-      place,
-      ...kinds,
-      button("Print", () => print()),
-      copies,
-    );
+    kinds.push(button("Print", () => print()));
+    kinds.push(button("Copies with their place, and a report", () => void this.guarded(copy)));
+    show(place, ...kinds);
   }
 
   /** Return the pins in a plan; without actions, for paper. */
