@@ -74,7 +74,9 @@ def svg_around(name: str, bounds_m: Bounds, marker: Marker | None = None) -> tup
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * scale:.0f}" height="{height * scale:.0f}" '
         f'viewBox="{left:.3f} {top:.3f} {width:.3f} {height:.3f}" font-family="{FONT_FAMILY}" text-anchor="middle">\n'
         f"<title>{xml_text(name)}</title>\n"
-        f'<rect x="{left:.3f}" y="{top:.3f}" width="{width:.3f}" height="{height:.3f}" fill="{PAPER}"/>\n'
+        # Without soft edges, as the size in pixels is rounded.
+        f'<rect x="{left:.3f}" y="{top:.3f}" width="{width:.3f}" height="{height:.3f}" fill="{PAPER}" '
+        'shape-rendering="crispEdges"/>\n'
     )
     camera = "" if marker is None else f"\n{draw_camera(marker, max(_size_m(bounds_m)))}"
     return head, f"{_scale_bar(bounds_m)}{camera}\n</svg>\n"

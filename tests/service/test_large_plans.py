@@ -38,7 +38,7 @@ def no_parsing(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> NoReturn:
         raise AssertionError("parsed in the service")
 
-    monkeypatch.setattr(FloorPlan, "_read", refuse)
+    monkeypatch.setattr("lalaloc_core.floorplan.plan.read_plan", refuse)
     monkeypatch.setattr(json_values, "_check_size", refuse)
 
 
@@ -112,7 +112,7 @@ def test_stored_large_plan_is_parsed_by_a_worker(monkeypatch: pytest.MonkeyPatch
     converter = Converter(Settings(import_workers=1), Telemetry())
     try:
         with monkeypatch.context() as patched:
-            patched.setattr(FloorPlan, "_read", None)
+            patched.setattr("lalaloc_core.floorplan.plan.read_plan", None)
             found = converter.parse(stored)
             assert converter.parse(PlanDocument(stored.document, "0" * 64, stored.warnings)) is None
     finally:
