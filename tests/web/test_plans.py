@@ -430,7 +430,7 @@ def test_false_scale_of_a_picture_is_corrected_with_one_click(desktop: Visit, tm
     page.get_by_role("button", name="Read the picture").click()
     apply = page.get_by_role("button", name=re.compile(r"Apply × 0\.7\d\d to all lengths"))
     expect(apply).to_be_visible(timeout=120_000)
-    expect(page.locator("#plan-warnings")).to_contain_text("check the scale")
+    expect(page.locator("#plan-warnings")).to_contain_text("check both")
     apply.click()
     expect(page.locator("#plan-facts")).to_contain_text(re.compile(r"3 rooms, 5[012]\."), timeout=120_000)
 

@@ -119,7 +119,7 @@ export class ImportForm {
       !(isNeeded && levels.length > 0) && again,
       factor !== null &&
         button(`Apply × ${factor.toFixed(3)} to all lengths`, () => this.multiply(factor), {
-          id: "import-multiply",
+          id: "import-apply",
           class: "primary",
         }),
       button("Cancel", () => this.cancelled()),
