@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 
+import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
@@ -86,12 +87,15 @@ def storeys_beside(sketch: Sketch) -> list[BaseGeometry]:
     A storey's rooms are joined by their nearness or, if the sketch has them, by walls.
     """
     rooms = [room.shape for room in sketch.rooms]
+    if len(rooms) < 2:
+        return [shapely.union_all(rooms)]
     reach_m = 0.5 * (_APART_M if sketch.walls is None else _JOINED_M)
     drawn = [*rooms, *([] if sketch.walls is None else [sketch.walls])]
     parts = polygons_from_geometry(shapely.union_all(shapely.buffer(drawn, reach_m)))
-    areas = [sum(room.area for room in rooms if part.intersects(room)) for part in parts]
-    least_m2 = max(_SHARE * max(areas, default=0.0), _MIN_M2)
-    main = [part for part, area in zip(parts, areas, strict=True) if area >= least_m2]
+    # Walls can be thousands of parts without a room, such as letters.
+    room, part = shapely.STRtree(parts).query(rooms, predicate="intersects")
+    areas = np.bincount(part, shapely.area(rooms)[room], minlength=len(parts))
+    main = [parts[index] for index in np.flatnonzero(areas >= max(_SHARE * areas.max(initial=0.0), _MIN_M2))]
     if len(main) < 2:
         return [shapely.union_all(rooms)]
     storeys = map(shapely.union_all, _by_nearest(rooms, rooms, main))
