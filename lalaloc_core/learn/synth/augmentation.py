@@ -24,7 +24,7 @@ _ROLL_DEG, _MAX_ROLL_DEG = 2.0, 5.0
 # Normal spread (degrees) of the error that remains when a picture has been levelled.
 _LEVEL_ERROR_DEG = 0.7
 # Share of pictures that show the whole patch, as spheres do.
-_WHOLE_SHARE = 0.15
+_WHOLE_SHARE = 0.1
 
 
 def framed(
@@ -63,13 +63,14 @@ def seen_by(
 def _lenses(count: int, device: torch.device, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Draw the tangents of half the horizontal and half the vertical field of view."""
 
-    def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(count, generator=generator, device=device)
+    def drawn(low: float, high: float) -> Tensor:
+        # Alike by ratio, because the narrow ones are the hard ones.
+        return low * (high / low) ** torch.rand(count, generator=generator, device=device)
 
     aspects = torch.tensor(_ASPECTS, device=device)
     aspect = aspects[torch.randint(len(_ASPECTS), (count,), generator=generator, device=device)]
     portrait = torch.rand(count, generator=generator, device=device) < _PORTRAIT_SHARE
-    field = torch.where(portrait, uniform(*_PORTRAIT_FIELD_DEG), uniform(*_FIELD_DEG))
+    field = torch.where(portrait, drawn(*_PORTRAIT_FIELD_DEG), drawn(*_FIELD_DEG))
     across = torch.tan(torch.deg2rad(field) / 2.0)
     return across, torch.where(portrait, across * aspect, across / aspect)
 

@@ -65,9 +65,7 @@ def laplace_mixture(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[
     """Return the negative log likelihood of true log distances under mixtures of Laplace distributions, where known."""
     error = (walls.log_profile - target[..., None]).abs()
     loss = -torch.logsumexp(walls.log_share - error * torch.exp(-walls.log_scale) - walls.log_scale, dim=2)
-    if known is None:
-        return loss.mean()
-    return (loss * known).sum() / known.sum().clamp_min(1)
+    return loss.mean() if known is None else _mean_of_pictures(loss, known)
 
 
 def wall_shape(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[Tensor, "b w"]) -> Tensor:
@@ -75,7 +73,13 @@ def wall_shape(walls: WallModes, target: Float[Tensor, "b w"], known: Bool[Tenso
     mean = (walls.log_share.exp() * walls.log_profile).sum(dim=2)
     error = torch.where(known, mean - target, torch.nan)
     scale = error.detach().nanmedian(dim=1, keepdim=True).values
-    return torch.where(known, (error - scale).abs(), 0.0).sum() / known.sum().clamp_min(1)
+    return _mean_of_pictures(torch.where(known, (error - scale).abs(), 0.0), known)
+
+
+def _mean_of_pictures(loss: Float[Tensor, "b w"], known: Bool[Tensor, "b w"]) -> Tensor:
+    """Return the mean over pictures of their means where known: narrow views count as much as wide ones."""
+    columns = known.sum(dim=1)
+    return ((loss * known).sum(dim=1) / columns.clamp_min(1)).sum() / (columns > 0).sum().clamp_min(1)
 
 
 def visible_walls(
