@@ -198,6 +198,13 @@ class TestCalibration:
         assert score([prediction(0.2)]).calibration_error is None
 
 
+def run_of(folder: Path, *predictions: Prediction) -> RunFolder:
+    run = RunFolder(folder)
+    run.write_info(INFO)
+    run.append(predictions)
+    return run
+
+
 class TestRunFolder:
     def test_predictions_round_trip(self, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path / "run")
@@ -211,18 +218,14 @@ class TestRunFolder:
         assert folder.read_predictions() == predictions
 
     def test_incomplete_last_line_is_ignored(self, tmp_path: Path) -> None:
-        folder = RunFolder(tmp_path)
-        folder.write_info(INFO)
-        folder.append([prediction(0.1), prediction(0.2)])
+        folder = run_of(tmp_path, prediction(0.1), prediction(0.2))
         path = tmp_path / PREDICTIONS_FILE
         path.write_text(path.read_text()[:-30])
         assert folder.read_predictions() == [prediction(0.1)]
 
     @pytest.mark.parametrize("text", ["not json\n", '{"scene": 3}\n', '{"scene": "a", "unknown": 1}\n', "[]\n"])
     def test_invalid_line_is_named(self, tmp_path: Path, text: str) -> None:
-        folder = RunFolder(tmp_path)
-        folder.write_info(INFO)
-        folder.append([prediction(0.1)])
+        folder = run_of(tmp_path, prediction(0.1))
         with (tmp_path / PREDICTIONS_FILE).open("a") as file:
             file.write(text)
         with pytest.raises(RunError, match="line 2 is not a prediction"):
@@ -236,9 +239,7 @@ class TestRunFolder:
             RunFolder(tmp_path).read_info()
 
     def test_scores_file_has_null_for_infinity(self, tmp_path: Path) -> None:
-        folder = RunFolder(tmp_path)
-        folder.write_info(INFO)
-        folder.append([prediction(), prediction(), prediction(0.1)])
+        folder = run_of(tmp_path, prediction(), prediction(), prediction(0.1))
         report = score_run(folder)
         assert report == json.loads((tmp_path / SCORES_FILE).read_text())
         assert report["final"]["median_cm"]["value"] is None

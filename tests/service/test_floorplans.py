@@ -15,28 +15,18 @@ import trimesh
 
 from lalaloc_core.floorplan import FloorPlan
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.strategies import rectangle
 
 
-def _room(polygon: Any, **more: Any) -> dict[str, Any]:
-    return {"ceiling_height_m": 2.5, "rooms": [{"name": "bath", "polygon": polygon, **more}]}
+def _room(polygon: Any) -> dict[str, Any]:
+    return {"ceiling_height_m": 2.5, "rooms": [{"name": "bath", "polygon": polygon}]}
 
 
-SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4]]
-
+# The core's tests have all faults; these are also ones of what is sent, and of the limits that a service sets.
 BAD_PLANS = {
-    "crosses itself": (_room([[0, 0], [4, 4], [4, 0], [0, 4]]), "crosses itself"),
-    "two vertices": (_room([[0, 0], [4, 0]]), "at least three"),
-    "no area": (_room([[0, 0], [1, 0], [2, 0]]), ""),
-    "a word for a number": (_room([[0, 0], [4, "x"], [4, 4]]), "vertex 1"),
-    "three coordinates": (_room([[0, 0, 0], [4, 0, 0], [4, 4, 0]]), "vertex 0"),
     "an integer beyond floats": (_room([[0, 0], [4, 0], [4, 10**400]]), "401 digits; the limit is 300"),
-    "a ceiling beyond floats": (_room(SQUARE, ceiling_height_m=10**400), "401 digits; the limit is 300"),
-    "no rooms": ({"name": "x", "rooms": []}, "at least one room"),
     "a list": ([1, 2], "must be an object"),
-    "an unknown key": ({**FLAT, "scale": 2}, "'scale'"),
-    "camera above the ceiling": ({**FLAT, "camera_height_m": 2.45}, "2.4"),
     "a lone surrogate": ({**FLAT, "name": "\ud800"}, "surrogates"),
-    "a control character": (_room(SQUARE, name="a\0b"), "control characters"),
     "too wide": (_room([[0, 0], [1600, 0], [1600, 1]]), "the limit is 1000 m (max_extent_m); check that the coord"),
 }
 
@@ -184,7 +174,7 @@ def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_p
 
 
 def test_assumed_ceiling_is_not_stored(client: httpx.Client) -> None:
-    plan = client.post("/floorplans", json={"name": "No ceiling", "rooms": [{"name": "den", "polygon": SQUARE}]}).json()
+    plan = client.post("/floorplans", json={"rooms": [{"name": "den", "polygon": rectangle(4.0, 4.0)}]}).json()
     assert plan["warnings"] == ["no ceiling height is given; 2.5 m is assumed (set ceiling_height_m)"]
     assert "ceiling_height_m" not in plan["plan"]["rooms"][0]
     assert plan["plan"].get("ceiling_height_m") is None

@@ -13,7 +13,6 @@ import pyproj
 import pytest
 
 from lalaloc_client import Client
-from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, ImportOptions, import_plan
 from tests.importers.conftest import FLAT as PLAN
@@ -22,6 +21,7 @@ from tests.service.conftest import FLAT, assert_problem, document_of, localise, 
 from tests.strategies import present
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
+ORIGIN = Anchor(**ANCHOR, north_deg=25.0)
 # Required by GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11).
 YPR = {"position": ("lat", "lon", "h"), "angles": ("yaw", "pitch", "roll")}
 
@@ -50,7 +50,27 @@ QUATERNION = {
     "required": ["position", "quaternion"],
     "additionalProperties": False,
 }
-AS_GEOPOSE = {"Accept": "application/geopose+json"}
+GEOJSON, GEOPOSE, JSON = "application/geo+json", "application/geopose+json", "application/json"
+
+
+@pytest.fixture(scope="module")
+def placed(client: httpx.Client) -> str:
+    """Return the id of `FLAT` at `ANCHOR`."""
+    return upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+
+
+def ask(client: httpx.Client, sphere: bytes, media: str = JSON, *, key: str = "", **fields: str) -> httpx.Response:
+    """Send a query, with `motion` that of two photographs, for an answer of a media type."""
+    path, count = ("/localise/sequence", 2) if "motion" in fields else ("/localise", 1)
+    headers = {"Accept": media} | ({"Idempotency-Key": key} if key else {})
+    files = [("photo", sphere)] * count
+    return client.post(path, data={"refine": "none"} | fields, files=files, headers=headers)
+
+
+def point_at(geopose: dict[str, Any]) -> dict[str, Any]:
+    """Return the geometry of GeoJSON of a geographic pose."""
+    place = geopose["position"]
+    return {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
 
 
 def assert_quaternion(document: dict[str, Any], geopose: dict[str, Any]) -> None:
@@ -77,27 +97,15 @@ def assert_at(geopose: dict[str, Any], pose: dict[str, Any], anchor: Anchor) -> 
     assert (turned + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.01)
 
 
-def anchored(**anchor: Any) -> FloorPlan:
-    return FloorPlan.from_dict(FLAT | {"anchor": anchor})
-
-
-def test_two_control_points_make_an_anchor() -> None:
-    known = Anchor(**ANCHOR, north_deg=25.0)
+def test_control_points_are_in_the_units_of_the_plan() -> None:
     places = [(1.0, 2.0), (9.0, 5.5)]
     points = [
-        {"x": x, "y": y, "latitude": float(lat), "longitude": float(lon)}
-        for (x, y), (lon, lat) in zip(places, known.to_earth(np.array(places)), strict=True)
+        {"x": x / 0.3048, "y": y / 0.3048, "latitude": float(lat), "longitude": float(lon)}
+        for (x, y), (lon, lat) in zip(places, ORIGIN.to_earth(np.array(places)), strict=True)
     ]
-    found = present(anchored(control_points=points, altitude_m=519.5).anchor)
-    assert (found.latitude, found.longitude) == pytest.approx((known.latitude, known.longitude), abs=1e-9)
-    assert found.north_deg == pytest.approx(25.0, abs=1e-4)
-    in_feet = FLAT | {"units": "ft", "anchor": {"control_points": [p | {"x": p["x"] / 0.3048, "y": p["y"] / 0.3048}
-                                                                   for p in points]}}  # fmt: skip
+    in_feet = FLAT | {"units": "ft", "anchor": {"control_points": points}}
     converted = present(import_plan(json.dumps(in_feet).encode(), ImportOptions()).anchor)
-    assert converted.latitude == pytest.approx(known.latitude, abs=1e-9)
-    stretched = [points[0], points[1] | {"x": 20.0}]
-    with pytest.raises(InvalidFloorPlanError, match="check the scale"):
-        anchored(control_points=stretched)
+    assert converted.latitude == pytest.approx(ORIGIN.latitude, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -119,13 +127,12 @@ def test_invalid_anchor_is_refused(client: httpx.Client, anchor: Any, words: str
     assert words in assert_problem(response, 422, "invalid-floorplan")["detail"]
 
 
-def test_earth_hint_equals_plan_hint(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[2.0, 1.0]]))
+def test_earth_hint_equals_plan_hint(client: httpx.Client, placed: str, sphere: bytes) -> None:
+    ((lon, lat),) = ORIGIN.to_earth(np.array([[2.0, 1.0]]))
     on_earth = json.dumps({"latitude": lat, "longitude": lon})
     fields = {"radius_m": 1.0, "strict": "true", "refine": "none"}
-    found = localise(client, plan_id, sphere, near=on_earth, **fields).json()
-    in_plan = localise(client, plan_id, sphere, near='{"x_m": 2, "y_m": 1}', **fields).json()
+    found = localise(client, placed, sphere, near=on_earth, **fields).json()
+    in_plan = localise(client, placed, sphere, near='{"x_m": 2, "y_m": 1}', **fields).json()
     assert [pose["position"] for pose in found["candidates"]] == [pose["position"] for pose in in_plan["candidates"]]
     assert all(math.dist(pose["position"].values(), (2.0, 1.0)) <= 1.0 + 1e-3 for pose in found["candidates"])
 
@@ -141,15 +148,14 @@ def test_earth_hint_equals_plan_hint(client: httpx.Client, sphere: bytes) -> Non
     ],
 )
 def test_invalid_earth_hint_is_refused(
-    client: httpx.Client, sphere: bytes, near: dict[str, float], slug: str, words: str
+    client: httpx.Client, placed: str, sphere: bytes, near: dict[str, float], slug: str, words: str
 ) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    problem = assert_problem(localise(client, plan_id, sphere, near=json.dumps(near), radius_m=5), 422, slug)
+    problem = assert_problem(localise(client, placed, sphere, near=json.dumps(near), radius_m=5), 422, slug)
     assert words in problem["detail"]
 
 
-def test_earth_hint_needs_an_anchor(client: httpx.Client, sphere: bytes) -> None:
-    response = localise(client, upload(client), sphere, near='{"latitude": 48, "longitude": 11}', radius_m=5)
+def test_earth_hint_needs_an_anchor(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    response = localise(client, flat, sphere, near='{"latitude": 48, "longitude": 11}', radius_m=5)
     assert "the plan has no anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
 
 
@@ -161,96 +167,85 @@ def test_plan_keeps_its_anchor_and_north(client: httpx.Client) -> None:
     assert FloorPlan.from_dict(plan).to_dict() == plan
 
 
-def test_answers_have_a_geopose(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    answer = localise(client, plan_id, sphere, heading_deg=115, refine="none").json()
+def test_answers_have_a_geopose(client: httpx.Client, placed: str, sphere: bytes) -> None:
+    answer = ask(client, sphere, floorplan_id=placed, heading_deg="115").json()
     geopose = answer["geopose"]
-    check_schema(geopose)
-    ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[*answer["position"].values()]]))
-    assert (geopose["position"]["lon"], geopose["position"]["lat"]) == pytest.approx((lon, lat), abs=1e-8)
-    assert geopose["position"]["h"] == pytest.approx(ANCHOR["altitude_m"] + answer["camera_height_m"], abs=1e-3)
     # 115° in the plan is due east.
     assert answer["heading_deg"] == 115.0
     assert geopose["angles"] == pytest.approx({"yaw": -90.0, "pitch": 0.0, "roll": 0.0}, abs=1e-3)
-    fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
-    file = {"photo": ("p.jpg", sphere, "image/jpeg")}
-    response = client.post("/localise", data=fields, files=file, headers={"Accept": "application/geo+json"})
-    assert response.headers["content-type"] == "application/geo+json"
+    assert geopose["position"]["h"] == pytest.approx(ANCHOR["altitude_m"] + answer["camera_height_m"], abs=1e-3)
+    response = ask(client, sphere, GEOJSON, floorplan_id=placed, heading_deg="115")
+    assert response.headers["content-type"] == GEOJSON
     feature = response.json()
-    assert feature["type"] == "Feature"
-    place = geopose["position"]
-    assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
+    assert (feature["type"], feature["geometry"]) == ("Feature", point_at(geopose))
     assert feature["properties"]["room"] == answer["room"]
-
-
-def test_answer_as_a_geopose(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
-    geopose = client.post("/localise", data=fields, files={"photo": sphere}).json()["geopose"]
-    response = client.post("/localise", data=fields, files={"photo": sphere}, headers=AS_GEOPOSE)
-    assert response.headers["content-type"] == "application/geopose+json"
+    response = ask(client, sphere, GEOPOSE, floorplan_id=placed, heading_deg="115")
+    assert response.headers["content-type"] == GEOPOSE
     assert response.headers["vary"] == "Accept"
     assert_quaternion(response.json(), geopose)
     # East is a quarter turn clockwise.
     expected = {"x": 0.0, "y": 0.0, "z": -(0.5**0.5), "w": 0.5**0.5}
     assert response.json()["quaternion"] == pytest.approx(expected, abs=1e-5)
-    keyed = client.post(
-        "/localise", data=fields, files={"photo": sphere}, headers=AS_GEOPOSE | {"Idempotency-Key": "k"}
-    )
-    assert_problem(keyed, 422, "invalid-request")
-    refused = client.post(
-        "/localise", data=fields | {"floorplan_id": upload(client)}, files={"photo": sphere}, headers=AS_GEOPOSE
-    )
-    assert "has no anchor" in assert_problem(refused, 409, "floorplan-unanchored")["detail"]
 
 
-def test_sequence_as_geoposes(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("photo", sphere)] * 2
-    poses = client.post("/localise/sequence", data=fields, files=files).json()["poses"]
-    response = client.post("/localise/sequence", data=fields, files=files, headers=AS_GEOPOSE)
-    assert response.headers["content-type"] == "application/geopose+json"
-    for document, pose in zip(response.json(), poses, strict=True):
+def test_sequences_have_geoposes(client: httpx.Client, placed: str, sphere: bytes) -> None:
+    turn = {"floorplan_id": placed, "motion": "turn"}
+    answer = ask(client, sphere, **turn).json()
+    response = ask(client, sphere, GEOPOSE, **turn)
+    assert response.headers["content-type"] == GEOPOSE
+    for document, pose in zip(response.json(), answer["poses"], strict=True):
         assert_quaternion(document, pose["geopose"])
-    refused = client.post(
-        "/localise/sequence", data=fields | {"floorplan_id": upload(client)}, files=files, headers=AS_GEOPOSE
-    )
-    assert_problem(refused, 409, "floorplan-unanchored")
+    response = ask(client, sphere, GEOJSON, **turn)
+    assert response.headers["content-type"] == GEOJSON
+    collection = response.json()
+    assert collection["type"] == "FeatureCollection"
+    assert (collection["floorplan_id"], collection["confidence"]) == (placed, answer["confidence"])
+    assert not collection.keys() & {"poses", "geometry", "properties", "coordinates"}
+    for pose, feature in zip(answer["poses"], collection["features"], strict=True):
+        assert_at(pose["geopose"], pose, ORIGIN)
+        assert (feature["geometry"], feature["properties"]) == (point_at(pose["geopose"]), pose)
 
 
-def test_session_as_geoposes(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    path = f"/sessions/{client.post('/sessions', json={'floorplan_id': plan_id}).json()['id']}"
-    response = client.post(f"{path}/photographs", files={"photo": sphere}, headers=AS_GEOPOSE)
-    assert response.headers["content-type"] == "application/geopose+json"
+@pytest.mark.parametrize("more", [{}, {"motion": "turn"}], ids=["photograph", "sequence"])
+@pytest.mark.parametrize("media", [GEOPOSE, GEOJSON])
+def test_places_on_earth_need_an_anchor_and_no_key(
+    client: httpx.Client, placed: str, flat: str, sphere: bytes, media: str, more: dict[str, str]
+) -> None:
+    refused = ask(client, sphere, media, floorplan_id=flat, **more)
+    assert "has no anchor" in assert_problem(refused, 409, "floorplan-unanchored")["detail"]
+    keyed = ask(client, sphere, media, key="k", floorplan_id=placed, **more)
+    assert_problem(keyed, 422, "invalid-request")
+
+
+def test_session_as_geoposes(client: httpx.Client, placed: str, flat: str, sphere: bytes) -> None:
+    made = [client.post("/sessions", json={"floorplan_id": plan_id}).json() for plan_id in (placed, flat)]
+    path, unanchored = (f"/sessions/{session['id']}" for session in made)
+    response = client.post(f"{path}/photographs", files={"photo": sphere}, headers={"Accept": GEOPOSE})
+    assert response.headers["content-type"] == GEOPOSE
     assert_quaternion(response.json(), client.get(path).json()["pose"]["geopose"])
-    unanchored = f"/sessions/{client.post('/sessions', json={'floorplan_id': upload(client)}).json()['id']}"
-    refused = client.post(f"{unanchored}/photographs", files={"photo": sphere}, headers=AS_GEOPOSE)
+    refused = client.post(f"{unanchored}/photographs", files={"photo": sphere}, headers={"Accept": GEOPOSE})
     assert_problem(refused, 409, "floorplan-unanchored")
     # The refused photograph has not moved the camera.
     assert client.get(unanchored).json()["photographs"] == 0
 
 
-def test_every_candidate_has_a_geopose(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    answer = localise(client, plan_id, sphere, refine="none", top_k=5).json()
+def test_every_candidate_has_a_geopose(client: httpx.Client, placed: str, sphere: bytes) -> None:
+    answer = localise(client, placed, sphere, refine="none", top_k=5).json()
     assert len(answer["candidates"]) > 1
     assert answer["candidates"][0]["geopose"] == answer["geopose"]
     for candidate in answer["candidates"]:
         check_schema(candidate["geopose"])
-        assert_at(candidate["geopose"], candidate, Anchor(**ANCHOR, north_deg=25.0))
+        assert_at(candidate["geopose"], candidate, ORIGIN)
 
 
-def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, sphere: bytes) -> None:
+def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, placed: str, flat: str, sphere: bytes) -> None:
     venue_anchor = {"latitude": -33.86, "longitude": 151.21, "altitude_m": 3.0, "north_deg": 90.0}
-    ids = [upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25}), upload(client)]
     far = FLAT | {"rooms": [{"name": "far", "polygon": [[x + 2e4, y] for x, y in FLAT["rooms"][0]["polygon"]]}]}
-    ids.append(upload(client, far))
-    anchors = {ids[0]: Anchor(**ANCHOR, north_deg=25.0), ids[1]: Anchor(**venue_anchor)}
+    ids = [placed, flat, upload(client, far)]
+    anchors = {placed: ORIGIN, flat: Anchor(**venue_anchor)}
     plans = [{"floorplan_id": plan_id} for plan_id in ids]
     venue_id = client.post("/venues", json={"plans": plans, "anchor": venue_anchor}).json()["id"]
-    fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"photo": sphere}
-    found = document_of(client.post("/localise", data=fields, files=file))["candidates"]
+    found = document_of(ask(client, sphere, venue_id=venue_id, top_k="10"))["candidates"]
     assert {candidate["floorplan_id"] for candidate in found} == set(ids)
     for candidate in found:
         if candidate["floorplan_id"] == ids[2]:
@@ -259,52 +254,21 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, sphere: bytes) 
         else:
             assert_at(candidate["geopose"], candidate, anchors[candidate["floorplan_id"]])
     client.delete(f"/floorplans/{ids[2]}")
-    feature = client.post("/localise", data=fields, files=file, headers={"Accept": "application/geo+json"}).json()
-    place = feature["properties"]["geopose"]["position"]
-    assert feature["geometry"]["coordinates"] == [place["lon"], place["lat"], place["h"]]
+    feature = ask(client, sphere, GEOJSON, venue_id=venue_id, top_k="10").json()
+    assert feature["geometry"] == point_at(feature["properties"]["geopose"])
 
 
-def test_unanchored_venue_has_no_geopose(client: httpx.Client, sphere: bytes) -> None:
-    venue_id = client.post("/venues", json={"plans": [{"floorplan_id": upload(client)}]}).json()["id"]
-    headers, fields = {"Accept": "application/geo+json"}, {"venue_id": venue_id, "refine": "none"}
-    response = client.post("/localise", data=fields, files={"photo": sphere}, headers=headers)
+def test_unanchored_venue_has_no_geopose(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    venue_id = client.post("/venues", json={"plans": [{"floorplan_id": flat}]}).json()["id"]
+    response = ask(client, sphere, GEOJSON, venue_id=venue_id)
     assert "nor has venue" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
-    picture = client.post("/localise", data=fields, files={"photo": sphere}, headers={"Accept": "image/png"})
+    picture = ask(client, sphere, "image/png", venue_id=venue_id)
     assert "a picture shows one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
 
 
-def test_sequence_is_a_feature_collection(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
-    fields, files = {"floorplan_id": plan_id, "refine": "none", "motion": "turn"}, [("photo", sphere)] * 2
-    answer = client.post("/localise/sequence", data=fields, files=files).json()
-    headers = {"Accept": "application/geo+json"}
-    response = client.post("/localise/sequence", data=fields, files=files, headers=headers)
-    assert response.headers["content-type"] == "application/geo+json"
-    collection = response.json()
-    assert collection["type"] == "FeatureCollection"
-    assert (collection["floorplan_id"], collection["confidence"]) == (plan_id, answer["confidence"])
-    assert not collection.keys() & {"poses", "geometry", "properties", "coordinates"}
-    for pose, feature in zip(answer["poses"], collection["features"], strict=True):
-        assert_at(pose["geopose"], pose, Anchor(**ANCHOR, north_deg=25.0))
-        place = pose["geopose"]["position"]
-        assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
-        assert feature["properties"] == pose
-    unanchored = fields | {"floorplan_id": upload(client)}
-    refused = client.post("/localise/sequence", data=unanchored, files=files, headers=headers)
-    assert_problem(refused, 409, "floorplan-unanchored")
-    keyed = client.post("/localise/sequence", data=fields, files=files, headers=headers | {"Idempotency-Key": "k"})
-    assert_problem(keyed, 422, "invalid-request")
-
-
-def test_unanchored_plan_has_no_geopose(client: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(client)
-    assert localise(client, plan_id, sphere, refine="none").json()["geopose"] is None
-    file = {"photo": ("p.jpg", sphere, "image/jpeg")}
-    response = client.post(
-        "/localise", data={"floorplan_id": plan_id}, files=file, headers={"Accept": "application/geo+json"}
-    )
-    assert "has no anchor" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
-    assert_problem(client.get(f"/floorplans/{plan_id}/export", params={"format": "imdf"}), 409, "floorplan-unanchored")
+def test_unanchored_plan_has_no_geopose(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    assert localise(client, flat, sphere, refine="none").json()["geopose"] is None
+    assert_problem(client.get(f"/floorplans/{flat}/export", params={"format": "imdf"}), 409, "floorplan-unanchored")
 
 
 @pytest.mark.parametrize(

@@ -48,15 +48,11 @@ from service.storage.store import PlanLookup, Store
 from service.telemetry import Telemetry
 from tests.service.conftest import FLAT, OpenStore, StartApp, constants, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
+from tests.strategies import plan_of, rectangle
 
 PLAN = FloorPlan.from_dict(FLAT)
-# About 1700 poses in seven chunks.
-HALL = FloorPlan.from_dict(
-    {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [20, 0], [20, 20], [0, 20]]}]}
-)
-LARGE_HALL = FloorPlan.from_dict(
-    {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [30, 0], [30, 30], [0, 30]]}]}
-)
+# The smaller one has about 1700 poses in seven chunks.
+HALL, LARGE_HALL = plan_of(rectangle(20.0, 20.0), ceiling_m=3.0), plan_of(rectangle(30.0, 30.0), ceiling_m=3.0)
 
 
 class CountingEncoders(PhotographEncoder):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from time import monotonic
 
@@ -137,7 +138,7 @@ def test_unexpected_error_reveals_only_the_request_id() -> None:
 
     # The app is never started, so every route fails as after a programming error.
     app.dependency_overrides[get_runtime] = broken
-    app.router.lifespan_context = _no_lifespan
+    app.router.lifespan_context = lambda _app: nullcontext()
     with serve(app) as base_url:
         response = httpx.get(f"{base_url}/floorplans", headers={"x-request-id": "r-1"})
     assert response.status_code == 500
@@ -153,14 +154,6 @@ def test_uvicorn_itself_bounds_connections(client: httpx.Client) -> None:
     response = client.get("/healthz", headers={"x-large": "x" * MAX_HEAD_BYTES})
     assert response.status_code == 431
     assert str(MAX_HEAD_BYTES) in response.text
-
-
-class _no_lifespan:
-    def __init__(self, _app: object) -> None: ...
-
-    async def __aenter__(self) -> None: ...
-
-    async def __aexit__(self, *_error: object) -> None: ...
 
 
 @pytest.mark.parametrize(("given", "kept"), [("abc-123", True), ("a b", False), ("x" * 65, False)])

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
-import os
 import shutil
-import signal
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +25,7 @@ from service.query.lpo_pool import LpoPool
 from service.settings import CONSTANTS, Settings
 from service.telemetry import Telemetry
 from service.workers.lpo import warm_up_job
-from tests.service.conftest import constants, end_time_limits, wait_for
+from tests.service.conftest import constants, wait_for
 
 # Time limit of jobs that must not end by it, also on a busy machine.
 _LONG_S = 120.0
@@ -53,16 +50,9 @@ def bundle(tiny_bundle: Path) -> Bundle:
 
 @pytest.fixture(scope="module")
 def pool(bundle: Bundle) -> Iterator[LpoPool]:
-    """Two workers; every test leaves both of them warm, or waits until they are."""
-    with _pool(bundle, workers=2, lpo_queue=6, lpo_stall_s=600.0) as started:
+    with _pool(bundle, workers=1, lpo_stall_s=600.0) as started:
+        wait_for(lambda: started.state.ready == 1, 120.0)
         yield started
-
-
-@pytest.fixture(autouse=True)
-def _all_warm(request: pytest.FixtureRequest) -> None:
-    if "pool" in request.fixturenames:
-        pool = request.getfixturevalue("pool")
-        wait_for(lambda: pool.state.ready == len(_workers()) == 2, 120.0)
 
 
 @pytest.fixture
@@ -130,21 +120,6 @@ def test_failing_job_leaves_the_worker_alive(pool: LpoPool, job: RefinementJob) 
 def test_no_time_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
     assert _refine(pool, job, 0.0) is None
     assert _refine(pool, job, -1.0) is None
-
-
-def test_stalled_worker_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
-    stopped = set(_workers())
-    for pid in stopped:
-        os.kill(pid, signal.SIGSTOP)
-    with ThreadPoolExecutor(1) as threads:
-        refined = threads.submit(_refine, pool, job, _LONG_S)
-        wait_for(lambda: end_time_limits() > 0)
-        assert refined.result() is None
-    # The worker with the job is killed; the other one is idle.
-    wait_for(lambda: len(stopped & set(_workers())) == 1)
-    for pid in stopped & set(_workers()):
-        os.kill(pid, signal.SIGCONT)
-    assert _refine(pool, job, _LONG_S) is not None
 
 
 def test_cold_pool_returns_none_and_closes(bundle: Bundle, job: RefinementJob, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from service.plan_files.plan_mesh import plan_glb
 from tests.service.conftest import FLAT
+from tests.strategies import plan_of, rectangle
 
 SVG = "{http://www.w3.org/2000/svg}"
 _L_SHAPE = [[0, 0], [4, 0], [4, 1], [1, 1], [1, 5], [0, 5]]
@@ -54,16 +55,13 @@ def test_valid_name_gives_well_formed_svg(name: str) -> None:
 
 @pytest.mark.parametrize("size_m", [(400.0, 3.0), (3.0, 400.0), (400.0, 300.0), (3.0, 2.0)])
 def test_scale_bar_lies_within_the_drawing(size_m: tuple[float, float]) -> None:
-    (width, height) = size_m
-    corners = [[0, 0], [width, 0], [width, height], [0, height]]
-    document = {"ceiling_height_m": 2.5, "rooms": [{"name": "hall", "polygon": corners}]}
-    root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(document)))
+    root = ElementTree.fromstring(plan_svg(plan_of(rectangle(*size_m))))
     left, top, seen_width, seen_height = (float(value) for value in root.attrib["viewBox"].split())
     (scale,) = [group for group in root.iter(f"{SVG}g") if group.get("class") == "scale"]
     label = next(scale.iter(f"{SVG}text"))
     size = float(label.attrib["font-size"])
     # Letters reach a quarter of their size below the line and are no wider than high.
-    assert top + height < float(label.attrib["y"]) < top + seen_height - size / 4.0
+    assert top + size_m[1] < float(label.attrib["y"]) < top + seen_height - size / 4.0
     assert left <= float(label.attrib["x"]) < left + seen_width - size * len(str(label.text))
     assert size >= 0.01 * min(seen_width, seen_height)
 
@@ -80,12 +78,14 @@ def test_camera_outside_the_plan_is_visible(x_m: float, y_m: float) -> None:
     assert top < -y_max < -y_min < top + height
 
 
+def mesh_of(plan: FloorPlan) -> trimesh.Scene:
+    return trimesh.load_scene(io.BytesIO(plan_glb(plan)), file_type="glb")
+
+
 @pytest.mark.parametrize("document", [FLAT, L_ROOM], ids=["flat", "concave"])
 def test_mesh_encloses_the_volume_of_the_plan(document: dict) -> None:
     plan = FloorPlan.from_dict(document)
-    scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
-    assert isinstance(scene, trimesh.Scene)
-    merged = scene.to_mesh()
+    merged = mesh_of(plan).to_mesh()
     expected = sum(room.area_m2 * room.ceiling_height_m for room in plan.rooms)
     # Faces point inwards, so the signed volume is negative.
     assert math.isclose(-merged.volume, expected, rel_tol=1e-5)
@@ -95,10 +95,7 @@ def test_mesh_encloses_the_volume_of_the_plan(document: dict) -> None:
 
 
 def test_mesh_surfaces_are_separate_and_named() -> None:
-    plan = FloorPlan.from_dict(FLAT)
-    scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
-    assert isinstance(scene, trimesh.Scene)
-    areas = {name: mesh.area for name, mesh in scene.geometry.items()}
+    areas = {name: mesh.area for name, mesh in mesh_of(FloorPlan.from_dict(FLAT)).geometry.items()}
     assert math.isclose(areas["1/kitchen/floor"], 12.0, rel_tol=1e-5)
     assert math.isclose(areas["1/kitchen/ceiling"], 12.0, rel_tol=1e-5)
     assert math.isclose(areas["1/kitchen/wall"], 14.0 * 2.4, rel_tol=1e-5)
@@ -146,11 +143,10 @@ def test_openings_holes_and_inner_walls_are_drawn() -> None:
 
 
 def test_mesh_has_holes_inner_walls_and_opening_panels() -> None:
-    plan = FloorPlan.from_dict(OPEN_FLAT)
-    scene = trimesh.load_scene(io.BytesIO(plan_glb(plan)), file_type="glb")
-    assert scene.geometry["1/room 1/floor"].area == pytest.approx(11.5, abs=1e-4)
+    surfaces = mesh_of(FloorPlan.from_dict(OPEN_FLAT)).geometry
+    assert surfaces["1/room 1/floor"].area == pytest.approx(11.5, abs=1e-4)
     # Outline 14 m, hole 2 + √2 m, both sides of the inner wall 2 m; 2.5 m high.
-    assert scene.geometry["1/room 1/wall"].area == pytest.approx(2.5 * (16.0 + 2.0 + math.sqrt(2.0)), abs=1e-3)
-    assert scene.geometry["1/room 1/window"].area == pytest.approx(1.0, abs=1e-4)
-    assert scene.geometry["2/room 2/door"].area == pytest.approx(0.9 * 2.05, abs=1e-4)
-    assert "2/room 2/window" not in scene.geometry
+    assert surfaces["1/room 1/wall"].area == pytest.approx(2.5 * (16.0 + 2.0 + math.sqrt(2.0)), abs=1e-3)
+    assert surfaces["1/room 1/window"].area == pytest.approx(1.0, abs=1e-4)
+    assert surfaces["2/room 2/door"].area == pytest.approx(0.9 * 2.05, abs=1e-4)
+    assert "2/room 2/window" not in surfaces

@@ -19,7 +19,7 @@ from tests.core.taken import EXAMPLES
 from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, upload, wait_for
 from tests.service.test_localise import HALL
 
-# Pose of each example in the plan above.
+KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
 POSES = {pose["file"]: pose for pose in json.loads((EXAMPLES / "poses.json").read_text())}
 STUDIO = {"ceiling_height_m": 2.6, "rooms": [{"name": "studio", "polygon": [[0, 0], [9, 0], [9, 2.2], [0, 2.2]]}]}
 
@@ -76,10 +76,9 @@ def test_right_plan_is_found_among_several(
 
 
 def test_venue_of_one_plan_equals_the_plan(shipped: httpx.Client, home: str) -> None:
-    picture = (EXAMPLES / "kitchen.jpg").read_bytes()
-    files = {"photo": ("p.jpg", picture, "image/jpeg")}
+    files = {"photo": ("p.jpg", KITCHEN, "image/jpeg")}
     alone = shipped.post("/localise", data={"floorplan_id": home, "heading_deg": "250"}, files=files).json()
-    found = ask(shipped, venue_of(shipped, home), picture, heading_deg=250).json()
+    found = ask(shipped, venue_of(shipped, home), KITCHEN, heading_deg=250).json()
     # Refinement can begin at another grid pose near the place.
     assert found["position"] == pytest.approx(alone["position"], abs=0.06)
     assert found["confidence"] == pytest.approx(alone["confidence"], abs=1e-3)
@@ -93,8 +92,7 @@ def test_turn_is_found_in_a_venue(
 ) -> None:
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", most)
     venue_id = venue_of(shipped, *others, home)
-    content = (EXAMPLES / "kitchen.jpg").read_bytes()
-    files = [("photo", (name, content, "image/jpeg")) for name in ("a.jpg", "b.jpg")]
+    files = [("photo", (name, KITCHEN, "image/jpeg")) for name in ("a.jpg", "b.jpg")]
     found = document_of(shipped.post("/localise/sequence", data={"venue_id": venue_id, "motion": "turn"}, files=files))
     assert (found["venue_id"], found["floorplan_id"], found["stage"]) == (venue_id, home, "lpo")
     for pose in found["poses"]:
@@ -107,8 +105,7 @@ def test_turn_is_found_in_a_venue(
 
 def test_equal_flats_share_the_probability(shipped: httpx.Client, home: str, others: list[str]) -> None:
     twin = upload(shipped, HOME)
-    picture = (EXAMPLES / "kitchen.jpg").read_bytes()
-    answer = ask(shipped, venue_of(shipped, home, others[0], twin), picture, heading_deg=250, top_k=10).json()
+    answer = ask(shipped, venue_of(shipped, home, others[0], twin), KITCHEN, heading_deg=250, top_k=10).json()
     assert 0.3 < answer["confidence"] <= 0.55
     [first, second] = [plan for plan in answer["plans"] if plan["floorplan_id"] in (home, twin)]
     assert first["probability"] == pytest.approx(second["probability"], abs=0.05)
@@ -124,12 +121,11 @@ def test_most_probable_plans_are_searched(
 ) -> None:
     copies = [upload(shipped, HOME) for _ in range(3)]
     venue_id = venue_of(shipped, *others, home, *copies)
-    picture = (EXAMPLES / "kitchen.jpg").read_bytes()
-    whole = ask(shipped, venue_id, picture, heading_deg=250, top_k=10).json()
+    whole = ask(shipped, venue_id, KITCHEN, heading_deg=250, top_k=10).json()
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
     # First from the store, then from memory.
     for _ in range(2):
-        chosen = ask(shipped, venue_id, picture, heading_deg=250, top_k=10).json()
+        chosen = ask(shipped, venue_id, KITCHEN, heading_deg=250, top_k=10).json()
         assert chosen["floorplan_id"] in (home, *copies)
         assert len(chosen["plans"]) == 2
         # Copies that were not searched keep their shares.
@@ -141,7 +137,6 @@ def test_most_probable_plans_are_searched(
 def test_missing_prototypes_are_made(
     start_app: StartApp, tmp_path: Path, app_store: Store, sphere: bytes, monkeypatch: pytest.MonkeyPatch, stored: str
 ) -> None:
-
     monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
     with start_app(tmp_path) as client:
         venue_id = venue_of(client, upload(client), upload(client, STUDIO))
@@ -190,11 +185,6 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
         assert document_of(ask(client, venue_id, sphere, refine="none"))["floorplan_id"] == replaced["floorplan_id"]
 
 
-@pytest.fixture(scope="module")
-def plan(client: httpx.Client) -> str:
-    return upload(client)
-
-
 BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
     "neither": ({}, "floorplan_id", "is missing"),
     "both": (
@@ -236,10 +226,10 @@ def test_unsearchable_venue_is_an_error(client: httpx.Client, sphere: bytes) -> 
     )
 
 
-def test_plans_with_too_low_ceilings_are_skipped(client: httpx.Client, plan: str, sphere: bytes) -> None:
+def test_plans_with_too_low_ceilings_are_skipped(client: httpx.Client, flat: str, sphere: bytes) -> None:
     low = upload(client, {**STUDIO, "ceiling_height_m": 2.0})
-    answer = ask(client, venue_of(client, plan, low), sphere, camera_height_m=2.1, refine="none").json()
-    assert {entry["floorplan_id"] for entry in answer["plans"]} == {plan}
+    answer = ask(client, venue_of(client, flat, low), sphere, camera_height_m=2.1, refine="none").json()
+    assert {entry["floorplan_id"] for entry in answer["plans"]} == {flat}
     assert "ceilings below camera_height_m" in answer["warnings"][0]
     assert_problem(ask(client, venue_of(client, low), sphere, camera_height_m=2.1), 422, "invalid-pose")
 
@@ -269,9 +259,9 @@ def test_plans_that_are_not_ready_are_warned_about(
         go_on.set()
 
 
-def test_deleted_plan_is_not_searched(client: httpx.Client, plan: str, sphere: bytes) -> None:
+def test_deleted_plan_is_not_searched(client: httpx.Client, flat: str, sphere: bytes) -> None:
     leaving = upload(client, STUDIO)
-    venue_id = venue_of(client, plan, leaving)
+    venue_id = venue_of(client, flat, leaving)
     assert len(ask(client, venue_id, sphere, refine="none").json()["plans"]) == 2
     client.delete(f"/floorplans/{leaving}")
-    assert [entry["floorplan_id"] for entry in ask(client, venue_id, sphere, refine="none").json()["plans"]] == [plan]
+    assert [entry["floorplan_id"] for entry in ask(client, venue_id, sphere, refine="none").json()["plans"]] == [flat]
