@@ -20,6 +20,7 @@ from lalaloc_core.photograph.cameras import Perspective
 from tests.core.taken import EXAMPLES, jpeg, sphere, take
 from tests.painted import painted_room, picture_file
 from tests.service.conftest import document_of, localise, upload
+from tests.strategies import plan_document, rectangle
 
 HOMES = 12
 FIRST_HOME = 1000
@@ -199,15 +200,12 @@ def test_right_heading_is_not_doubted(right: list[dict[str, Any]], given: bool) 
         assert np.median([answer["heading_confidence"] for answer in right]) > 0.7
 
 
-def plain_room(size_m: tuple[float, float]) -> dict[str, Any]:
-    """Return a plan of one room without openings."""
-    polygon = [[0.0, 0.0], [size_m[0], 0.0], list(size_m), [0.0, size_m[1]]]
-    return {"rooms": [{"name": "room", "polygon": polygon, "ceiling_height_m": 2.5}], "camera_height_m": 1.5}
-
-
 @pytest.mark.parametrize(("size_m", "ways"), [((3.2, 4.6), 2), ((3.2, 3.2), 4)], ids=["rectangle", "square"])
 def test_plain_room_splits_between_its_headings(shipped: httpx.Client, size_m: tuple[float, float], ways: int) -> None:
-    room, picture = upload(shipped, plain_room(size_m)), painted_room(size_m, (0.8, 1.0))
+    room, picture = (
+        upload(shipped, plan_document(rectangle(*size_m), camera_height_m=1.5)),
+        painted_room(size_m, (0.8, 1.0)),
+    )
     answer = ask(shipped, room, picture, None, top_k=5)
     shares = [candidate["probability"] for candidate in answer["candidates"]]
     assert shares[:ways] == pytest.approx([1.0 / ways] * ways, abs=0.08)
@@ -220,10 +218,8 @@ def test_plain_room_splits_between_its_headings(shipped: httpx.Client, size_m: t
 
 
 def test_plain_corridor_is_uncertain_along_only(shipped: httpx.Client, given: bool) -> None:
-    size_m = (40.0, 1.8)
-    answer = ask(
-        shipped, upload(shipped, plain_room(size_m)), painted_room(size_m, (15.0, 0.8)), 0.0 if given else None
-    )
+    corridor = upload(shipped, plan_document(rectangle(40.0, 1.8), camera_height_m=1.5))
+    answer = ask(shipped, corridor, painted_room((40.0, 1.8), (15.0, 0.8)), 0.0 if given else None)
     assert answer["confidence"] < 0.25
     across, along = np.linalg.eigvalsh(np.array(answer["covariance_m2"]))
     assert along > 25.0 * across

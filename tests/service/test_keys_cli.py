@@ -92,6 +92,9 @@ def test_key_is_revoked_once(data_dir: Path, capsys: pytest.CaptureFixture[str])
         (["--scope", "read", "--name", "a\nb"], "printable"),
         (["--scope", "read", "--rate-per-minute", "-1"], "--rate-per-minute"),
         (["--scope", "read", "--rate-per-minute", "1000001"], "0 to 1000000"),
+        (["--scope", "read", "--expires-in", "0s"], "--expires-in"),
+        (["--scope", "read", "--expires-in", "3661d"], "--expires-in"),
+        (["--scope", "read", "--expires-in", "soon"], "--expires-in"),
     ],
 )
 def test_invalid_key_options_are_refused(

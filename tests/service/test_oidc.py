@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -360,25 +360,18 @@ def test_keys_are_not_fetched_per_token(issuer: AnyIssuer) -> None:
     asyncio.run(run())
 
 
-def _endless(handler: BaseHTTPRequestHandler) -> None:
-    handler.send_response(200)
-    handler.end_headers()
-    try:
-        for _ in range(100):
-            handler.wfile.write(b" " * 65536)
-    except OSError:
-        pass
+def _repeated(content: bytes, times: int, pause_s: float = 0.0) -> Callable[[BaseHTTPRequestHandler], None]:
+    """Return an answer that repeats its content until the caller has enough."""
 
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.end_headers()
+        with suppress(OSError):
+            for _ in range(times):
+                handler.wfile.write(content)
+                time.sleep(pause_s)
 
-def _slow(handler: BaseHTTPRequestHandler) -> None:
-    handler.send_response(200)
-    handler.end_headers()
-    try:
-        for _ in range(600):
-            handler.wfile.write(b" ")
-            time.sleep(0.05)
-    except OSError:
-        pass
+    return answer
 
 
 def _redirecting(handler: BaseHTTPRequestHandler) -> None:
@@ -390,8 +383,8 @@ def _redirecting(handler: BaseHTTPRequestHandler) -> None:
 @pytest.mark.parametrize(
     ("answer", "document", "reason"),
     [
-        (_endless, {}, "more than 262144 bytes"),
-        (_slow, {}, "for more than"),
+        (_repeated(b" " * 65536, 100), {}, "more than 262144 bytes"),
+        (_repeated(b" ", 600, 0.05), {}, "for more than"),
         (_redirecting, {}, "status 302"),
         (lambda handler: handler.send_error(500), {}, "status 500"),
         (None, {"issuer": "https://other.example"}, "calls itself 'https://other.example'"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from lalaloc_core.photograph.cameras import Perspective
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, PHONE, jpeg, sphere, take
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.test_sessions import begin
+from tests.service.test_sessions import send as photograph_of_session
 
 MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
 ANCHOR = {"latitude": 48.1, "longitude": 11.5, "north_deg": 0.0}
@@ -220,12 +223,7 @@ def test_model_for_spheres_refuses_other_photographs(start_app: StartApp, tmp_pa
 
 
 def test_session_takes_photographs_of_any_projection(client: httpx.Client, flat: str) -> None:
-    session_id = client.post("/sessions", json={"floorplan_id": flat}).json()["id"]
-
-    def send(content: bytes, **fields: Any) -> httpx.Response:
-        data = {name: str(value) for name, value in fields.items()}
-        return client.post(f"/sessions/{session_id}/photographs", data=data, files={"photo": content})
-
+    send = partial(photograph_of_session, client, begin(client, flat))
     phone = send(jpeg(shown(), PHONE)).json()["pose"]
     assert (phone["view"]["projection"], phone["view"]["hfov"]["source"]) == ("perspective", "exif")
     # Gravity of the device.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
-import threading
 import zlib
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -34,10 +35,11 @@ def _moved(covariance: str) -> dict[str, Any]:
     return {"forward_m": 1, "turn_deg": 0, "covariance": covariance}
 
 
-def send(client: httpx.Client, session_id: str, picture: bytes, **fields: Any) -> httpx.Response:
+def send(client: httpx.Client, session_id: str, picture: bytes, key: str = "", **fields: Any) -> httpx.Response:
     data = {name: str(value) for name, value in fields.items()}
     files = {"photo": ("p.jpg", picture, "image/jpeg")}
-    return client.post(f"/sessions/{session_id}/photographs", data=data, files=files)
+    headers = {"Idempotency-Key": key} if key else {}
+    return client.post(f"/sessions/{session_id}/photographs", data=data, files=files, headers=headers)
 
 
 def test_session_follows_photographs_until_it_is_deleted(client: httpx.Client, flat: str, sphere: bytes) -> None:
@@ -113,12 +115,8 @@ def test_unreadable_photograph_leaves_the_session_free(client: httpx.Client, fla
 
 def test_two_photographs_at_once_move_the_camera_once_each(client: httpx.Client, flat: str, sphere: bytes) -> None:
     session_id = begin(client, flat)
-    answers: list[httpx.Response] = []
-    threads = [threading.Thread(target=lambda: answers.append(send(client, session_id, sphere))) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as threads:
+        answers = list(threads.map(lambda _: send(client, session_id, sphere), range(4)))
     accepted = [answer for answer in answers if answer.status_code == 200]
     for answer in answers:
         if answer not in accepted:
@@ -315,11 +313,7 @@ def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_pat
 
 def test_repeated_request_moves_the_camera_once(client: httpx.Client, flat: str, sphere: bytes) -> None:
     session_id = begin(client, flat)
-
-    def keyed(key: str, picture: bytes = sphere, **fields: str) -> httpx.Response:
-        url, files = f"/sessions/{session_id}/photographs", {"photo": ("p.jpg", picture, "image/jpeg")}
-        return client.post(url, data=fields, files=files, headers={"Idempotency-Key": key})
-
+    keyed = partial(send, client, session_id, sphere)
     first, again = keyed("first"), keyed("first")
     assert first.status_code == again.status_code == 200, first.text
     assert again.json() == first.json()
@@ -330,7 +324,7 @@ def test_repeated_request_moves_the_camera_once(client: httpx.Client, flat: str,
     assert keyed("second").json()["photographs"] == 2
     # A broken picture gets the same answer again.
     for _ in range(2):
-        assert keyed("third", b"broken").status_code == 422
+        assert send(client, session_id, b"broken", "third").status_code == 422
     assert keyed("fourth", number="3").json()["photographs"] == 3
 
 
@@ -343,11 +337,7 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
 
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
-
-        def photograph() -> httpx.Response:
-            files = {"photo": ("p.jpg", sphere, "image/jpeg")}
-            return client.post(f"/sessions/{session_id}/photographs", files=files, headers={"Idempotency-Key": "key"})
-
+        photograph = partial(send, client, session_id, sphere, "key")
         with monkeypatch.context() as patch:
             patch.setattr(IdempotencyKeys, "finish", fail)
             first = photograph()

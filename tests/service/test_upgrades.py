@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sqlite3
 from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from service.storage import Store, migrations
 from service.storage.plan_rows import place_columns
 from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import FLOORPLANS, METADATA, ORIGINAL_CHUNKS, REVISIONS
-from tests.service.conftest import StartApp, localise, upload, wait_for
+from tests.service.conftest import StartApp, localise, original_of, upload, wait_for
 from tests.service.postgres import PostgresServer
 from tests.strategies import present
 
@@ -42,9 +43,23 @@ def test_every_released_version_is_tested() -> None:
     assert sorted(headings, key=parts) == VERSIONS
 
 
+def script_of(version: str) -> str:
+    return (RELEASED / f"{version}.sql").read_text(encoding="utf-8")
+
+
+def changed_file(folder: Path, script: str, change: str, *values: object) -> str:
+    """Write a released database with a change to an SQLite file, and return its URL."""
+    file = folder / "lalaloc.sqlite3"
+    with closing(sqlite3.connect(file)) as database:
+        database.executescript(script)
+        database.execute(change, values)
+        database.commit()
+    return f"sqlite:///{file}"
+
+
 @pytest.fixture
-def script(request: pytest.FixtureRequest) -> str:
-    return (RELEASED / f"{request.getfixturevalue('version')}.sql").read_text(encoding="utf-8")
+def script(version: str) -> str:
+    return script_of(version)
 
 
 @pytest.fixture
@@ -135,13 +150,31 @@ def _assert_counted(store: Store, counts: dict[str, int]) -> None:
 
 
 def test_plan_that_cannot_be_read_gets_no_place(tmp_path: Path) -> None:
-    file = tmp_path / "lalaloc.sqlite3"
-    with closing(sqlite3.connect(file)) as database:
-        database.executescript((RELEASED / "0.2.0.sql").read_text(encoding="utf-8"))
-        database.execute("UPDATE revisions SET document = 'damaged'")
-        database.commit()
-    with closing(Store(f"sqlite:///{file}")) as store, store.database.reading() as connection:
+    url = changed_file(tmp_path, script_of("0.2.0"), "UPDATE revisions SET document = 'damaged'")
+    with closing(Store(url)) as store, store.database.reading() as connection:
         assert connection.scalars(sa.select(FLOORPLANS.c.reach_m)).all() == [None]
+
+
+@pytest.mark.parametrize("grids", ["latent_grids", "latent_grids_2"])
+def test_files_of_the_first_version_are_kept(tmp_path: Path, grids: str) -> None:
+    script, original = script_of("0.1.0").replace("latent_grids_2", grids), b"\x00 as sent \xff" * 200_000
+    with closing(Store(changed_file(tmp_path, script, "UPDATE originals SET content = ?", original))) as store:
+        [summary] = store.plans.list_plans("default", limit=10)
+        assert summary.name == "Flat of 0.1.0"
+        assert summary.created_at == datetime(2026, 11, 24, 17, 7, 46, 882394, tzinfo=UTC)
+        assert original_of(store, summary.id) == original
+        # Grids are computed again.
+        assert [missing.id for missing in store.grids.missing("m1", 0.5, 10)] == [summary.id]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [("localise read write", {"localise", "read", "write", "metrics"}), ("localise write", {"localise", "write"})],
+)
+def test_keys_that_read_get_the_scope_of_metrics(tmp_path: Path, before: str, after: set[str]) -> None:
+    url = changed_file(tmp_path, script_of("0.5.0"), "UPDATE api_keys SET scopes = ?", before)
+    with closing(Store(url)) as store:
+        assert [(key.scopes, key.expires_at) for key in store.keys.list_keys()] == [(after, None)]
 
 
 @pytest.mark.slow
