@@ -1,4 +1,4 @@
-"""The API's description makes clients that work, and the README's requests work as they are written."""
+"""Generated files of the client are up to date, and the API's description and the README make clients that work."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
+from lalaloc_client import AsyncClient, Client
+from scripts.generate_client import generated_files
 from tests.service.conftest import StartApp
 
 ROOT = Path(__file__).parents[2]
@@ -90,3 +92,12 @@ def test_readme_requests_work_as_written(start_app: StartApp, tmp_path: Path) ->
         script = requests[0].replace(ADDRESS, str(app.base_url).rstrip("/"))
         done = subprocess.run(["sh", "-euc", script], cwd=ROOT, stdout=subprocess.PIPE, timeout=300, check=True)
     assert json.loads(done.stdout)["heading_deg"] == 250.0
+
+
+def test_blocking_client_is_up_to_date() -> None:
+    stale = [path.name for path, text in generated_files().items() if path.read_text(encoding="utf-8") != text]
+    assert stale == [], "run `make client`"
+
+
+def test_clients_have_the_same_methods() -> None:
+    assert [name for name in vars(Client) if name[0] != "_"] == [name for name in vars(AsyncClient) if name[0] != "_"]

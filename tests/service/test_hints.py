@@ -1,7 +1,8 @@
-"""Hints of a query: validation, and their effect on the search."""
+"""Hints of a query: validation, and their effect on the search; source of its heading: request, compass or search."""
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -10,6 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from PIL import Image
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Posterior, Support
@@ -19,9 +21,12 @@ from lalaloc_core.localise.search.pipeline import Localisation
 from lalaloc_core.render.sampling import PoseSet
 from service.query.ground import Ground
 from service.storage.records import PlanRecord
-from tests.service.conftest import FLAT, assert_problem, localise, upload
+from tests.core.test_photo_sphere import xmp
+from tests.painted import picture_file
+from tests.service.conftest import FLAT, assert_problem, encode_picture, localise, upload
 from tests.strategies import rectangle
 
+APP_SETTINGS = {"compass_tolerance_deg": 15.0}
 PLAN: dict[str, Any] = FLAT | {
     "rooms": [
         {"name": "Bedroom", "polygon": rectangle(4.0, 3.0)},
@@ -126,3 +131,54 @@ def test_contradicted_hints_are_warned_about() -> None:
     assert strict.hint_warnings(replace(found, hints_missed=("near",))) == [
         "near is within 3 m of (6, 4.5), which the photograph contradicts: the answer follows it because strict is set"
     ]
+
+
+# Headings
+
+NORTH_DEG = 30.0
+
+
+def with_packet(**properties: object) -> bytes:
+    picture = Image.open(io.BytesIO(encode_picture(512, 256, "PNG")))
+    return picture_file(picture, "WEBP", lossless=True, xmp=xmp(**properties))
+
+
+@pytest.fixture(scope="module")
+def north(client: httpx.Client) -> str:
+    return upload(client, FLAT | {"north_deg": NORTH_DEG})
+
+
+def poses(response: httpx.Response) -> tuple[str, list[object]]:
+    assert response.status_code == 200, response.text
+    answer = response.json()
+    return answer["heading_source"], [
+        (candidate["position"], candidate["heading_deg"]) for candidate in answer["candidates"]
+    ]
+
+
+@pytest.mark.parametrize("compass_deg", [0.0, 100.0, 345.0])
+def test_compass_is_used_if_north_is_known(client: httpx.Client, north: str, compass_deg: float) -> None:
+    picture = with_packet(PoseHeadingDegrees=compass_deg)
+    source, found = poses(localise(client, north, picture, refine="none"))
+    assert source == "photograph"
+    heading_deg = (compass_deg + NORTH_DEG) % 360.0
+    given = localise(client, north, picture, refine="none", heading_deg=heading_deg, heading_tolerance_deg=15)
+    assert poses(given) == ("given", found)
+
+
+def test_requested_heading_takes_precedence(client: httpx.Client, north: str) -> None:
+    fields = {"refine": "none", "heading_deg": 200}
+    with_compass = poses(localise(client, north, with_packet(PoseHeadingDegrees=10), **fields))
+    assert with_compass[0] == "given"
+    assert with_compass == poses(localise(client, north, with_packet(), **fields))
+
+
+@pytest.mark.parametrize("properties", [{}, {"PoseHeadingDegrees": 400}, {"InitialViewHeadingDegrees": 90}])
+def test_heading_is_searched_without_a_compass(client: httpx.Client, north: str, properties: dict[str, object]) -> None:
+    assert poses(localise(client, north, with_packet(**properties), refine="none"))[0] == "searched"
+
+
+def test_heading_is_searched_without_north(client: httpx.Client, flat: str) -> None:
+    with_compass = poses(localise(client, flat, with_packet(PoseHeadingDegrees=10), refine="none"))
+    assert with_compass[0] == "searched"
+    assert with_compass == poses(localise(client, flat, with_packet(), refine="none"))

@@ -19,6 +19,7 @@ from time import monotonic, sleep
 import httpx
 import pytest
 
+from service.cli.entry_point import store_example
 from service.cli.lan_access import lan_address, lan_certificate
 from service.settings import CONSTANTS, PREFIX, Settings
 from service.storage import open_store
@@ -208,6 +209,13 @@ def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp
         process.wait(30.0)
     with closing(open_store(Settings(data_dir=tmp_path))) as store:
         assert [run.revoked_at is None for run in store.keys.list_keys()] == [False]
+
+
+def test_example_is_stored_in_an_empty_database_only(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    with closing(open_store(settings)) as store:
+        assert [store_example(store, settings) for _ in range(2)] == ["Example flat", None]
+        assert [plan.name for plan in store.plans.list_plans("default", limit=9)] == ["Example flat"]
 
 
 def test_certificate_is_kept_until_it_is_old(tmp_path: Path) -> None:

@@ -1,22 +1,60 @@
-"""Predictions that are replaced by the layout at the true pose, of `lalaloc bench --only bounds`."""
+"""Queries of `lalaloc bench`: pictures that cannot tell the place, and predictions replaced by the true layout."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 
 from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.evaluate.bench.accuracy import blank_azimuth, landscape
 from lalaloc_core.evaluate.bench.bounds import Asked, with_truth
 from lalaloc_core.evaluate.methods.method import Pose
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight, PredictedOpenings, PredictedProfile, Query
 from lalaloc_core.render.sampling import PoseSet
+from tests.strategies import plan_of, rectangle
+
+# Room of 4 x 3 m with a window in the whole of its nearest wall, on the left of the camera.
+WINDOW = {"kind": "window", "line": [[0.0, 0.01], [0.0, 2.99]]}
+ROOM = rectangle(4.0, 3.0)
+
+
+def camera(heading: float) -> Camera:
+    position_m = np.array([0.5, 2.0])
+    return Camera(name="c", position_m=position_m, room_index=0, heading=heading, camera_height_m=1.5, photographs={})
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
+@pytest.mark.parametrize(("openings", "expected"), [([], -math.pi / 2.0), ([WINDOW], 0.0)])
+def test_blank_wall_is_the_nearest_without_openings(heading: float, openings: list, expected: float) -> None:
+    found = blank_azimuth(plan_of(ROOM, openings=openings), camera(heading))
+    assert found is not None
+    # The wall to the north is one metre away; near the corner the view also shows a part of the window.
+    off = (found + heading - expected + math.pi) % (2.0 * math.pi) - math.pi
+    assert abs(off) < 0.5
+
+
+def test_room_of_windows_has_no_blank_wall() -> None:
+    walls = [[[0.01, 0], [3.99, 0]], [[4, 0.01], [4, 2.99]], [[3.99, 3], [0.01, 3]], [[0, 2.99], [0, 0.01]]]
+    windows = [{"kind": "window", "line": line} for line in walls]
+    assert blank_azimuth(plan_of(ROOM, openings=windows), camera(0.0)) is None
+
+
+def test_landscape_continues_behind_the_camera() -> None:
+    picture = landscape(np.random.default_rng(0)).astype(float)
+    assert picture.shape == (512, 1024, 3)
+    # Patches of the ground end anywhere; sky and hills go around.
+    assert np.abs(picture[:240, 0] - picture[:240, -1]).max() < 2.0
+    assert picture[:200].mean() > picture[300:].mean() + 30.0
+
+
+# Bounds: predictions are those of the layout at the true pose.
 
 COLUMNS = 64
-DOOR = {"kind": "door", "line": [[1.0, 0.0], [2.0, 0.0]]}
-PLAN = FloorPlan.from_dict(
-    {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0, 0], [5, 0], [5, 3], [0, 3]]}], "openings": [DOOR]}
-)
+PLAN = plan_of(rectangle(5.0, 3.0), openings=[{"kind": "door", "line": [[1.0, 0.0], [2.0, 0.0]]}])
 
 
 def asked(heading: float) -> Asked:
