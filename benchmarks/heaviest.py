@@ -174,6 +174,10 @@ def _svg(kibibytes: int) -> bytes:
     return drawing[:end] + kibibytes * (b"<!--" + 1017 * b"x" + b"-->") + drawing[end:]
 
 
+def _unended_string(size: int) -> bytes:
+    return b'"' + b'\\"' * (size // 2)
+
+
 def _grey_jpeg(width: int, height: int) -> bytes:
     """Return a grey progressive JPEG."""
     buffer = io.BytesIO()
@@ -226,14 +230,24 @@ def _get(path: str, *, conditional: bool = False, **query: object) -> Work:
     return work
 
 
-def _post_and_delete(content: Callable[[int], bytes], media: str = "application/json") -> Work:
-    """Return the work of storing a plan and deleting it."""
+def _post_plan(
+    title: str,
+    size: int,
+    content: Callable[[int], bytes],
+    media: str = "application/json",
+    *,
+    routes: tuple[str, ...] = ("POST /floorplans",),
+    deletes: bool = True,
+    refusals: frozenset[int] = frozenset(),
+) -> Load:
+    """Return the load of storing a plan, and by default of deleting it, before its pose grid is prepared."""
 
     def work(caller: Caller, _stored: Stored, size: int) -> None:
-        if plan := _create(caller, "/floorplans", content(size), media):
+        plan = _create(caller, "/floorplans", content(size), media)
+        if plan and deletes:
             caller.send("DELETE", plan)
 
-    return work
+    return Load(routes, title, work, size, refusals=refusals)
 
 
 def _put_plan(caller: Caller, stored: Stored, size: int) -> None:
@@ -244,15 +258,6 @@ def _hall(area_m2: int) -> bytes:
     side_m = math.sqrt(area_m2)
     polygon = [[0.0, 0.0], [side_m, 0.0], [side_m, side_m], [0.0, side_m]]
     return _body({"ceiling_height_m": 3.0, "rooms": [{"polygon": polygon}]})
-
-
-def _post_plan(content: Callable[[int], bytes]) -> Work:
-    """Return the work of storing a plan whose pose grid is prepared."""
-
-    def work(caller: Caller, _stored: Stored, size: int) -> None:
-        caller.send("POST", "/floorplans", content(size))
-
-    return work
 
 
 def _follow_events(caller: Caller, _stored: Stored, size: int) -> None:
@@ -455,27 +460,15 @@ LOADS = (
         9_600,
         connections=64,
     ),
-    Load(("POST /floorplans", f"DELETE {_PLAN}"), "homes of one room", _post_and_delete(lambda _size: _body(home(0)))),
-    Load(("POST /floorplans",), VERTICES_PLAN, _post_and_delete(lambda size: _building_body(size, 190)), 500),
-    Load(("POST /floorplans",), ROOMS_PLAN, _post_and_delete(lambda size: _building_body(size, 4, 2)), 10_000),
-    Load(
-        ("POST /floorplans",),
-        "2,000 rooms × 10,000 diagonal openings",
-        _post_and_delete(_diagonals_body),
-        2_000,
-        refusals=_TOO_LONG,
-    ),
-    Load(("POST /floorplans",), "SVG of 39 MB", _post_and_delete(_svg, "image/svg+xml"), 39_000),
-    Load(("POST /floorplans",), "halls of 1,600 m², whose pose grids are prepared", _post_plan(_hall), 1_600),
-    Load(("POST /floorplans",), "24 rooms, crossing combs", _post_and_delete(_combs_body), 24, refusals=_TOO_LONG),
-    Load(("POST /floorplans",), "500 slivers across a square", _post_plan(_slivers_body), 500, refusals=_TOO_LONG),
-    Load(
-        ("POST /floorplans",),
-        "JSON that is one string without an end",
-        _post_and_delete(lambda size: b'"' + b'\\"' * (size // 2)),
-        2_000_000,
-        refusals=_TOO_LONG,
-    ),
+    _post_plan("homes of one room", 0, lambda _size: _body(home(0)), routes=("POST /floorplans", f"DELETE {_PLAN}")),
+    _post_plan(VERTICES_PLAN, 500, lambda size: _building_body(size, 190)),
+    _post_plan(ROOMS_PLAN, 10_000, lambda size: _building_body(size, 4, 2)),
+    _post_plan("2,000 rooms × 10,000 diagonal openings", 2_000, _diagonals_body, refusals=_TOO_LONG),
+    _post_plan("SVG of 39 MB", 39_000, _svg, "image/svg+xml"),
+    _post_plan("halls of 1,600 m², whose pose grids are prepared", 1_600, _hall, deletes=False),
+    _post_plan("24 rooms, crossing combs", 24, _combs_body, refusals=_TOO_LONG),
+    _post_plan("500 slivers across a square", 500, _slivers_body, deletes=False, refusals=_TOO_LONG),
+    _post_plan("JSON that is one string without an end", 2_000_000, _unended_string, refusals=_TOO_LONG),
     Load((f"PUT {_PLAN}",), ROOMS_PLAN, _put_plan, 10_000),
     Load(("POST /venues", f"DELETE {_VENUE}"), "{homes} homes", _post_venue),
     Load(("POST /venues",), "file of 200 levels × 50 rooms", _post_levels, 10_000),

@@ -269,6 +269,27 @@ def test_confidence_is_null_without_a_model(client: httpx.Client, flat: str, sph
     assert answer["heading_std_deg"] is None
 
 
+def test_posterior_is_included_on_request(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    answer = localise(client, flat, sphere, include="posterior", heading_deg=10.0).json()
+    posterior = answer["posterior"]
+    step_m = client.get(f"/floorplans/{flat}").json()["grid"]["step_m"]
+    assert posterior["step_m"] == step_m
+    assert len(posterior["x_m"]) == len(posterior["y_m"]) == len(posterior["probability"]) > 0
+    assert sum(posterior["probability"]) == pytest.approx(1.0, abs=1e-3)
+    assert min(posterior["probability"]) > 0.0
+    plan = FloorPlan.from_dict(FLAT)
+    places = np.array([posterior["x_m"], posterior["y_m"]]).T
+    assert all(any(room.shape.covers(Point(place)) for room in plan.rooms) for place in places)
+    assert localise(client, flat, sphere, heading_deg=10.0).json()["posterior"] is None
+
+
+def test_unknown_include_is_rejected(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    problem = assert_problem(localise(client, flat, sphere, include="grid"), 422, "invalid-request")
+    (fault,) = problem["errors"]
+    assert fault["field"] == "include"
+    assert "posterior" in fault["message"]
+
+
 def test_query_waits_for_a_preparing_plan(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, HALL, wait=False)
     assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"

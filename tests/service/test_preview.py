@@ -1,4 +1,4 @@
-"""Drawing and mesh of a plan: scale, names, marker, openings."""
+"""Drawing, mesh and layout of a plan: scale, names, marker, openings."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 import math
 from xml.etree import ElementTree
 
+import httpx
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +17,7 @@ from lalaloc_core.draw.plan import Marker, plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from service.plan_files.plan_mesh import plan_glb
-from tests.service.conftest import FLAT
+from tests.service.conftest import FLAT, assert_problem, upload
 from tests.strategies import plan_of, rectangle
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -150,3 +151,47 @@ def test_mesh_has_holes_inner_walls_and_opening_panels() -> None:
     assert surfaces["1/room 1/window"].area == pytest.approx(1.0, abs=1e-4)
     assert surfaces["2/room 2/door"].area == pytest.approx(0.9 * 2.05, abs=1e-4)
     assert "2/room 2/window" not in surfaces
+
+
+DOORS = [
+    {"kind": "passage", "line": [[4, 0.5], [4, 1.5]], "head_m": 2.1},
+    {"kind": "window", "line": [[7, 0], [8, 0]], "sill_m": 0.9, "head_m": 2.1},
+]
+
+
+def test_layout_has_walls_and_openings(client: httpx.Client) -> None:
+    document = FLAT | {"openings": DOORS}
+    plan_id = upload(client, document)
+    layout = client.get(f"/floorplans/{plan_id}/layout").json()
+    plan = FloorPlan.from_dict(document)
+    assert layout["floorplan_id"] == plan_id
+    assert [room["id"] for room in layout["rooms"]] == [room.id for room in plan.rooms]
+    for drawn, room in zip(layout["rooms"], plan.rooms, strict=True):
+        np.testing.assert_allclose(drawn["walls_m"], room.walls_m)
+        assert drawn["ceiling_height_m"] == room.ceiling_height_m
+    kitchen, living = layout["rooms"]
+    assert [opening["kind"] for opening in kitchen["openings"]] == ["passage"]
+    assert sorted(opening["kind"] for opening in living["openings"]) == ["passage", "window"]
+    (window,) = (opening for opening in living["openings"] if opening["kind"] == "window")
+    x0, y0, x1, y1 = living["walls_m"][window["wall"]]
+    ends = sorted(x0 + share * (x1 - x0) for share in (window["start"], window["end"]))
+    assert (y0, y1) == (0.0, 0.0)
+    assert ends == pytest.approx([7.0, 8.0])
+    assert (window["sill_m"], window["head_m"]) == (0.9, 2.1)
+    assert kitchen["openings"][0]["sill_m"] is None
+
+
+def test_layout_of_older_revision_is_available(client: httpx.Client) -> None:
+    plan_id = upload(client)
+    first = client.get(f"/floorplans/{plan_id}").json()["revision"]
+    client.put(f"/floorplans/{plan_id}", json=FLAT | {"openings": DOORS}).raise_for_status()
+    now = client.get(f"/floorplans/{plan_id}/layout")
+    assert any(room["openings"] for room in now.json()["rooms"])
+    before = client.get(f"/floorplans/{plan_id}/layout", params={"revision": first}).json()
+    assert before["revision"] == first
+    assert not any(room["openings"] for room in before["rooms"])
+    assert (
+        client.get(f"/floorplans/{plan_id}/layout", headers={"If-None-Match": now.headers["etag"]}).status_code == 304
+    )
+    assert_problem(client.get(f"/floorplans/{plan_id}/layout", params={"revision": "0" * 32}), 404, "unknown-revision")
+    assert_problem(client.get("/floorplans/none/layout"), 404, "unknown-floorplan")

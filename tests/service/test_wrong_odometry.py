@@ -10,6 +10,8 @@ import pytest
 
 from tests.core.taken import sphere
 from tests.painted import picture_file
+from tests.service.conftest import document_of
+from tests.service.test_sessions import begin, send
 
 # The robot turns on the spot.
 TURN_DEG = 45.0
@@ -27,14 +29,9 @@ def turning() -> list[bytes]:
 
 def follow(client: httpx.Client, plan_id: str, photos: list[bytes], **motion: Any) -> list[dict[str, Any]]:
     """Return the poses of photographs with the same stated motion between all of them."""
-    session = client.post("/sessions", json={"floorplan_id": plan_id, "camera_height_m": 1.5}).json()["id"]
-    poses = []
-    for number, photo in enumerate(photos):
-        data = {name: str(value) for name, value in motion.items()} if number else {}
-        answer = client.post(f"/sessions/{session}/photographs", data=data, files={"photo": photo})
-        assert answer.status_code == 200, answer.text
-        poses.append(answer.json()["pose"])
-    return poses
+    session_id = begin(client, plan_id, camera_height_m=1.5)
+    answers = [send(client, session_id, photo, **(motion if number else {})) for number, photo in enumerate(photos)]
+    return [document_of(answer)["pose"] for answer in answers]
 
 
 def test_right_odometry_is_not_contradicted(shipped: httpx.Client, home: str, turning: list[bytes]) -> None:
