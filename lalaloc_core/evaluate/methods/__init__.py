@@ -3,5 +3,3 @@
 Begin with `method.py`, the question and the answer. `lalaloc.py` is this project's search. `icp.py` and
 `explicit.py` are the paper's baselines. `similarity.py` retrieves with the true layout or pose.
 """
-
-from lalaloc_core.evaluate.methods.method import Answer, Method, Pose, Question

@@ -2,8 +2,4 @@
 
 Begin with `evaluation.py`, which evaluates a method. `factories.py` builds data set and method, `predictions.py` reads
 and writes the folder of a run, `score.py` scores it without model or data and classifies the failures.
-Only modules that load no network are re-exported.
 """
-
-from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import score_run

@@ -6,5 +6,4 @@ opens its reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own data, 
 data sets are in `synthetic/`.
 """
 
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, load_scenes
 from lalaloc_core.learn.data.dataset_detection import open_dataset

@@ -3,6 +3,3 @@
 Begin with `run_export.py`, which exports a training run; `bundle_export.py` writes ONNX and safetensors files and
 compares them with torch.
 """
-
-from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.learn.export.run_export import export_run

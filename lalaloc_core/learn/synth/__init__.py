@@ -3,7 +3,4 @@
 Begin with `rendering/sphere_renderer.py`, the sphere renderer. `homes/` draws floor plans with doors and windows,
 `furniture/` furnishes their rooms; `scene/` collects the surroundings of one camera in a `RenderScene`, `rendering/`
 casts its rays and shades the hits, `camera.py` exposes the picture. `records.py` stores the rows of numbers of a scene.
-Only names that need no torch are re-exported, because data sets use plans without it.
 """
-
-from lalaloc_core.learn.synth.homes import Home, Opening, generate_home

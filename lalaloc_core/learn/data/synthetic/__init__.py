@@ -5,6 +5,4 @@ degrades or replaces their photographs, and `altered_plans.py` asks for them in 
 `lalaloc lab synth`.
 """
 
-from lalaloc_core.learn.data.synthetic.altered_photographs import MismatchedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, training_plans
-from lalaloc_core.learn.data.synthetic.writing import Synthesis, synthesise

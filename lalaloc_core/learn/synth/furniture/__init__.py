@@ -4,5 +4,3 @@ Begin with `furnish.py`, which furnishes a room. `pieces.py` defines a piece, `c
 of each kind of room, `built_in.py` has fixed furniture.
 Needs no torch.
 """
-
-from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, furnish

@@ -5,4 +5,4 @@ Homes are numbered by split. Needs no torch.
 """
 
 from lalaloc_core.learn.synth.homes.openings import Opening, OpeningKind
-from lalaloc_core.learn.synth.homes.plans import Home, HomeConfig, generate_home
+from lalaloc_core.learn.synth.homes.plans import Home

@@ -2,7 +2,3 @@
 
 Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`).
 """
-
-from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
-from lalaloc_core.learn.synth.scene.render_scene import RenderScene
-from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
