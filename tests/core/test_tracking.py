@@ -1,4 +1,4 @@
-"""Tests of tracking: motions of the belief, its state in bytes, and localisation of walks photograph by photograph."""
+"""Tests of tracking: motions of the belief, its state in bytes, walks photograph by photograph, and TUM odometry."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import psutil
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError, InvalidStateError
@@ -26,6 +27,7 @@ from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.track_state import StatePlan
 from lalaloc_core.localise.tracking.tracked_plans import PlanOnLevel, TrackedPlans
 from lalaloc_core.localise.tracking.tracking_filter import Tracked, track_steps
+from lalaloc_core.localise.tracking.trajectories import Frame, read_trajectory
 from lalaloc_core.localise.tracking.walk_motion import States, WalkGraph, moved
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from tests.core.questions import Walk, queries_along
@@ -361,3 +363,69 @@ class TestState:
             content = content[:10] + zlib.compress(bytes(body))
         with pytest.raises(InvalidStateError):
             TrackState.from_bytes(content)
+
+
+# TUM odometry in the frames of robots and of visual SLAM
+
+
+# Azimuths (radians, clockwise) and places (m, to the right and forward of the first pose) of a walk.
+TURNS = np.radians([0.0, -40.0, -90.0, -100.0, 30.0])
+PLACES = np.array([[0.0, 0.0], [0.5, 2.0], [-1.0, 4.0], [-3.0, 3.5], [-3.0, 6.0]])
+# Columns are right, forward and up of the camera in the axes of the body, or of the first camera in those of the world.
+REP103 = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def tum(body: np.ndarray, world: np.ndarray, turns: np.ndarray = TURNS, places: np.ndarray = PLACES) -> str:
+    """Return TUM lines of the walk, for axes of the body and of the world."""
+    lines = []
+    for time_s, (turn, (x, y)) in enumerate(zip(turns, places, strict=True)):
+        # Azimuths are clockwise, angles of scipy counterclockwise.
+        level = Rotation.from_euler("z", -turn).as_matrix()
+        # TUM states x, y, z, w, as scipy does.
+        values = [*(world @ [x, y, 0.02 * time_s]), *Rotation.from_matrix(world @ level @ body.T).as_quat()]
+        lines.append(" ".join(f"{value:.9f}" for value in (float(time_s), *values)))
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("body", "world", "frame", "is_named"),
+    [
+        (REP103, REP103, "rep103", False),
+        (OPTICAL, OPTICAL, "optical", True),
+        (OPTICAL, REP103, "optical", True),
+        (OPTICAL, np.eye(3), "optical", True),
+    ],
+    ids=["robot", "first camera", "level world of a robot", "level world"],
+)
+def test_frames_are_recognised(body: np.ndarray, world: np.ndarray, frame: str, *, is_named: bool) -> None:
+    text = tum(body, world)
+    for stated in ("auto", frame):
+        path = read_trajectory(text, stated)  # pyright: ignore[reportArgumentType]
+        assert bool(path.warnings) == (is_named and stated == "auto")
+        for step in range(1, len(TURNS)):
+            motion = path.motion(step - 1.0, float(step))
+            right, ahead = PLACES[step] - PLACES[step - 1]
+            before = TURNS[step - 1]
+            forward_m = ahead * math.cos(before) + right * math.sin(before)
+            assert motion.forward_m == pytest.approx(forward_m, abs=1e-6)
+            assert motion.right_m == pytest.approx(right * math.cos(before) - ahead * math.sin(before), abs=1e-6)
+            assert math.remainder(motion.turn - TURNS[step] + before, math.tau) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_straight_ways_tell_the_frame_by_their_heights() -> None:
+    turns, places = np.zeros(3), np.array([[0.0, 0.0], [0.0, 2.0], [0.0, 5.0]])
+    for body, is_optical in ((REP103, False), (OPTICAL, True)):
+        path = read_trajectory(tum(body, body, turns, places))
+        assert bool(path.warnings) == is_optical
+        assert path.motion(0.0, 2.0).forward_m == pytest.approx(5.0, abs=1e-6)
+
+
+def test_poses_that_are_upright_in_no_frame_are_refused() -> None:
+    lying = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    text = tum(lying, REP103)
+    for frame in get_args(Frame):
+        with pytest.raises(InvalidMotionError, match=r"lean by up to \d+° .*; the limit is 35°: .*--odometry-frame"):
+            read_trajectory(text, frame)
+    with pytest.raises(InvalidMotionError, match="has no rotation"):
+        read_trajectory("0 0 0 0 0 0 0 0\n1 1 0 0 0 0 0 0")

@@ -1,4 +1,4 @@
-"""Sessions of tracked cameras: photographs in order, stored states, refusals."""
+"""Sessions of tracked cameras: photographs in order, stored states, refusals, odometry that photographs contradict."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from time import sleep
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from sqlalchemy import update
 
@@ -20,6 +21,8 @@ from service.storage.kept_answers import IdempotencyKeys
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.venues import venue_plans
+from tests.core.taken import sphere as taken_sphere
+from tests.painted import picture_file
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, encode_picture, upload
 from tests.service.test_venue_queries import venue_of
 
@@ -348,3 +351,59 @@ def test_request_whose_answer_was_not_kept_moves_the_camera_once(
         assert photograph().json() == first.json()
         assert client.get(f"/sessions/{session_id}").json()["photographs"] == 1
         assert send(client, session_id, sphere).json()["photographs"] == 2
+
+
+# Contradicted odometry, with the shipped model
+
+
+# The robot turns on the spot.
+TURN_DEG = 45.0
+
+
+@pytest.fixture(scope="module")
+def turning() -> list[bytes]:
+    """Return photographs of a camera that turns clockwise on the spot."""
+    files, pixels = [], taken_sphere("kitchen")
+    for number in range(6):
+        turned = np.roll(pixels, -round(number * TURN_DEG / 360.0 * pixels.shape[1]), axis=1)
+        files.append(picture_file(turned, "JPEG"))
+    return files
+
+
+def follow(client: httpx.Client, plan_id: str, photos: list[bytes], **motion: Any) -> list[dict[str, Any]]:
+    """Return the poses of photographs with the same stated motion between all of them."""
+    session_id = begin(client, plan_id, camera_height_m=1.5)
+    answers = [send(client, session_id, photo, **(motion if number else {})) for number, photo in enumerate(photos)]
+    return [document_of(answer)["pose"] for answer in answers]
+
+
+def test_right_odometry_is_not_contradicted(shipped: httpx.Client, home: str, turning: list[bytes]) -> None:
+    poses = follow(shipped, home, turning, forward_m=0, turn_deg=TURN_DEG)
+    assert [pose["motion_contradicted"] for pose in poses] == [[]] * len(poses)
+    assert all(pose["probability"] > 0.5 for pose in poses[2:])
+    assert [pose["warnings"] for pose in poses] == [[]] * len(poses)
+
+
+@pytest.mark.parametrize(
+    ("motion", "component"),
+    [
+        ({"forward_m": 0, "turn_deg": -TURN_DEG}, "turn_deg"),
+        ({"forward_m": 2.5, "turn_deg": TURN_DEG}, "forward_m"),
+        ({"forward_m": 0, "right_m": -2.5, "turn_deg": TURN_DEG}, "right_m"),
+    ],
+    ids=["sign of the turn", "slipping wheels", "sideways"],
+)
+def test_wrong_odometry_is_named(
+    shipped: httpx.Client, home: str, turning: list[bytes], motion: dict[str, Any], component: str
+) -> None:
+    poses = follow(shipped, home, turning, **motion)
+    # The photographs are believed.
+    assert {pose["room"] for pose in poses} == {"kitchen"}
+    assert [component in pose["motion_contradicted"] for pose in poses[1:]] == [True] * (len(poses) - 1)
+    stated = (
+        f"{component} is {motion[component]:g}, which the photographs contradict by more than 4 standard deviations"
+    )
+    assert stated in poses[1]["warnings"]
+    assert len(poses[1]["warnings"]) == len(poses[1]["motion_contradicted"])
+    again = f"{component} contradicts at least 3 of the last 8 photographs: check its sign, unit and standard deviation"
+    assert again in poses[-1]["warnings"]
