@@ -25,13 +25,14 @@ from tests.core.taken import EXAMPLES, jpeg, sphere, take
 
 ROOT = Path(__file__).parents[2]
 PLAN, KITCHEN, BEDROOM = (str(EXAMPLES / name) for name in ("flat.json", "kitchen.jpg", "bedroom.jpg"))
-LALALOC = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main; sys.exit(main())"]
+MAIN = "import sys; from lalaloc_core.cli import main; sys.exit(main())"
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
-def run_in(folder: Path, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)} | changes
+def run_in(folder: Path, *arguments: str, program: str = MAIN) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", program, *arguments]
     return subprocess.run(
-        [*LALALOC, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
+        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=300, check=False
     )
 
 
@@ -316,10 +317,9 @@ def test_completion_script_is_valid(shell: str, tmp_path: Path, capsys: pytest.C
 
 
 def test_closed_pipe_is_not_an_error(tmp_path: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    command = [*LALALOC, "completion", "bash"]
+    command = [sys.executable, "-c", MAIN, "completion", "bash"]
     with subprocess.Popen(
-        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -334,9 +334,7 @@ def loaded_packages(*arguments: str) -> set[str]:
         "import sys; from lalaloc_core.cli import main\n"
         "try:\n    main()\nfinally:\n    print(*{name.split('.')[0] for name in sys.modules}, file=sys.stderr)"
     )
-    command = [sys.executable, "-c", program, *arguments]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    done = run_in(ROOT, *arguments, program=program)
     assert done.returncode == 0, done.stderr
     return set(done.stderr.split())
 

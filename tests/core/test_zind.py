@@ -25,7 +25,7 @@ from lalaloc_core.learn.data.zind import Zind
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.sampling import random_poses
 from tests.strategies import crooked_flat, plan_document, plan_of, plans, rectangle, same_ring, seeds
-from tests.zind_home import CEILING_GREY, FLOOR, FLOOR_GREY, HEIGHT, SPHERES, WIDTH, TrueSphere, wall_colour, write_home
+from tests.zind_home import CEILING_GREY, FLOOR_GREY, HEIGHT, SPHERES, WIDTH, TrueSphere, wall_colour, write_home
 from tests.zind_home import write_homes as write_zind_homes
 
 NAME = "0002/floor_01"
@@ -378,33 +378,28 @@ def test_unreadable_door_is_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def zind(tmp_path: Path) -> Path:
-    """Write a ZInD home with a door between two rooms, drawn in both, and a window in the first."""
-    write_home(tmp_path / "0000", crooked_flat(), SPHERES, np.random.default_rng(0))
-    path = tmp_path / "0000" / "zind_data.json"
-    document = json.loads(path.read_text())
-    merger = document["merger"][FLOOR]
+def zind(root: Path) -> Path:
+    """Draw a door between two rooms, in both, and a window in the first."""
 
-    def layout_of(room: int) -> dict[str, list]:
-        (partial,) = merger[f"complete_room_{room + 1:02d}"].values()
-        return next(iter(partial.values()))["layout_complete"]
-
-    def between(room: int, wall: int, begin: float, end: float) -> list[list[float]]:
+    def between(layout: dict[str, list], wall: int, begin: float, end: float) -> list[list[float]]:
         """Return a piece of a room's wall in the frame of the room's sphere."""
-        vertices = layout_of(room)["vertices"]
+        vertices = layout["vertices"]
         start, stop = (np.array(vertices[(wall + k) % len(vertices)]) for k in (0, 1))
         return [(start + share * (stop - start)).tolist() for share in (begin, end)]
 
-    # The right wall of the first room is 2.2 m long, the left wall of the second 2.5 m, both from y = 0.
-    layout_of(0)["doors"] = [*between(0, 1, 0.5 / 2.2, 1.4 / 2.2), [-1.0, 0.35]]
-    layout_of(1)["doors"] = [*between(1, 3, 1.1 / 2.5, 2.0 / 2.5), [-1.0, 0.35]]
-    layout_of(0)["windows"] = [*between(0, 0, 0.2, 0.5), [-0.4, 0.4]]
-    path.write_text(json.dumps(document))
-    return tmp_path
+    def draw(document: dict[str, Any]) -> None:
+        first, second = (sphere(document, room, pano)["layout_complete"] for room, pano in ((1, 0), (2, 2)))
+        # The right wall of the first room is 2.2 m long, the left wall of the second 2.5 m, both from y = 0.
+        first["doors"] = [*between(first, 1, 0.5 / 2.2, 1.4 / 2.2), [-1.0, 0.35]]
+        second["doors"] = [*between(second, 3, 1.1 / 2.5, 2.0 / 2.5), [-1.0, 0.35]]
+        first["windows"] = [*between(first, 0, 0.2, 0.5), [-0.4, 0.4]]
+
+    change_home(root, draw)
+    return root
 
 
 def test_zind_openings_are_in_the_plan_once(zind: Path) -> None:
-    plan = Zind(zind).load(f"0000/{FLOOR}").plan
+    plan = Zind(zind).load(NAME).plan
     assert [opening.kind for opening in plan.openings] == ["door", "window"]
     faces = sorted((face.room, face.wall, face.behind) for face in plan.opening_faces)
     assert faces == [(0, 0, -1), (0, 1, 1), (1, 3, 0)]
@@ -416,13 +411,9 @@ def test_zind_openings_are_in_the_plan_once(zind: Path) -> None:
 
 
 def test_damaged_zind_lists_are_warnings(zind: Path) -> None:
-    path = zind / "0000" / "zind_data.json"
-    document = json.loads(path.read_text())
-    (partial,) = document["merger"][FLOOR]["complete_room_01"].values()
-    layout = next(iter(partial.values()))["layout_complete"]
-    layout["doors"], layout["windows"] = [[0, 0]], [[0, 0], [1, "x"], [0, 1]]
-    path.write_text(json.dumps(document))
-    plan = Zind(zind).load(f"0000/{FLOOR}").plan
+    lists = {"doors": [[0, 0]], "windows": [[0, 0], [1, "x"], [0, 1]]}
+    change_home(zind, lambda document: sphere(document)["layout_complete"].update(lists))
+    plan = Zind(zind).load(NAME).plan
     assert [opening.kind for opening in plan.openings] == ["door"]
     assert any("'doors' is left out; it is not a list of triples" in warning for warning in plan.warnings)
     assert any("an entry of 'windows' is left out" in warning for warning in plan.warnings)

@@ -355,6 +355,11 @@ def lines_of(response: httpx.Response) -> list[dict[str, Any]]:
     return [json.loads(line) for line in response.text.splitlines()]
 
 
+def connection_to(client: httpx.Client) -> socket.socket:
+    """Return a connection to the service of a client, for what a client does not send."""
+    return socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=60.0)
+
+
 def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
     return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})

@@ -15,7 +15,7 @@ import pytest
 
 from service.capacity.admission_control import Slots
 from service.errors import OverloadedError, ShareExceededError
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, localise, metric, upload, wait_for
 from tests.service.test_localise import HALL
 
 pytestmark = pytest.mark.one_replica
@@ -37,7 +37,7 @@ def small(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iter
 @contextmanager
 def _open_upload(client: httpx.Client, path: str = "/floorplans") -> Iterator[socket.socket]:
     """Open an upload that never sends its body."""
-    with socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=10.0) as connection:
+    with connection_to(client) as connection:
         head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
         connection.sendall(f"{head}Content-Length: 100000\r\n\r\n{{".encode())
         yield connection
@@ -185,7 +185,7 @@ def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, sphere: b
 def test_disconnect_frees_the_slot(small: httpx.Client, sphere: bytes) -> None:
     preparing = upload(small, HALL, wait=False)
     body, content_type = _multipart(preparing, sphere)
-    with socket.create_connection((small.base_url.host, small.base_url.port or 80), timeout=10.0) as connection:
+    with connection_to(small) as connection:
         lines = ["POST /localise HTTP/1.1", "Host: localhost", f"Content-Type: {content_type}"]
         head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
         connection.sendall(head.encode() + body)

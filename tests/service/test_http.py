@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import socket
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
@@ -19,7 +18,7 @@ from service.http.http_protocol import MAX_HEAD_BYTES
 from service.openapi import openapi_text
 from service.runtime import Runtime, get_runtime
 from service.settings import Settings
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serve, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, localise, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 ROOT = Path(__file__).parents[2]
@@ -287,11 +286,10 @@ def test_pages_load_own_files_and_cannot_be_framed(client: httpx.Client, path: s
 
 @pytest.mark.parametrize("path", ["/floorplans", "/healthz", "/no/such"])
 def test_request_with_two_lengths_is_refused_and_closed(client: httpx.Client, path: str) -> None:
-    assert client.base_url.port is not None
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     smuggled = "GET /limits HTTP/1.1\r\nHost: localhost\r\n\r\n"
     lengths = "Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n"
-    with socket.create_connection(("127.0.0.1", client.base_url.port), timeout=10.0) as connection:
+    with connection_to(client) as connection:
         connection.sendall(f"{head}{lengths}{smuggled}".encode())
         answer = b"".join(iter(lambda: connection.recv(65536), b"")).decode()
     assert answer.startswith("HTTP/1.1 400 ")

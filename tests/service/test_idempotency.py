@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
@@ -38,7 +37,7 @@ from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY, KEPT_ANSWERS
 from service.uploaded_file import UploadedFile
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, localise, upload, wait_for
 from tests.service.test_store import _add
 
 CONTENT = json.dumps(FLAT).encode()
@@ -194,8 +193,7 @@ def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:
         "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nIdempotency-Key: a\r\n"
         f"Content-Length: {len(CONTENT)}\r\n\r\n"
     )
-    address = (own.base_url.host, own.base_url.port or 0)
-    with socket.create_connection(address) as connection:
+    with connection_to(own) as connection:
         connection.sendall(head.encode() + CONTENT)
 
     def send() -> httpx.Response:
@@ -215,7 +213,7 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
         query = client.build_request("POST", "/localise", headers=_keyed("a"), **form)
         body = query.read()
         head = b"".join(name + b": " + value + b"\r\n" for name, value in query.headers.raw)
-        with socket.create_connection((client.base_url.host, client.base_url.port or 0)) as connection:
+        with connection_to(client) as connection:
             connection.sendall(b"POST /localise HTTP/1.1\r\n" + head + b"\r\n" + body)
             wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
         wait_for(lambda: "lalaloc_requests_in_flight 0.0" in client.get("/metrics").text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import httpx
 import pytest
 
 from benchmarks.plan_drawing import draw_plan
-from tests.service.conftest import FLAT, StartApp, assert_problem, lines_of, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, lines_of, wait_for
 from tests.service.test_plan_files import plan_file
 from tests.service.test_venue_levels import geojson
 
@@ -107,7 +106,7 @@ def test_plan_of_a_client_that_left_is_stored(own: httpx.Client, picture: tuple[
     content, fields = picture
     request = own.build_request("POST", "/floorplans", files={"file": ("plan", content)}, data=fields, headers=LINES)
     head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
-    with socket.create_connection((own.base_url.host, own.base_url.port or 80), timeout=60.0) as connection:
+    with connection_to(own) as connection:
         connection.sendall(f"POST /floorplans HTTP/1.1\r\n{head}\r\n".encode() + request.read())
         received = b""
         while b"reading" not in received and b"opening" not in received:

@@ -21,7 +21,7 @@ import pytest
 from lalaloc_core.bundle import default_bundle
 from tests.local_servers import free_port
 from tests.service import test_albums as albums
-from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, connection_to, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 CONFIGURATION = Path(__file__).parents[2] / "docker" / "nginx.conf"
@@ -158,7 +158,7 @@ def _assert_refused(head: bytes, body: bytes, status: int, slug: str) -> None:
 
 
 def _answer_to(proxy: httpx.Client, request: bytes) -> tuple[bytes, bytes]:
-    with socket.create_connection((proxy.base_url.host, proxy.base_url.port or 80), timeout=20.0) as connection:
+    with connection_to(proxy) as connection:
         connection.sendall(request)
         received = b""
         while not received.rstrip().endswith((b"}", b"</html>")):

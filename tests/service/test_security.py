@@ -7,7 +7,6 @@ import io
 import json
 import logging
 import re
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -40,6 +39,7 @@ from tests.service.conftest import (
     DatabaseOf,
     StartApp,
     assert_problem,
+    connection_to,
     encode_picture,
     localise,
     serve,
@@ -355,7 +355,7 @@ def test_last_use_is_written_once_a_minute(guarded: Guarded) -> None:
 
 def test_refused_request_is_answered_before_its_body(guarded: Guarded) -> None:
     head = "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000000\r\n\r\n"
-    with socket.create_connection((guarded.client.base_url.host, guarded.client.base_url.port or 0), 60.0) as raw:
+    with connection_to(guarded.client) as raw:
         raw.sendall(head.encode())
         assert raw.recv(4096).startswith(b"HTTP/1.1 401 ")
 

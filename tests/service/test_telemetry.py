@@ -6,7 +6,6 @@ import io
 import json
 import logging
 import re
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -30,7 +29,7 @@ from service.telemetry import LOGGER_NAME, RequestLogFields
 from service.telemetry.logs import JsonFormatter, TraceContext, child_of, parse_traceparent
 from service.telemetry.tracing import Tracing, otlp_exporter
 from tests.local_servers import QuietHandler, http_server
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, localise, metric, upload, wait_for
 
 ROOT = Path(__file__).parents[2]
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
@@ -128,7 +127,7 @@ def test_early_refusal_logs_its_route(start_app: StartApp, tmp_path: Path, log: 
 def test_disconnect_is_counted_and_logged(client: httpx.Client, log: Log) -> None:
     gone = 'lalaloc_disconnects_total{route="/floorplans"}'
     before = metric(client, gone)
-    with socket.create_connection((client.base_url.host, client.base_url.port or 80)) as connection:
+    with connection_to(client) as connection:
         head = (
             "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
             "Content-Length: 1000\r\nX-Request-ID: gone-1\r\n\r\n"

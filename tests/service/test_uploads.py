@@ -24,7 +24,7 @@ from service.capacity.admission_control import BytesInFlight
 from service.errors import BytesInFlightError, UploadTooLargeError
 from service.http.uploads import UploadLimits, ending_request, read_body, read_parts
 from service.uploaded_file import UploadedFile
-from tests.service.conftest import FLAT, StartApp, assert_problem, metric, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, metric, wait_for
 
 HEAD = (
     "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
@@ -35,9 +35,7 @@ HEAD = (
 @contextmanager
 def open_body(client: httpx.Client) -> Iterator[socket.socket]:
     """Open a connection on which a body has been announced."""
-    port = client.base_url.port
-    assert port is not None
-    with socket.create_connection(("127.0.0.1", port), timeout=20.0) as connection:
+    with connection_to(client) as connection:
         connection.sendall(HEAD.encode("ascii"))
         yield connection
 
