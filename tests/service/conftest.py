@@ -360,9 +360,11 @@ def connection_to(client: httpx.Client) -> socket.socket:
     return socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=60.0)
 
 
-def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
+def localise(
+    client: httpx.Client, plan_id: str, *pictures: bytes, path: str = "/localise", **fields: Any
+) -> httpx.Response:
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
-    return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})
+    return client.post(path, data=data, files=[("photo", ("p.jpg", picture, "image/jpeg")) for picture in pictures])
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:

@@ -123,9 +123,7 @@ BAD_FIELDS = {
 def test_invalid_field_is_rejected_with_its_limit(
     client: httpx.Client, flat: str, sphere: bytes, fields: dict[str, str], name: str, message: str
 ) -> None:
-    response = client.post(
-        "/localise", data={"floorplan_id": flat} | fields, files={"photo": ("p.jpg", sphere, "image/jpeg")}
-    )
+    response = localise(client, flat, sphere, **fields)
     faults = {fault["field"]: fault["message"] for fault in assert_problem(response, 422, "invalid-request")["errors"]}
     assert message in faults[name]
     assert not re.search("string|float|integer|parse|None|sys", faults[name])

@@ -86,14 +86,14 @@ def test_ray_answers_like_one_process(
 
 @pytest.mark.slow
 def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
-    sequence = on_ray.post("/localise/sequence", data={"floorplan_id": plan_id, "motion": "turn"}, files=files)
+    sequence = localise(on_ray, plan_id, sphere, sphere, path="/localise/sequence", motion="turn")
     assert sequence.status_code == 200, sequence.text
     venue = on_ray.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 1}]}).json()["id"]
-    found = on_ray.post("/localise", data={"venue_id": venue}, files=files[:1])
+    found = ask(on_ray, venue, sphere)
     assert found.json()["floorplan_id"] == plan_id, found.text
     accepted = {"Accept": "image/png"}
-    drawn = on_ray.post("/localise", data={"floorplan_id": plan_id}, files=files[:1], headers=accepted)
+    files = {"photo": ("p.jpg", sphere, "image/jpeg")}
+    drawn = on_ray.post("/localise", data={"floorplan_id": plan_id}, files=files, headers=accepted)
     assert drawn.content.startswith(b"\x89PNG"), drawn.text
 
 
@@ -121,11 +121,10 @@ def test_each_plan_stays_in_one_replica(on_ray: httpx.Client, sphere: bytes) -> 
 @pytest.mark.slow
 def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, sphere: bytes) -> None:
     kill_replica("lpo")
-    # Single photographs are refined by the search replicas.
-    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
 
     def ask() -> httpx.Response:
-        return on_ray.post("/localise/sequence", data={"floorplan_id": plan_id, "motion": "turn"}, files=files)
+        # Single photographs are refined by the search replicas.
+        return localise(on_ray, plan_id, sphere, sphere, path="/localise/sequence", motion="turn")
 
     assert ask().status_code == 200
     wait_for(lambda: ask().json()["stage"] == "lpo", timeout_s=120.0)

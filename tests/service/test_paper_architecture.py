@@ -60,9 +60,7 @@ def test_query_reaches_each_stage(
 
 @pytest.mark.slow
 def test_turn_is_refined_by_latents(client: httpx.Client, sphere: bytes) -> None:
-    files = [("photo", ("p.jpg", sphere, "image/jpeg"))] * 2
-    fields = {"floorplan_id": upload(client), "motion": "turn"}
-    response = client.post("/localise/sequence", data=fields, files=files)
+    response = localise(client, upload(client), sphere, sphere, path="/localise/sequence", motion="turn")
     assert response.status_code == 200, response.text
     # The pose on the grid is the answer until the worker has started.
     assert response.json()["stage"] in ("lpo", "retrieval")

@@ -15,7 +15,7 @@ import pytest
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, PHONE, jpeg, sphere, take
-from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload
 from tests.service.test_sessions import begin
 from tests.service.test_sessions import send as photograph_of_session
 
@@ -35,8 +35,7 @@ def shown(heading_deg: float = 0.0, **tilt: float) -> np.ndarray:
 
 
 def ask(client: httpx.Client, plan_id: str, *photos: bytes, path: str = "/localise", **fields: Any) -> httpx.Response:
-    data = {"floorplan_id": plan_id} | {name: str(value) for name, value in (QUICK | fields).items()}
-    return client.post(path, data=data, files=[("photo", ("p", photo)) for photo in photos])
+    return localise(client, plan_id, *photos, path=path, **(QUICK | fields))
 
 
 def turn(client: httpx.Client, plan_id: str, *photos: bytes, **fields: Any) -> httpx.Response:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
-from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture
+from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture, localise
 
 APP_SETTINGS = {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
 
@@ -21,11 +21,8 @@ def pictures() -> list[bytes]:
 
 
 def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> httpx.Response:
-    data = {"floorplan_id": plan_id, "motion": "turn"} | {
-        name: json.dumps(value) if isinstance(value, list) else str(value) for name, value in fields.items()
-    }
-    files = [("photo", ("p.jpg", picture, "image/jpeg")) for picture in pictures]
-    return client.post("/localise/sequence", data=data, files=files)
+    texts = {name: json.dumps(value) if isinstance(value, list) else value for name, value in fields.items()}
+    return localise(client, plan_id, *pictures, path="/localise/sequence", **({"motion": "turn"} | texts))
 
 
 def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.venues import venue_plans
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, upload, wait_for
+from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, localise, upload, wait_for
 from tests.service.test_localise import HALL
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
@@ -76,8 +76,7 @@ def test_right_plan_is_found_among_several(
 
 
 def test_venue_of_one_plan_equals_the_plan(shipped: httpx.Client, home: str) -> None:
-    files = {"photo": ("p.jpg", KITCHEN, "image/jpeg")}
-    alone = shipped.post("/localise", data={"floorplan_id": home, "heading_deg": "250"}, files=files).json()
+    alone = localise(shipped, home, KITCHEN, heading_deg=250).json()
     found = ask(shipped, venue_of(shipped, home), KITCHEN, heading_deg=250).json()
     # Refinement can begin at another grid pose near the place.
     assert found["position"] == pytest.approx(alone["position"], abs=0.06)
