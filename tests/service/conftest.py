@@ -360,11 +360,15 @@ def connection_to(client: httpx.Client) -> socket.socket:
     return socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=60.0)
 
 
-def localise(
-    client: httpx.Client, plan_id: str, *pictures: bytes, path: str = "/localise", **fields: Any
-) -> httpx.Response:
+def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
-    return client.post(path, data=data, files=[("photo", ("p.jpg", picture, "image/jpeg")) for picture in pictures])
+    return client.post("/localise", data=data, files={"photo": ("p.jpg", picture, "image/jpeg")})
+
+
+def localise_turn(client: httpx.Client, plan_id: str, *pictures: bytes, **fields: Any) -> httpx.Response:
+    data = {"floorplan_id": plan_id, "motion": "turn"} | {name: str(value) for name, value in fields.items()}
+    files = [("photo", ("p.jpg", picture, "image/jpeg")) for picture in pictures]
+    return client.post("/localise/sequence", data=data, files=files)
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:

@@ -20,7 +20,7 @@ from lalaloc_core.errors import ConfigError
 from service.errors import PROBLEMS, DeadlineExceededError, InvalidRequestError, PlanNotReadyError, problem_kind
 from service.query import QueryContext
 from service.settings import Settings
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serving, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, localise_turn, serving, upload, wait_for
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c constraints.txt -e '.[ray]'")
 
@@ -86,7 +86,7 @@ def test_ray_answers_like_one_process(
 
 @pytest.mark.slow
 def test_ray_answers_sequences_venues_and_pictures(on_ray: httpx.Client, plan_id: str, sphere: bytes) -> None:
-    sequence = localise(on_ray, plan_id, sphere, sphere, path="/localise/sequence", motion="turn")
+    sequence = localise_turn(on_ray, plan_id, sphere, sphere)
     assert sequence.status_code == 200, sequence.text
     venue = on_ray.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 1}]}).json()["id"]
     found = ask(on_ray, venue, sphere)
@@ -124,7 +124,7 @@ def test_dead_lpo_replica_is_replaced(on_ray: httpx.Client, plan_id: str, sphere
 
     def ask() -> httpx.Response:
         # Single photographs are refined by the search replicas.
-        return localise(on_ray, plan_id, sphere, sphere, path="/localise/sequence", motion="turn")
+        return localise_turn(on_ray, plan_id, sphere, sphere)
 
     assert ask().status_code == 200
     wait_for(lambda: ask().json()["stage"] == "lpo", timeout_s=120.0)

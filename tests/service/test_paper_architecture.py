@@ -14,7 +14,7 @@ from lalaloc_core.learn.export.bundle_export import export_bundle
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.nets.paper_encoders import PaperConfig
-from tests.service.conftest import FLAT, localise, upload, wait_for
+from tests.service.conftest import FLAT, localise, localise_turn, upload, wait_for
 
 # Seconds of LPO on the small networks, even on a busy machine.
 LPO_DEADLINE_S = 60.0
@@ -60,7 +60,7 @@ def test_query_reaches_each_stage(
 
 @pytest.mark.slow
 def test_turn_is_refined_by_latents(client: httpx.Client, sphere: bytes) -> None:
-    response = localise(client, upload(client), sphere, sphere, path="/localise/sequence", motion="turn")
+    response = localise_turn(client, upload(client), sphere, sphere)
     assert response.status_code == 200, response.text
     # The pose on the grid is the answer until the worker has started.
     assert response.json()["stage"] in ("lpo", "retrieval")

@@ -15,7 +15,7 @@ import pytest
 from lalaloc_core.photograph.cameras import Perspective
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, PHONE, jpeg, sphere, take
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, localise_turn, upload
 from tests.service.test_sessions import begin
 from tests.service.test_sessions import send as photograph_of_session
 
@@ -34,12 +34,12 @@ def shown(heading_deg: float = 0.0, **tilt: float) -> np.ndarray:
     return take(sphere("living_room"), MAIN, heading_deg=heading_deg, **tilt)
 
 
-def ask(client: httpx.Client, plan_id: str, *photos: bytes, path: str = "/localise", **fields: Any) -> httpx.Response:
-    return localise(client, plan_id, *photos, path=path, **(QUICK | fields))
+def ask(client: httpx.Client, plan_id: str, photo: bytes, **fields: Any) -> httpx.Response:
+    return localise(client, plan_id, photo, **(QUICK | fields))
 
 
 def turn(client: httpx.Client, plan_id: str, *photos: bytes, **fields: Any) -> httpx.Response:
-    return ask(client, plan_id, *photos, path="/localise/sequence", **{"motion": "turn", **fields})
+    return localise_turn(client, plan_id, *photos, **(QUICK | fields))
 
 
 def test_phone_photograph_is_localised(client: httpx.Client, flat: str) -> None:

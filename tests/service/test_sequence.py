@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
-from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture, localise
+from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture, localise_turn
 
 APP_SETTINGS = {"max_sequence_photographs": 30, "max_sequence_bytes": 300_000}
 
@@ -22,7 +22,7 @@ def pictures() -> list[bytes]:
 
 def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> httpx.Response:
     texts = {name: json.dumps(value) if isinstance(value, list) else value for name, value in fields.items()}
-    return localise(client, plan_id, *pictures, path="/localise/sequence", **({"motion": "turn"} | texts))
+    return localise_turn(client, plan_id, *pictures, **texts)
 
 
 def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> dict[str, Any]:
