@@ -11,7 +11,7 @@ from lalaloc_core.photograph.file_segments import END
 from tests.core.fault_photographs import CONTRADICTED, FAULTS, Fault, fault_id
 from tests.core.taken import EXAMPLES
 from tests.service.conftest import assert_problem
-from tests.service.test_photographs import ask
+from tests.service.test_photographs import ask, turn
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
 # All files are sent alone; routes for several differ in how they name a file, so a third of the files do for them.
@@ -101,7 +101,7 @@ def test_damaged_photograph_is_used_with_a_warning_at_the_top(client: httpx.Clie
 
 
 def test_warnings_about_photographs_of_a_sequence_name_them(client: httpx.Client, flat: str) -> None:
-    answer = ask(client, flat, KITCHEN, KITCHEN[:-2], path="/localise/sequence", motion="turn").json()
+    answer = turn(client, flat, KITCHEN, KITCHEN[:-2]).json()
     text = "the file ends before its picture does: the missing part is grey; send the whole file"
     assert f"photo[1]: {text}" in answer["warnings"]
     assert text in answer["poses"][1]["warnings"]
