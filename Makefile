@@ -70,8 +70,9 @@ ray: $(STAMP) ## run the tests of Ray, and the API's tests on Ray (about 20 minu
 	$(PYTEST) -m "slow or not slow" tests/service/test_on_ray.py
 	for file in $(ON_RAY); do TEST_DATABASE=ray $(PYTEST) tests/service/test_$$file.py || exit 1; done
 
-check: $(STAMP) ## lint, check types, build the documentation site
+check: $(STAMP) ## lint, check types, build the documentation site, warn of slower stages
 	@$(MAKE) --no-print-directory -j 2 types lint site
+	-@$(BIN)/python -m benchmarks.pairs
 
 PRETTIER := web/node_modules/.bin/prettier
 lint: $(STAMP) ## run ruff and, after `npm ci` in web/, prettier

@@ -1,14 +1,19 @@
 """Durations and CPU times of two checkouts of this repository, taken in turns, and the differences of their answers.
 
-    git worktree add ../before v0.9.0
+    git worktree add ../before v0.7.0
     taskset -c 0 python -m benchmarks.pairs ../before . --rounds 5
+    python -m benchmarks.pairs
 
 Each checkout runs the service of its own code with this interpreter. In every round each does the same work, in
 changing order, so that other load on the machine affects both; the CPU time (user and system) of all processes is
 counted, which load affects less than durations. The work is a photograph of 12 megapixels, spheres, a turn, a film and
 two plans by one client, four clients, and the start of the service and of two commands; `--only NAME` chooses some of
 it. Prints a Markdown table of medians over the rounds, and the largest differences of the answers to spheres. Exits
-with 1 if one is more than 1e-6 m, degrees or probability.
+with 1 if one is more than 1e-6 m, degrees or probability. `--json` stores the figures of a release, and its stages.
+
+Without checkouts, the stages of answers about the example flat are measured in this one, each over fixed work of the
+same run, so that the machine and its load count little. A warning names those that grew by more than 20 % since the
+last stored release.
 """
 
 from __future__ import annotations
@@ -17,11 +22,14 @@ import itertools
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import timeit
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -32,10 +40,12 @@ from typing import Any, NamedTuple
 
 import httpx
 import numpy as np
+from PIL import Image
 
 from benchmarks import harness
 from benchmarks.buildings import building_of
-from examples.truth import PLAN_PATH, read_poses
+from examples.launch import ROOT
+from examples.truth import FOLDER, PLAN_PATH, read_poses
 from lalaloc_core.evaluate.bench.service_latency import PHONE_FIELD_DEG, phone_photograph
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
@@ -51,6 +61,10 @@ _TURN, _FIELD_DEG = 12, 53.0
 # Frames of the film as they are drawn, at half of its size; FFmpeg repeats and enlarges them to 30 a second in 1080p.
 _FRAMES, _FRAMES_PER_S = 100, 10
 _OFFICE_M2 = 2000.0
+# Figures and stages of releases. Photographs whose stages are measured, how often, the shortest stage (ms), and the
+# factor from which one is said to have grown.
+_STORED = ROOT / "docs" / "pairs.json"
+_STAGES_OF, _STAGE_ROUNDS, _SHORTEST_MS, _GROWN = ("living_room.jpg", "phone.jpg"), 12, 1.0, 1.2
 
 
 @dataclass(eq=False)
@@ -95,19 +109,69 @@ class Spent(NamedTuple):
 def main() -> int:
     """Measure; return 1 when answers differ."""
     parser = harness.argument_parser(__doc__)
-    parser.add_argument("checkouts", nargs=2, type=Path, help="folders of the checkouts, the one before first")
+    parser.add_argument("checkouts", nargs="*", type=Path, help="folders of two checkouts, the one before first")
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--only", action="append", choices=tuple(FIGURES), help="a figure of these; repeatable")
+    parser.add_argument("--json", type=Path, help="file to add figures and stages of the second checkout to")
     options = parser.parse_args()
+    if not options.checkouts:
+        version, release = list(json.loads(_STORED.read_text()).items())[-1]
+        for text in grown_stages(stage_ratios(ROOT), release["stages"]):
+            print(f"warning: {text} than in {version}; see benchmarks/pairs.py", file=sys.stderr)
+        return 0
+    if len(options.checkouts) != 2:
+        parser.error("give two checkouts, or none")
     with ExitStack() as stack:
         checkouts = []
         for folder in map(Path.resolve, options.checkouts):
             service = stack.enter_context(harness.example_service(_SETTINGS, folder))
             checkouts.append(Checkout(folder.name, folder, service))
-        _print_figures(checkouts, options.rounds, options.only or list(FIGURES))
+        figures = _print_figures(checkouts, options.rounds, options.only or list(FIGURES))
+    if options.json:
+        before, after = (_version(checkout.folder) for checkout in checkouts)
+        releases = json.loads(options.json.read_text()) if options.json.exists() else {}
+        releases[after] = {"before": before, "figures": figures, "stages": stage_ratios(checkouts[1].folder)}
+        options.json.write_text(json.dumps(releases, indent=2) + "\n")
     differences = _differences(*checkouts)
     print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
     return int(max(differences.values()) > _TOLERANCE)
+
+
+def _version(checkout: Path) -> str:
+    return re.findall(r'^__version__ = "(.+)"', (checkout / "lalaloc_core/__init__.py").read_text(), re.MULTILINE)[0]
+
+
+def stage_ratios(checkout: Path, rounds: int = _STAGE_ROUNDS) -> dict[str, float]:
+    """Return the least duration of each stage of answers of a checkout's service, over that of fixed work like it."""
+    values = np.linspace(0.0, 1.0, 2**18, dtype=np.float32).reshape(512, 512)
+    works: dict[str, Callable[[], object]] = {
+        "decode": lambda: Image.open(FOLDER / _STAGES_OF[0]).resize((256, 128)),
+        "encode": lambda: values @ values,
+        "others": lambda: np.sort(values * values, axis=None),
+    }
+    least_ms: defaultdict[tuple[str, str], float] = defaultdict(lambda: math.inf)
+    with (
+        harness.example_service(_SETTINGS, checkout) as service,
+        httpx.Client(base_url=service.url, timeout=_TIMEOUT_S) as client,
+    ):
+        for _ in range(rounds):
+            spent_ms = {("", stage): 1e3 * timeit.timeit(work, number=1) for stage, work in works.items()}
+            for name in _STAGES_OF:
+                data, files = {"floorplan_id": service.plan_id}, {"photo": (name, (FOLDER / name).read_bytes())}
+                timings_ms = client.post("/localise", data=data, files=files).raise_for_status().json()["timings_ms"]
+                spent_ms |= {(name, stage): spent for stage, spent in timings_ms.items() if stage != "total"}
+            least_ms |= {key: min(spent, least_ms[key]) for key, spent in spent_ms.items()}
+    return {
+        f"{name}: {stage}": round(spent / least_ms["", stage if stage in works else "others"], 4)
+        for (name, stage), spent in least_ms.items()
+        if name and spent >= _SHORTEST_MS
+    }
+
+
+def grown_stages(ratios: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
+    """Return a text for each stage whose ratio grew by more than 20 %."""
+    grown = {name: ratio / stored.get(name, math.inf) for name, ratio in ratios.items()}
+    return [f"stage {name} takes {factor - 1.0:.0%} longer" for name, factor in grown.items() if factor > _GROWN]
 
 
 def _sent(send: Callable[[httpx.Client, Checkout], httpx.Response], repeats: int = 1) -> Callable[[Checkout], Spent]:
@@ -251,13 +315,16 @@ FIGURES: Mapping[str, Callable[[Checkout], Spent]] = {
 }
 
 
-def _print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[str]) -> None:
-    """Print the medians of figures over rounds in which the checkouts take turns, after a round as a warm-up.
+def _print_figures(
+    checkouts: Sequence[Checkout], rounds: int, names: Sequence[str]
+) -> dict[str, dict[str, float | None]]:
+    """Print and return medians of figures over rounds in which the checkouts take turns, after a round as a warm-up.
 
     Ratios are medians of the ratios within a round.
     """
     before, after = (checkout.name for checkout in checkouts)
     harness.print_table_head("figure", before, after, "ratio", f"CPU, {before}", f"CPU, {after}", "ratio")
+    figures: dict[str, dict[str, float | None]] = {}
     for name in names:
         if name.startswith("film") and shutil.which("ffmpeg") is None:
             print(harness.table_row(name, *["needs FFmpeg"] * 2, *[""] * 4), flush=True)
@@ -267,13 +334,15 @@ def _print_figures(checkouts: Sequence[Checkout], rounds: int, names: Sequence[s
             spent = {checkout.name: FIGURES[name](checkout) for checkout in checkouts[:: 1 if index % 2 else -1]}
             found.append([spent[before], spent[after]])
         values = np.array(found[1:])
+        medians, ratios = np.median(values, axis=0), np.median(values[:, 1] / values[:, 0], axis=0)
+        unit = "{:.2f}" if "over" in name else "{:.3f} s"
         cells: list[str] = []
-        for kind in range(2):
-            medians = np.median(values[:, :, kind], axis=0)
-            ratio = np.median(values[:, 1, kind] / values[:, 0, kind])
-            unit = "{:.2f}" if "over" in name else "{:.3f} s"
-            cells += ["-"] * 3 if np.isnan(ratio) else [*map(unit.format, medians), f"{ratio:.2f}"]
+        for kind, ratio in enumerate(ratios):
+            cells += ["-"] * 3 if np.isnan(ratio) else [*map(unit.format, medians[:, kind]), f"{ratio:.2f}"]
         print(harness.table_row(name, *cells), flush=True)
+        wall, cpu = (None if np.isnan(ratio) else round(float(ratio), 2) for ratio in ratios)
+        figures[name] = {"after": round(float(medians[1, 0]), 3), "ratio": wall, "cpu_ratio": cpu}
+    return figures
 
 
 def _differences(before: Checkout, after: Checkout) -> dict[str, float]:

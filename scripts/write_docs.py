@@ -101,6 +101,21 @@ def neighbours_table() -> str:
     return f"`{report['command']}` on {report['cores']} cores:\n\n{markdown_of_neighbours(report)}"
 
 
+def pairs_table() -> str:
+    """Return durations of each release, and over those of an old one (processor times in brackets), as Markdown."""
+    releases = {name: found for name, found in _read("docs/pairs.json").items() if "figures" in found}
+
+    def cell(name: str, found: dict[str, float]) -> str:
+        unit = "" if "over" in name else " s"
+        cpu = "" if found["cpu_ratio"] is None else f" ({found['cpu_ratio']:.2f})"
+        return f"{found['after']:.3g}{unit}: {found['ratio']:.2f}{cpu}"
+
+    names = dict.fromkeys(name for found in releases.values() for name in found["figures"])
+    head = " | ".join(["figure", *(f"{name} over {found['before']}" for name, found in releases.items())])
+    each = [found["figures"] for found in releases.values()]
+    return table(head, [(name, *(cell(name, row[name]) if name in row else "–" for row in each)) for name in names])
+
+
 def paper_tables() -> str:
     """Return the measured tables of the paper with our figures beside the paper's, as Markdown."""
     paths = [ROOT / "docs" / "tables" / f"{paper_table.name}.json" for paper_table in PAPER_TABLES]
@@ -196,6 +211,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "problems": problems_table,
     "cli": commands,
     "neighbours": neighbours_table,
+    "pairs": pairs_table,
     "paper": paper_tables,
     **{name: partial(measured_table, name) for name in _MEASURED},
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.pairs import grown_stages, stage_ratios
 from examples.demo import StageMissingError, check_localisation
 from examples.make_examples import HEIGHT, PHONE, TURN_DEG, VIEWS, WIDTH, example_home, true_pose
 from examples.truth import FOLDER, PLAN_PATH, read_poses
@@ -111,3 +113,16 @@ def test_demo_runs_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
     assert done.stdout.count(".jpg") == 2 * len(VIEWS)
     with Image.open(out) as picture:
         assert picture.width > 1000
+
+
+def test_stages_that_grew_since_a_release_are_named() -> None:
+    stored = {"a: decode": 1.0, "a: encode": 2.0}
+    assert grown_stages({"a: decode": 1.19, "a: encode": 3.0, "a: next_step": 9.0}, stored) == [
+        "stage a: encode takes 50% longer"
+    ]
+
+
+@pytest.mark.slow
+def test_stages_of_the_last_release_are_measured() -> None:
+    *_, release = json.loads((ROOT / "docs/pairs.json").read_text()).values()
+    assert stage_ratios(ROOT, rounds=2).keys() >= release["stages"].keys()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -166,6 +166,11 @@ class PredictionErrors:
             raise ConfigError(f"seen and class_probability have the shapes {table}; there are {classes} classes")
         if not self.spread > 0.0:
             raise ConfigError(f"spread is {self.spread:g}; it must be positive")
+
+    def thinned(self, stride: int) -> PredictionErrors:
+        """Return the errors at every azimuth whose column is a multiple of `stride`."""
+        names = ("error_correlation", "scale_correlation", "seen_correlation")
+        return replace(self, **{name: getattr(self, name)[::stride] for name in names})
 
     def profile(
         self, log_m: Float[np.ndarray, "n w"], rng: np.random.Generator

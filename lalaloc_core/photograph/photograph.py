@@ -35,13 +35,7 @@ from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.picture_files import FORMATS, PhotographLimits, PictureFile, opened_picture, scaled
 from lalaloc_core.photograph.projection import COARSEST, Lens, Source, find_lens, is_closed, is_twice_as_wide
-from lalaloc_core.photograph.sphere_formats import (
-    THUMBNAIL_SIDE,
-    SphereFormat,
-    Thumbnail,
-    find_sphere_format,
-    looks_spherical,
-)
+from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, SphereFormat, Thumbnail, find_sphere_format
 from lalaloc_core.photograph.spheres import level_sphere
 from lalaloc_core.photograph.stated_camera import AUTO, Projection, StatedCamera
 from lalaloc_core.photograph.turn_angles import Overview
@@ -308,7 +302,7 @@ class _Opened:
             sphere=self.metadata,
             exif=self.exif,
             orientation=self.file.orientation,
-            looks_spherical=lambda: looks_spherical(self.thumbnail.pixels),
+            looks_spherical=lambda: self.thumbnail.looks_spherical,
             closes=lambda: is_closed(self.thumbnail.pixels),
         )
 

@@ -73,6 +73,16 @@ class Thumbnail:
         """Grey levels."""
         return cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY)
 
+    @cached_property
+    def looks_spherical(self) -> bool:
+        """Whether it looks like a full sphere."""
+        return looks_spherical(self.pixels)
+
+    @cached_property
+    def between_bars(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """`_bars` of its rows, and of its columns."""
+        return _bars(self.pixels), _bars(self.pixels.transpose(1, 0, 2))
+
 
 def find_sphere_format(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a picture; None for a photograph, or a sphere as it should be."""
@@ -122,7 +132,7 @@ def _find_circles(thumbnail: Thumbnail) -> SphereFormat | None:
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
     beside = (part for part in (grey[:top], grey[:, :left]) if part.size)
-    if all(np.percentile(part, 90) < _DARK for part in beside) and _is_circle(grey[top : top + side, left:][:, :side]):
+    if all((part < _DARK).mean() > 0.9 for part in beside) and _is_circle(grey[top : top + side, left:][:, :side]):
         return SphereFormat(
             text="the photograph is the circle of a fisheye lens: send projection=fisheye and hfov_deg, its horizontal "
             "field of view (often 180), of the square around the circle"
@@ -192,7 +202,7 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a sphere within bars of one colour."""
     pixels = thumbnail.pixels
     height, width = pixels.shape[:2]
-    (top, bottom), (left, right) = _bars(pixels), _bars(pixels.transpose(1, 0, 2))
+    (top, bottom), (left, right) = thumbnail.between_bars
     if (bottom - top) * (right - left) > (1.0 - _MIN_BARS) * height * width or min(bottom - top, right - left) < 16:
         return None
     # The bars are equal and the sphere twice as wide as high, which is more exact than the judged pixels.
@@ -215,14 +225,13 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
 
 def _find_photograph_in_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a photograph within bars of one colour, such as a screenshot, which can have texts there."""
-    pixels = thumbnail.pixels
-    # Some cameras paint the zenith and nadir of their spheres in one colour.
-    if _has_ratio(pixels, 2.0) and looks_spherical(pixels):
-        return None
-    height, width = pixels.shape[:2]
-    (top, bottom), (left, right) = _bars(pixels), _bars(pixels.transpose(1, 0, 2))
+    height, width = thumbnail.pixels.shape[:2]
+    (top, bottom), (left, right) = thumbnail.between_bars
     share = 1.0 - (bottom - top) * (right - left) / (height * width)
     if not _PHOTOGRAPH_BARS[0] <= share <= _PHOTOGRAPH_BARS[1] or min(bottom - top, right - left) < _FEWEST_ROWS:
+        return None
+    # Some cameras paint the zenith and nadir of their spheres in one colour.
+    if _has_ratio(thumbnail.pixels, 2.0) and thumbnail.looks_spherical:
         return None
     return SphereFormat(
         text=f"the photograph is within bars, {share:.0%} of the picture, as in a screenshot: they were cut off; send "
@@ -241,8 +250,9 @@ def _bars(pixels: UInt8[np.ndarray, "n m 3"]) -> tuple[int, int]:
     mean, spread = cv2.meanStdDev(np.ascontiguousarray(pixels[[0, -1]]))
     if spread.max() > 2.0 * _MAX_BAR_SPREAD:
         return 0, len(pixels)
-    is_colour = np.abs(pixels - mean[:, 0]).max(axis=2) < 2.0 * _MAX_BAR_SPREAD
-    is_bar = is_colour.mean(axis=1) >= _OF_BAR
+    lowest, highest = np.floor(mean - 2.0 * _MAX_BAR_SPREAD) + 1.0, np.ceil(mean + 2.0 * _MAX_BAR_SPREAD) - 1.0
+    is_colour = cv2.inRange(np.ascontiguousarray(pixels), lowest, highest)
+    is_bar = cv2.reduce(is_colour, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] >= 255.0 * _OF_BAR
     if is_bar.all():
         return 0, len(pixels)
     return int(np.argmin(is_bar)), len(pixels) - int(np.argmin(is_bar[::-1]))

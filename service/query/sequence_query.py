@@ -43,12 +43,13 @@ class SequenceSearch:
             clock=context.clock,
         )
         found = await executor.run_search(steps, context)
-        timings_ms = executor.observe(context, found.stage)
 
         def compose() -> SequenceAnswer:
-            composed = compose_turn(turn, found, ground, self._parts.bundle, warnings=ground.warnings)
+            composed = compose_turn(
+                turn, found, ground, self._parts.bundle, warnings=ground.warnings, clock=context.clock
+            )
             venue_id = where.id if isinstance(where, VenueRecord) else None
-            return sequence_answer(composed, ground, timings_ms, venue_id)
+            return sequence_answer(composed, ground, executor.observe(context, found.stage), venue_id)
 
         return await executor.compute(context, compose)
 

@@ -81,10 +81,11 @@ class SingleSearch:
         )
 
         def compose(found: Localisation) -> tuple[LocaliseAnswer, Answer]:
-            timings_ms = self._parts.executor.observe(context, found.stage)
             warnings = [*ground.hint_warnings(found), *ground.warnings]
-            composed = compose_answer(found, ground, spot, known, self._parts.bundle, warnings=warnings)
-            answer = localise_answer(composed, ground, timings_ms)
+            composed = compose_answer(
+                found, ground, spot, known, self._parts.bundle, warnings=warnings, clock=context.clock
+            )
+            answer = localise_answer(composed, ground, self._parts.executor.observe(context, found.stage))
             return answer.model_copy(update=self._extras(where, query, ground, found)), composed
 
         return await self._parts.executor.run_search(finish_with(steps, compose), context)

@@ -84,6 +84,7 @@ class TimingsAnswer(ResponseModel):
     retrieve: Milliseconds
     vdr: Milliseconds
     lpo: Milliseconds
+    next_step: Milliseconds = Field(0.0, description="Search for `view.next_step`, after an answer that is not sure.")
     total: Milliseconds = Field(description="Time from the complete upload to the answer, waiting included.")
 
 

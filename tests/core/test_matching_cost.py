@@ -345,3 +345,9 @@ def test_terms_add_up_to_the_cost() -> None:
         terms = matching_cost.terms(layouts, np.full(4, k), offset[k])
         np.testing.assert_allclose(terms.total(WEIGHTS), cost[k], rtol=1e-4)
         assert min(values.min() for values in terms) >= 0.0
+    # At an exact height, also the means over azimuths with the costs of rooms do.
+    exact = MatchingCost(PLAN, dataclasses.replace(query, camera_height=EXACT), 0.1, WEIGHTS, CONFIG)
+    by_azimuth = exact.by_azimuth(layouts)
+    assert by_azimuth.shape == (2, 4, 12)
+    expected = by_azimuth.mean(axis=2) + exact.room_costs[0, layouts.room_index]
+    np.testing.assert_allclose(exact.costs(layouts)[0], expected, rtol=1e-4)

@@ -236,6 +236,7 @@ def test_unsure_answer_has_a_next_step_and_a_sure_one_none(shipped: httpx.Client
     assert step["expected_bits"] > 0.0
     assert (step["turn_deg"] is None) == (step["kind"] in ("heading", "rooms"))
     assert "; the expected confidence is then " in step["text"]
+    assert 0.0 < unsure["timings_ms"]["next_step"] < unsure["timings_ms"]["total"]
     assert ask(shipped, home, wall, None, hfov_deg=53.0)["view"]["next_step"] == step
     sure = ask(shipped, home, (EXAMPLES / "kitchen.jpg").read_bytes(), None)
     assert sure["confidence"] >= 0.5

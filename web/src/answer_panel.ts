@@ -173,7 +173,7 @@ function otherWay(answer: Answer, index: number, select: (index: number) => void
 function facts(answer: Answer): HTMLElement {
   const stages = Object.entries(answer.timings_ms)
     .filter(([name, spent]) => name !== "total" && spent > 0)
-    .map(([name, spent]) => `${name} ${milliseconds(spent)}`);
+    .map(([name, spent]) => `${name.replace("_", " ")} ${milliseconds(spent)}`);
   const plans = (answer.plans ?? [])
     .filter(({ probability }) => probability !== null)
     .slice(0, MAX_PLANS)

@@ -23,13 +23,11 @@ from lalaloc_core.evaluate.bench.bounds import bench_bounds
 from lalaloc_core.evaluate.bench.house import bench_house
 from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.bench.service_latency import bench_service
-from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
 from lalaloc_core.evaluate.bench.steps import bench_steps
 from lalaloc_core.evaluate.bench.turns import bench_films, bench_turns
 
 _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
     **{group: partial(measure, rows) for group, rows in GROUPS.items()},
-    "rendering": bench_rendering,
     "service": bench_service,
     "turns": bench_turns,
     "films": bench_films,
@@ -40,8 +38,6 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
     "localisability": bench_localisability,
     "uninformative": bench_uninformative,
     "azimuths": bench_azimuths,
-    "methods": bench_methods,
-    "datasets": bench_datasets,
     "album_weights": bench_album_weights,
 }
 # Measured only on request: it takes hours, and chooses weights instead of measuring them.

@@ -17,12 +17,16 @@ from typing import Any
 
 import httpx
 import numpy as np
+from jaxtyping import UInt8
 
 from lalaloc_core.evaluate.bench.measured import Setting
-from lalaloc_core.evaluate.bench.speed import spheres_of_home
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.altered_plans import without_openings
+from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
+from lalaloc_core.learn.synth.homes.plans import TEST, home_of
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.photograph.cameras import Perspective
 
 _REQUESTS = 40
@@ -34,7 +38,7 @@ _PHONE_SIZE, PHONE_FIELD_DEG, _PHONE_PHOTOGRAPHS = (4032, 3024), 80.0, 4
 
 def bench_service(setting: Setting) -> dict[str, Any]:
     """Measure the latency of `POST /localise` from one client, and the memory of the service's processes."""
-    shots, images = spheres_of_home(_REQUESTS, (512, 1024), setting.textures)
+    shots, images = _spheres(setting.textures)
     plan, pictures = shots[0].home.plan, [encode_jpeg(image) for image in images]
     heights = [{"camera_height_m": f"{plan.camera_height_m}"}] * _REQUESTS
     # Stated, because a plain sphere of procedural materials can look like none.
@@ -61,6 +65,15 @@ def bench_service(setting: Setting) -> dict[str, Any]:
         # The smaller child is Python's resource tracker.
         report["workers_resident_mb"] = [size for size in _children_mb(process.pid) if size > _SMALL_PROCESS_MB]
     return report
+
+
+def _spheres(textures: Path | None) -> tuple[list[Shot], UInt8[np.ndarray, "n h w 3"]]:
+    """Return shots of the furnished test home closest to 100 m², of the first hundred, and their spheres."""
+    homes = (home_of(TEST, 0, index)[0] for index in range(100))
+    home = min(homes, key=lambda home: abs(home.plan.area_m2 - 100.0))
+    shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))
+    return shots, renderers.renderer(512, 1024).render(shots).cpu().numpy()
 
 
 def _latency(client: httpx.Client, plan_id: str, requests: list[tuple[bytes, dict[str, str]]]) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from lalaloc_core.localise.belief import (
 from lalaloc_core.localise.localisability.reports import known_of, step_after
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import KnownHeading
-from lalaloc_core.localise.search.pipeline import Localisation
+from lalaloc_core.localise.search.pipeline import Localisation, StageClock
 from lalaloc_core.localise.tracking import Odometry
 from lalaloc_core.localise.tracking.tracking_filter import Tracked
 
@@ -49,12 +49,13 @@ def compose_answer(
     warnings: Sequence[str] = (),
     with_step: bool = True,
     relative_heading: AssumedAngle | None = None,
+    clock: StageClock | None = None,
 ) -> Answer:
     """Compose the answer of a search.
 
     `known` is the heading that was known before the search, and `warnings` are those besides warnings about it and the
-    photograph. `with_step` computes the next step of an answer that is not sure. `relative_heading` is the heading
-    minus that of the first photograph of a turn.
+    photograph. `with_step` computes the next step of an answer that is not sure, a stage of `clock`.
+    `relative_heading` is the heading minus that of the first photograph of a turn.
     """
     model = bundle.manifest.confidence_for(view=found.query.is_view, turn=found.query.is_turn)
     confidence = found.confidence(model, ground.share(found))
@@ -83,7 +84,9 @@ def compose_answer(
         latent_distance=best.latent_distance,
         camera_height_m=found.camera_height_m,
         candidates=candidates,
-        view=_told(spot, ground, found, confidence, bundle if with_step else None, relative_heading),
+        view=_told(
+            spot, ground, found, confidence, bundle if with_step else None, relative_heading, clock or StageClock()
+        ),
         model=ModelAnswer.of(bundle),
         evidence=Evidence(ground, found, spot.photograph),
     )
@@ -177,6 +180,7 @@ def _told(
     confidence: Confidence | None,
     bundle: Bundle | None,
     relative_heading: AssumedAngle | None,
+    clock: StageClock,
 ) -> ViewAnswer:
     """Return the answer's part about its photograph; the next step follows from the model `bundle`, if any."""
     bits = information_bits(ground.plan, ground.grid.poses, found.posterior.pose)
@@ -186,7 +190,8 @@ def _told(
     if bundle is not None and confidence is not None and can_turn:
         field = spot.photograph.hfov.value
         known = known_of(found, confidence, arcs=spot.arcs, field=field, rooms_known=ground.rooms_known)
-        step = step_after(ground.plan, bundle.manifest, known, step_m=ground.grid.step_m)
+        with clock.stage("next_step"):
+            step = step_after(ground.plan, bundle.manifest, known, step_m=ground.grid.step_m)
     objects = None
     if seen is not None:
         objects = [

@@ -212,9 +212,15 @@ def overlap_warnings(angles: Sequence[TurnAngles], hfov: float) -> list[str]:
 
 
 def compose_turn(
-    turn: Turn, found: TurnLocalisation, ground: Ground, bundle: Bundle, *, warnings: Sequence[str] = ()
+    turn: Turn,
+    found: TurnLocalisation,
+    ground: Ground,
+    bundle: Bundle,
+    *,
+    warnings: Sequence[str] = (),
+    clock: StageClock | None = None,
 ) -> TurnAnswer:
-    """Compose the answer about photographs of one spot; its first pose has the next step.
+    """Compose the answer about photographs of one spot; its first pose has the next step, a stage of `clock`.
 
     `warnings` are those besides warnings about the photographs.
     """
@@ -231,6 +237,7 @@ def compose_turn(
             bundle,
             with_step=index == 0,
             relative_heading=turn.relative_headings[index],
+            clock=clock,
         )
         for index, (photograph, picture) in enumerate(zip(turn.photographs, found.pictures, strict=True))
     ]

@@ -29,17 +29,17 @@ from lalaloc_core.localise.query import CameraHeight, PredictedOpenings, Predict
 from lalaloc_core.render.sampling import PoseSet
 
 StepKind = Literal["turn", "door", "heading", "rooms"]
-# Places that stand for the posterior, and drawn photographs of each step.
-_PLACES, _DRAWS = 256, 24
+# Places that stand for the posterior, drawn photographs of each step, and step of the azimuths that are compared.
+_PLACES, _DRAWS, _STRIDE = 128, 24, 2
 # Angles (radians) that are tried for another photograph from the spot.
 _TURNS = tuple(math.radians(degrees) for degrees in (45, -45, 90, -90, 135, -135, 180))
 # Share of another photograph that must be new.
 _NEW = 0.5
 # Doors that are tried; length of the step behind one (m), and the difference of the distance of the same door (m).
 _DOORS, BEHIND_M, _SAME_DOOR_M = 3, 1.0, 0.7
-# Error of a stated heading, as of a compass (radians), and its values that are tried.
+# Error of a stated heading, as of a compass (radians), and the headings that can be stated.
 HEADING_ERROR = math.radians(10.0)
-_HEADINGS_TOLD = (-0.8, -0.4, 0.0, 0.4, 0.8)
+_STATED = np.radians(np.arange(0.0, 360.0, 4.0))
 # Rooms that are named for a choice, and the smallest probability of one.
 _ROOMS, _MIN_ROOM = 5, 0.03
 # Smallest increase of the confidence that is worth a step.
@@ -112,7 +112,8 @@ def next_steps(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: flo
     steps = list(_statements(plan, belief, known))
     errors = manifest.errors if not known.is_view else None if manifest.view is None else manifest.view.errors
     if errors is not None and manifest.profile_columns:
-        drawn = _Photographs(plan, manifest, errors, known, belief, step_m, np.random.default_rng(0))
+        rng = np.random.default_rng(0)
+        drawn = _Photographs(plan, manifest, errors.thinned(_STRIDE), known, belief, step_m, rng)
         steps += [*drawn.turns(), *drawn.doors()]
     steps = [step for step in steps if step.confidence >= known.fit * now + _WORTH]
     return sorted(steps, key=lambda step: (-step.confidence, -step.bits))
@@ -153,54 +154,56 @@ class _Belief:
         """Share within 1 m of the best place."""
         return float((self.weight @ self._near).max())
 
-    def told(self, likelihood: Float[np.ndarray, "k n"], *, near: Bool[np.ndarray, "n n"] | None = None) -> _Told:
+    def told(
+        self, likelihood: Float[np.ndarray, "k n"], *, near: Float[np.ndarray, "n n"] | None = None, drawn: bool = True
+    ) -> _Told:
         """Return the mean information and the mean share within 1 m of the best place after some observations.
 
-        `likelihood` is that of each observation at every place; `near` states which places are close, if not those of
-        the photograph.
+        `likelihood` is that of each observation at every place; the observations are `drawn`, or all that are possible.
+        `near` is 1 for places that are close, if not those of the photograph.
         """
         after = likelihood * self.weight
-        total = after.sum(axis=1, keepdims=True)
-        after = after[total[:, 0] > 0.0] / total[total[:, 0] > 0.0]
-        if not len(after):
+        total = after.sum(axis=1)
+        possible = total > 0.0
+        if not possible.any():
             return _Told(0.0, self.share)
-        cells = np.zeros((len(after), int(self.cell.max()) + 1))
-        np.add.at(cells.T, self.cell, after.T)
-        before = np.bincount(self.cell, self.weight)
+        after, total = after[possible] / total[possible, None], total[possible]
+        cells, before = after @ self._in_cell, self.weight @ self._in_cell
         ratio = np.divide(cells, before, out=np.ones_like(cells), where=cells > 0.0)
-        share = after @ (self._near if near is None else near.astype(float))
-        return _Told(float((cells * np.log2(ratio)).sum(axis=1).mean()), float(share.max(axis=1).mean()))
+        bits = (cells * np.log2(ratio)).sum(axis=1)
+        share = (after @ (self._near if near is None else near)).max(axis=1)
+        weights = None if drawn else total
+        return _Told(float(np.average(bits, weights=weights)), float(np.average(share, weights=weights)))
+
+    @cached_property
+    def _in_cell(self) -> Float[np.ndarray, "n c"]:
+        return (self.cell[:, None] == np.arange(self.cell.max() + 1)).astype(float)
 
     @cached_property
     def _near(self) -> Float[np.ndarray, "n n"]:
-        return _near_each_other(self.poses.position_m).astype(float)
+        return _near_each_other(self.poses.position_m)
 
 
-def _near_each_other(position_m: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n n"]:
-    """Return which places are within 1 m of each other."""
-    return np.hypot(*(position_m[:, None] - position_m[None]).T) < RIGHT_WITHIN_M
+def _near_each_other(position_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n n"]:
+    """Return 1 for places within 1 m of each other, else 0."""
+    return (np.hypot(*(position_m[:, None] - position_m[None]).T) < RIGHT_WITHIN_M).astype(float)
 
 
 def _statements(plan: FloorPlan, belief: _Belief, known: Known) -> Iterator[NextStep]:
     """Yield the steps that state the heading or choose a room."""
-    every, weight = np.arange(len(belief.weight)), belief.weight
     fit = known.fit * min(known.answer / belief.share, 1.0)
-    # The mean over places takes each as often as it is probable.
-    drawn = every[np.minimum(np.searchsorted(np.cumsum(weight), (every + 0.5) / len(every)), len(every) - 1)]
     if not known.heading:
-        told = [belief.heading[drawn] + share * HEADING_ERROR for share in _HEADINGS_TOLD]
-        agree = np.abs(wrap_angle(np.concatenate(told)[:, None] - belief.heading[None])) <= HEADING_ERROR
-        bits, share = belief.told(agree.astype(float))
+        agree = np.abs(wrap_angle(_STATED[:, None] - belief.heading)) <= HEADING_ERROR
+        bits, share = belief.told(agree / agree.sum(axis=0), drawn=False)
         yield NextStep(kind="heading", bits=bits, confidence=fit * share)
     room = belief.poses.room_index
-    mass = np.bincount(room, weight, minlength=len(plan.rooms))
+    mass = np.bincount(room, belief.weight, minlength=len(plan.rooms))
     probable = np.argsort(-mass, kind="stable")[: np.count_nonzero(mass >= _MIN_ROOM)]
     # Rooms of one name cannot be chosen by it.
-    names = [plan.rooms[index].name.casefold() for index in range(len(plan.rooms))]
-    kinds = np.array([names.index(name) for name in names])
+    _, kinds = np.unique([room.name.casefold() for room in plan.rooms], return_inverse=True)
     if known.rooms or len(np.unique(kinds[probable])) < 2:
         return
-    bits, share = belief.told((kinds[room[drawn]][:, None] == kinds[room][None]).astype(float))
+    bits, share = belief.told((np.unique(kinds[room])[:, None] == kinds[room]).astype(float), drawn=False)
     rooms = tuple(int(index) for index in probable[:_ROOMS])
     yield NextStep(kind="rooms", bits=bits, confidence=fit * share, rooms=rooms)
 
@@ -228,7 +231,7 @@ class _Photographs:
         """Render the layouts of all places."""
         self._plan, self._errors, self._known, self._belief, self._rng = plan, errors, known, belief, rng
         self._weights = manifest.evidence_for(view=known.is_view)
-        self._columns, self._config = manifest.profile_columns or 0, MatchingConfig()
+        self._columns, self._config = manifest.profile_columns // _STRIDE, MatchingConfig()
         self._reach_m = self._config.grid_reach * step_m
         view = manifest.view
         self._prior = np.array(manifest.opening_prior if not known.is_view or view is None else view.opening_prior)
@@ -314,30 +317,23 @@ class _Photographs:
         self, layouts: Layouts, rows: Int[np.ndarray, "d"], shown: Bool[np.ndarray, "k w"]
     ) -> Float[np.ndarray, "d k n"]:
         """Return the likelihood at every place of photographs drawn at some, each showing the azimuths of k masks."""
-        errors, rng = self._errors, self._rng
-        log_profile = layouts.log_profile[rows].astype(float)
-        kind = np.zeros(log_profile.shape, np.uint8) if layouts.kind is None else layouts.kind[rows]
-        log_m, log_scale = errors.profile(log_profile, rng)
-        log_probability = errors.openings(kind, rng)
-        found = np.empty((len(rows), len(shown), len(layouts)))
-        for number in range(len(rows)):
-            scale = np.where(shown, log_scale[number], np.inf).astype(np.float32)
-            centre = np.broadcast_to(log_m[number].astype(np.float32), scale.shape)
-            openings = np.where(shown[..., None], log_probability[number], np.log(self._prior))
-            query = Query(
-                np.zeros((len(shown), 1), np.float32),
-                np.zeros(len(shown)),
-                0.0,
-                True,
-                CameraHeight(self._known.height_m, 0.0),
-                profile=PredictedProfile(centre, scale),
-                openings=PredictedOpenings(openings, self._prior),
-                is_view=self._known.is_view,
-            )
-            cost, _ = MatchingCost(self._plan, query, self._reach_m, self._weights, self._config).costs(layouts)
-            logs = -self._weights.temperature * cost.astype(float)
-            found[number] = np.exp(logs - logs.max(axis=1, keepdims=True))
-        return found
+        kind = np.zeros(layouts.log_profile.shape, np.uint8) if layouts.kind is None else layouts.kind
+        log_m, log_scale = self._errors.profile(layouts.log_profile[rows].astype(float), self._rng)
+        openings = PredictedOpenings(self._errors.openings(kind[rows], self._rng), self._prior)
+        query = Query(
+            np.zeros((len(rows), 1), np.float32),
+            np.zeros(len(rows)),
+            0.0,
+            True,
+            CameraHeight(self._known.height_m, 0.0),
+            profile=PredictedProfile(log_m.astype(np.float32), log_scale.astype(np.float32)),
+            openings=openings,
+            is_view=self._known.is_view,
+        )
+        cost = MatchingCost(self._plan, query, self._reach_m, self._weights, self._config).by_azimuth(layouts)
+        # The other azimuths cost nothing.
+        logs = -self._weights.temperature / self._columns * (cost @ shown.T.astype(np.float32)).transpose(0, 2, 1)
+        return np.exp(logs - logs.max(axis=2, keepdims=True))
 
     def _within(self, centre: float, width: float) -> Bool[np.ndarray, "w"]:
         """Return the columns within an arc (radians)."""

@@ -31,6 +31,7 @@ neighbouring azimuths are correlated, so each term has a weight in units of the 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -184,13 +185,27 @@ class MatchingCost:
             cost[part], best[part] = self._compared(self._gathered(layouts, pose[part]), hypothesis[part])
         return cost, self.offsets[best]
 
+    def by_azimuth(self, layouts: Layouts) -> Float[np.ndarray, "k n w"]:
+        """Return the cost of walls and openings of every pose at each azimuth under every hypothesis, at δ = 0.
+
+        The means over the azimuths are costs without those of rooms. For photographs that show all around.
+        """
+        gathered = self._gathered(layouts, np.arange(len(layouts)))
+        cost = np.empty((self.hypotheses, *gathered.log_profile.shape), np.float32)
+        for number in range(self.hypotheses):
+            hypothesis = np.array([number])
+            (factor,) = self._factors(gathered, hypothesis, np.zeros((1, 1), np.float32))
+            np.log(factor, out=cost[number])
+            cost[number] += self._weights.openings * self._openings(gathered, hypothesis)
+        return cost
+
     def terms(self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]) -> Terms:
         """Return the terms of the cost of poses that each have their own hypothesis and δ."""
         every = np.arange(len(layouts))
         gathered = self._gathered(layouts, every)
         return Terms(
             walls=self._walls(gathered, hypothesis, offset[None])[0].astype(np.float64),
-            openings=self._openings(gathered, hypothesis).astype(np.float64),
+            openings=self._openings(gathered, hypothesis).mean(axis=1).astype(np.float64),
             ceiling=self._ceilings(offset)[every, layouts.room_index],
             room_type=self._room_types[layouts.room_index],
             objects=self._objects[layouts.room_index],
@@ -289,13 +304,21 @@ class MatchingCost:
         """Return the cost of poses under their hypotheses, one each or one for all, and the number of the best δ."""
         cost = self._walls(gathered, hypothesis, self.offsets[:, None])
         cost += self.room_costs[:, gathered.room_index]
-        return cost.min(axis=0) + self._weights.openings * self._openings(gathered, hypothesis), cost.argmin(axis=0)
+        openings = self._openings(gathered, hypothesis).mean(axis=1)
+        return cost.min(axis=0) + self._weights.openings * openings, cost.argmin(axis=0)
 
     def _walls(
         self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"], offset: Float[np.ndarray, "j #m"]
     ) -> Float[np.ndarray, "j m"]:
         """Return the walls' term at each of several δ."""
-        seen, offset = self._seen_walls, offset.astype(np.float32)
+        width, factors = gathered.log_profile.shape[1], self._factors(gathered, hypothesis, offset.astype(np.float32))
+        return np.stack([mean_log(factor, columns=width) for factor in factors])
+
+    def _factors(
+        self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"], offset: Float[np.ndarray, "j #m"]
+    ) -> Iterator[Float[np.ndarray, "m s"]]:
+        """Yield the factors whose logs are the cost of walls at the s seen azimuths, for each of several δ."""
+        seen = self._seen_walls
         first, *rivals = seen.modes
         (count, width), shown = gathered.log_profile.shape, first.centre.shape[1]
         log_profile = gathered.log_profile
@@ -316,7 +339,6 @@ class MatchingCost:
         precision_behind = first.precision.take(predicted)
         residual_behind = (log_behind - first.centre.take(predicted)) * precision_behind
         offset_behind = offset if offset.shape[1] == 1 else offset[:, pose]
-        cost = np.empty((len(offset), count), np.float32)
         for j in range(len(offset)):
             # The last δ reuses the memory of the residuals.
             out = residual if j == len(offset) - 1 else None
@@ -334,15 +356,14 @@ class MatchingCost:
                 # At least 1: an opening costs nothing where its own wall fits, as networks learn to see that wall.
                 either = np.maximum(1.0 / (1.0 / factor.take(place) + odds / behind), 1.0)
                 factor.put(place, either)
-            cost[j] = mean_log(factor, columns=width)
-        return cost
+            yield factor
 
-    def _openings(self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
-        """Return the openings' term."""
+    def _openings(self, gathered: _Gathered, hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m #w"]:
+        """Return the unweighted cost of openings at every azimuth."""
         loss = self._opening_losses
         if loss is None or gathered.opening is None:
-            return np.zeros(len(gathered.room_index), np.float32)
-        return loss.take(hypothesis[:, None] * loss[0, 0].size + gathered.opening).mean(axis=1)
+            return np.zeros((len(gathered.room_index), 1), np.float32)
+        return loss.take(hypothesis[:, None] * loss[0, 0].size + gathered.opening)
 
     @cached_property
     def _seen_walls(self) -> SeenWalls:
