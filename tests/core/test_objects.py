@@ -19,7 +19,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import Confidence, is_outside, reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
-from lalaloc_core.localise.encode.view_encoder import objects_of_views, outside_odds
+from lalaloc_core.localise.encode.view_encoder import OBJECT_OUTPUTS, objects_of_views, outside_odds
 from lalaloc_core.localise.match import MatchingConfig, PlaceCost
 from lalaloc_core.localise.match.matching_cost import MatchingCost
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, PredictedRoomType, Query, SeenObject, SeenObjects
@@ -79,6 +79,7 @@ def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
     grid = build_grid(rooms, encoder().layouts, step_m=0.5, camera_height_m=1.5, latents=False)
     alone = query(asked)
     found = localise(rooms, grid, encoder().layouts, alone, refine="none")
+    features = present(encoder().with_features(asked[0]).features)
     parts: list[str] = []
 
     class Helper(ThreadPoolExecutor):
@@ -91,9 +92,13 @@ def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
         try:
             beside = query(asked)
             again = localise(rooms, grid, encoder().layouts, beside, refine="none")
+            same = present(encoder().with_features(asked[0]).features)
         finally:
             encoder().use_helper(lambda: None)
-    assert parts == ["seen_objects", "by_chance"]
+    assert parts == ["seen_objects", "by_chance", "_object_outputs"]
+    assert features.outputs.keys() == same.outputs.keys() >= set(OBJECT_OUTPUTS)
+    for name, values in features.outputs.items():
+        np.testing.assert_array_equal(same.outputs[name], values)
     assert beside.objects is not None
     assert alone.objects is not None
     assert beside.objects.objects == alone.objects.objects

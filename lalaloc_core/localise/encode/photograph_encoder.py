@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +27,8 @@ from lalaloc_core.localise.encode.view_encoder import (
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
 from lalaloc_core.photograph.patches import joined_patches
+
+_ArgumentT, _ResultT = TypeVar("_ArgumentT"), TypeVar("_ResultT")
 
 
 class PhotographEncoder:
@@ -84,8 +88,7 @@ class PhotographEncoder:
         self.check(photograph)
         assert self._views is not None
         turned = [(photograph, 0.0), *others]
-        helper = None if photograph.features is not None or self._objects is None else self.layouts.helper()
-        beside = None if helper is None else helper.submit(self.seen_objects, turned)
+        objects = self._beside(self.seen_objects, turned, with_helper=photograph.features is None)
         if photograph.features is None:
             patches = self._patches(turned)
             outputs = self._views.outputs([patch.rgba for patch, _ in patches], height_m)
@@ -97,13 +100,12 @@ class PhotographEncoder:
         query = self._views.query_of_outputs(
             outputs, placed, heading, camera_height, heading_tolerance=heading_tolerance
         )
-        objects = self.seen_objects(turned) if beside is None else beside.result()
         directions = tuple(
             WallDirection(view.wall_direction.value + turn, view.wall_direction.sd)
             for view, turn in turned
             if view.wall_direction is not None
         )
-        several = {"objects": objects, "wall_directions": directions, "is_turn": bool(others)}
+        several = {"objects": objects(), "wall_directions": directions, "is_turn": bool(others)}
         searched = None if query.searched is None else replace(query.searched, **several)
         return replace(query, **several, searched=searched)
 
@@ -121,10 +123,19 @@ class PhotographEncoder:
             outputs["ring"] = np.zeros((len(RING_HEIGHTS_M), *outputs["ring"].shape), np.float32)
             return replace(photograph, features=PhotographFeatures(outputs))
         assert self._views is not None
-        outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0)
-        if self._objects is not None:
-            outputs |= self._objects.outputs(photograph)
+        objects = self._beside(self._object_outputs, photograph)
+        outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0) | objects()
         return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
+
+    def _beside(
+        self, work: Callable[[_ArgumentT], _ResultT], argument: _ArgumentT, *, with_helper: bool = True
+    ) -> Callable[[], _ResultT]:
+        """Return a function with the result of recognising objects, meanwhile on an idle core if there is one."""
+        helper = self.layouts.helper() if with_helper and self._objects is not None else None
+        return partial(work, argument) if helper is None else helper.submit(work, argument).result
+
+    def _object_outputs(self, photograph: Photograph) -> dict[str, np.ndarray]:
+        return {} if self._objects is None else self._objects.outputs(photograph)
 
     def _patches(self, turned: Sequence[tuple[Photograph, float]]) -> list[tuple[Patch, float]]:
         """Return the patches of photographs of one spot, and the standard deviations (radians) of their tilt.

@@ -200,7 +200,7 @@ def _statements(plan: FloorPlan, belief: _Belief, known: Known) -> Iterator[Next
     mass = np.bincount(room, belief.weight, minlength=len(plan.rooms))
     probable = np.argsort(-mass, kind="stable")[: np.count_nonzero(mass >= _MIN_ROOM)]
     # Rooms of one name cannot be chosen by it.
-    _, kinds = np.unique([room.name.casefold() for room in plan.rooms], return_inverse=True)
+    _, kinds = np.unique([named.name.casefold() for named in plan.rooms], return_inverse=True)
     if known.rooms or len(np.unique(kinds[probable])) < 2:
         return
     bits, share = belief.told((np.unique(kinds[room])[:, None] == kinds[room]).astype(float), drawn=False)
