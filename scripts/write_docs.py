@@ -105,7 +105,7 @@ def pairs_table() -> str:
     """Return durations of each release, and over those of an old one (processor times in brackets), as Markdown."""
     releases = {name: found for name, found in _read("docs/pairs.json").items() if "figures" in found}
 
-    def cell(name: str, found: dict[str, float]) -> str:
+    def cell(name: str, found: dict[str, Any]) -> str:
         unit = "" if "over" in name else " s"
         cpu = "" if found["cpu_ratio"] is None else f" ({found['cpu_ratio']:.2f})"
         return f"{found['after']:.3g}{unit}: {found['ratio']:.2f}{cpu}"
