@@ -13,7 +13,7 @@ STAMP := $(VENV)/.everything
 comma := ,
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo serve serve-lan check test test-all ray lint types openapi docs neighbours site client web lock notice audit digests clean
+.PHONY: help setup develop demo serve serve-lan check test test-all ray lint types openapi docs neighbours pictures site client web lock notice audit digests clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -93,6 +93,9 @@ docs: $(STAMP) ## write the generated parts of docs/
 neighbours: $(STAMP) ## measure every route beside another tenant, write docs/reference/neighbours.md (about 15 minutes)
 	-$(BIN)/python -m benchmarks.neighbours --json docs/neighbours.json
 	$(BIN)/python -m scripts.write_docs
+
+pictures: $(STAMP) ## draw the pictures of README.md and docs/ into docs/images (needs Chromium; about 3 minutes)
+	$(BIN)/python -m scripts.draw_pictures
 
 site: $(STAMP) ## build the documentation site into build/site; warnings are errors
 	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs build/site

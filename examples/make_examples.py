@@ -1,8 +1,7 @@
-"""Render the example spheres and photographs of a phone, write the spheres' true poses, and draw pictures for docs/.
+"""Render the example spheres and photographs of a phone, and write the spheres' true poses.
 
 Run `python -m examples.make_examples` after a change of the flat, the views or the renderer. The flat was drawn by
-hand, and no training data contains its plan, furniture or lighting. The pictures are those of
-docs/how-to/take-photographs.md: a usable sphere, a tilted one, and an incomplete one.
+hand, and no training data contains its plan, furniture or lighting.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from lalaloc_core.learn.synth.rendering.sphere_renderer import SphereRenderer
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.photograph.cameras import Perspective
-from lalaloc_core.photograph.spheres import level
 
 HEIGHT, WIDTH = 512, 1024
 # Rays per pixel and axis, for smooth edges.
@@ -62,12 +60,6 @@ _PHONE_PITCH, _PHONE_ROLL = math.radians(-4.0), math.radians(1.5)
 _PHONE_SPHERE, _PHONE_SIZE, _TURN_SIZE, _TURN_QUALITY = (1536, 3072), (1280, 960), (640, 480), 75
 _EXIF_IFD, _FOCAL_LENGTH_35MM = 0x8769, 0xA405
 
-# Pictures for docs/: rotation of a tilted camera, and the part of a sphere in a phone's panorama mode.
-_PICTURES = FOLDER.parent / "docs" / "images"
-_PICTURE_WIDTH, _PICTURE_HEIGHT, _PICTURE_QUALITY = 768, 384, 85
-_PITCH, _ROLL = math.radians(8.0), math.radians(6.0)
-_PHONE_ROWS = slice(_PICTURE_HEIGHT // 3, 2 * _PICTURE_HEIGHT // 3)
-
 
 def main() -> None:
     """Render every view of the flat and write the true poses."""
@@ -80,7 +72,6 @@ def main() -> None:
         print(FOLDER / view.file)
     write_poses([true_pose(home.plan, view) for view in VIEWS])
     _write_phone_photographs(home, materials)
-    _write_pictures()
 
 
 def _write_phone_photographs(home: Home, materials: MaterialLibrary) -> None:
@@ -94,21 +85,6 @@ def _write_phone_photographs(home: Home, materials: MaterialLibrary) -> None:
         pixels = cut_view(sphere, camera, azimuth=math.radians(turn_deg), pitch=_PHONE_PITCH, roll=_PHONE_ROLL)
         Image.fromarray(pixels).save(FOLDER / name, quality=quality, optimize=True, exif=exif)
         print(FOLDER / name)
-
-
-def _write_pictures() -> None:
-    _PICTURES.mkdir(exist_ok=True)
-    with Image.open(FOLDER / "kitchen.jpg") as picture:
-        size = _PICTURE_WIDTH, _PICTURE_HEIGHT
-        sphere = np.asarray(picture.convert("RGB").resize(size, Image.Resampling.LANCZOS))
-    pictures = {
-        "sphere": sphere,
-        "tilted": level(sphere, pitch=_PITCH, roll=_ROLL),
-        "phone": sphere[_PHONE_ROWS, : 2 * _PICTURE_WIDTH // 3],
-    }
-    for name, pixels in pictures.items():
-        path = _PICTURES / f"{name}.jpg"
-        Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=_PICTURE_QUALITY, optimize=True)
 
 
 def example_home() -> Home:

@@ -20,6 +20,7 @@ from examples.launch import running_service
 from lalaloc_core.cli import main
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.annotations import read_annotation
+from scripts.draw_pictures import IMAGES, pictures, shown
 from scripts.write_docs import documents
 from service.schemas import GeoPose, LocaliseAnswer
 from service.schemas.plan_import import ImportReport
@@ -86,6 +87,15 @@ def test_local_links_resolve(page: Path) -> None:
 def test_generated_parts_are_up_to_date() -> None:
     stale = [path.name for path, text in documents().items() if path.read_text(encoding="utf-8") != text]
     assert stale == [], "run `make docs`"
+
+
+def test_pictures_show_the_present_version() -> None:
+    drawn = json.loads((IMAGES / "drawn.json").read_text(encoding="utf-8"))
+    changed = [name for name, digest in shown().items() if drawn["shown"].get(name) != digest]
+    assert changed == [], "docs/images shows these as they were: run `make pictures`"
+    assert drawn["pictures"] == pictures(), "pictures were changed otherwise: run `make pictures`"
+    linked = re.findall(r"!\[[^]]*\]\(\S*images/(\S+)\)", "".join(page.read_text("utf-8") for page in PAGES))
+    assert set(linked) == drawn["pictures"].keys()
 
 
 def test_json_examples_are_valid(tmp_path: Path) -> None:
