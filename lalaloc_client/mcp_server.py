@@ -244,12 +244,13 @@ class _Tools:
         context: Context[Any, Any],
         name: Annotated[str | None, Field(description="Part of the plans' names. Default: all plans.")] = None,
     ) -> str:
-        """List the first hundred stored floor plans with their ids and the times of their last change."""
+        """List the first hundred stored floor plans: their ids, and the numbers and times of their last revisions."""
         async with self._service(context) as service:
             plans: list[dict[str, Any]] = []
             async for plan in service.floorplans(name, page_size=_MAX_LISTED):
                 stored = None if plan.updated_at is None else plan.updated_at.isoformat(timespec="seconds")
-                plans.append({"id": plan.id, "name": plan.name, "status": plan.status, "updated_at": stored})
+                facts = {key: getattr(plan, key) for key in ("id", "name", "status", "revision_number")}
+                plans.append(facts | {"updated_at": stored})
                 if len(plans) == _MAX_LISTED:
                     break
             return _text(plans)

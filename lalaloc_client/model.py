@@ -97,6 +97,7 @@ class FloorPlanSummary:
     created_at: datetime
     revision: str | None = None
     updated_at: datetime | None = None
+    revision_number: int | None = None
 
 
 @dataclass(frozen=True)

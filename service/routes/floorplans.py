@@ -163,6 +163,7 @@ def _list_entries(summaries: list[PlanSummary], states: list[GridState]) -> list
         FloorPlanSummary(
             id=summary.id,
             revision=summary.revision_id,
+            revision_number=summary.revision,
             name=summary.name,
             status=state.status,
             progress=state.progress,

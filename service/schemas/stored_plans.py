@@ -94,6 +94,7 @@ class FloorPlanSummary(ResponseModel):
 
     id: str
     revision: str
+    revision_number: int = Field(ge=1, description="Number of the revision, from 1.")
     name: str
     status: PlanStatus
     progress: Share

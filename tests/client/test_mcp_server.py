@@ -76,7 +76,7 @@ def test_plan_is_imported_and_photographs_are_localised(app: httpx.Client, flat:
         assert plan["status"] == "ready"
         assert [room["name"] for room in plan["rooms"]] == [room["name"] for room in FLAT["rooms"]]
         listed = _said(await client.call_tool("list_plans", {}))
-        assert plan["id"] in {item["id"] for item in listed}
+        assert (plan["id"], 1) in {(item["id"], item["revision_number"]) for item in listed}
         asked = {"photograph": str(photograph), "floorplan_id": plan["id"], "heading_deg": 30.0}
         found = await client.call_tool("localise_photograph", asked)
         answer = _said(found)

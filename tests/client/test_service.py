@@ -36,7 +36,7 @@ def test_plan_is_stored_listed_and_deleted(service: Any, tmp_path: Path) -> None
     fetched = service.floorplan(plan.id)
     assert (fetched.id, fetched.rooms, fetched.grid) == (plan.id, plan.rooms, plan.grid)
     listed = {summary.id: summary for summary in service.floorplans()}
-    assert listed[plan.id].rooms == 2
+    assert (listed[plan.id].rooms, listed[plan.id].revision_number) == (2, 1)
     service.delete_floorplan(plan.id)
     with pytest.raises(NotFoundError) as caught:
         service.floorplan(plan.id)

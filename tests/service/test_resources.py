@@ -195,8 +195,8 @@ def test_replaced_plan_has_another_revision(client: httpx.Client) -> None:
     assert response.headers["content-location"] == created.headers["content-location"] == url
     now = client.get(url)
     assert (now.json(), now.headers["etag"]) == (after, response.headers["etag"])
-    listed = client.get("/floorplans").json()["floorplans"]
-    assert [plan["revision"] for plan in listed if plan["id"] == before["id"]] == [after["revision"]]
+    listed = {plan["id"]: plan for plan in client.get("/floorplans").json()["floorplans"]}[before["id"]]
+    assert (listed["revision"], listed["revision_number"]) == (after["revision"], 2)
 
 
 def test_kept_revisions_can_be_read(start_app: StartApp, tmp_path: Path) -> None:

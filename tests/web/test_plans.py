@@ -270,6 +270,15 @@ def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
 
 
 @pytest.mark.slow
+def test_plans_of_one_name_show_date_and_revision(desktop: Visit) -> None:
+    for _ in range(2):
+        upload(desktop.client, FLAT | {"name": "Twin"})
+    told = [re.compile(r"Twin.*stored \d+ \w+ \d{4}, \d\d:\d\d, revision 1$")] * 2
+    for path, entries in (("/", "#plan-list .plan"), ("/", "#venue-form-plan option"), ("/pin", "#plan-choice option")):
+        expect(desktop.open(path).locator(entries, has_text="Twin")).to_have_text(told)
+
+
+@pytest.mark.slow
 def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, inline_grid_poses=0) as client:
         for visited in visit(browser, client):

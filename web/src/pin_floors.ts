@@ -2,8 +2,9 @@
 
 import { api } from "./api";
 import { h, s } from "./dom";
+import { nameIn } from "./plan_caption";
 import { boxOf, path } from "./plan_drawing";
-import type { Layout, Plan, RoomLayout } from "./types";
+import type { Layout, Plan, PlanSummary, RoomLayout, Venue } from "./types";
 import { planLabel } from "./venues";
 import type { Schemas } from "../../clients/typescript/src/index";
 
@@ -16,8 +17,8 @@ export interface Floor {
 }
 
 /** Return a group of a list of plans and venues; false if it is empty. */
-export function choicesOf(label: string, kind: string, places: { id: string; name: string }[]): HTMLElement | false {
-  const options = places.map(({ id, name }) => h("option", { value: `${kind}:${id}` }, name));
+export function choicesOf(label: string, kind: string, places: (PlanSummary | Venue)[]): HTMLElement | false {
+  const options = places.map((place) => h("option", { value: `${kind}:${place.id}` }, nameIn(place, places)));
   return options.length > 0 && h("optgroup", { label }, ...options);
 }
 

@@ -3,7 +3,7 @@
 import { byId, h, show } from "./dom";
 import { InputError, showError } from "./notices";
 import { plainWords } from "./plain_words";
-import type { Plan, PlanDocument } from "./types";
+import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 const DRAFT =
   "This plan is a draft, derived from a picture or from lines: check it, and correct it with “Edit”. When all doors or " +
@@ -13,10 +13,8 @@ const MAX_WARNINGS = 4;
 /** Describe a stored plan, or the example before it is stored; null: no plan is shown. */
 export function showCaption(plan: Plan | null, example: PlanDocument | null = null): void {
   byId("plan-name").textContent = plan?.name ?? example?.name ?? "No plan chosen";
-  const facts = (shown: Plan): string =>
-    `${shown.rooms.length} rooms, ${shown.area_m2.toFixed(1)} m², revision ${shown.revision_number}`;
-  byId("plan-facts").textContent =
-    plan !== null ? facts(plan) : example !== null ? "example, stored with the first query" : "";
+  const facts = plan && `${plan.rooms.length} rooms, ${plan.area_m2.toFixed(1)} m², revision ${plan.revision_number}`;
+  byId("plan-facts").textContent = facts ?? (example === null ? "" : "example, stored with the first query");
   byId("preparing").hidden = plan?.status !== "preparing";
   byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
   byId<HTMLButtonElement>("edit-plan").disabled = plan === null;
@@ -25,6 +23,18 @@ export function showCaption(plan: Plan | null, example: PlanDocument | null = nu
   }
   showWarnings(plan);
 }
+
+type Stored = Pick<PlanSummary, "name" | "updated_at"> & { revision_number?: number };
+
+/** Tell a plan or venue from others of its name in a list by its last change; "" if no other has its name. */
+export function storedAs({ name, updated_at, revision_number: revision }: Stored, listed: Stored[]): string {
+  if (listed.filter((other) => other.name === name).length < 2) return "";
+  const date = new Date(updated_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
+  return `stored ${date}${revision === undefined ? "" : `, revision ${revision}`}`;
+}
+
+/** Return the name of a plan or venue in a list, with its last change if others have it. */
+export const nameIn = (place: Stored, all: Stored[]) => [place.name, storedAs(place, all)].filter(Boolean).join(", ");
 
 /** Show the warnings about a plan; the rest of a long list opens with a click. */
 function showWarnings(plan: Plan | null): void {

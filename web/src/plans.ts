@@ -8,6 +8,7 @@ import { eventsOf } from "./events";
 import { type Example, exampleFiles, examplePlan, ROOMS, SPHERES, TURN } from "./example";
 import { checkPixels, hasOptions, ImportForm, PICTURES } from "./import_form";
 import { attempt, clearError, say, showError } from "./notices";
+import { storedAs } from "./plan_caption";
 import type { Plan, PlanDocument, PlanSummary } from "./types";
 
 /** True if the import guessed nothing that the user may want to correct. */
@@ -283,18 +284,13 @@ export class Plans {
 
   private draw(): void {
     const entries = this.found.map((plan) => {
+      const { id, name } = plan;
       const done = Math.round(100 * plan.progress);
       const state = { preparing: `preparing, ${done} %`, failed: "failed", ready: "" }[plan.status];
-      const isAlone = this.found.filter(({ name }) => name === plan.name).length === 1;
-      const date = new Date(plan.updated_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
       const size = `${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}, ${plan.area_m2.toFixed(0)} m²`;
-      const facts = [size, state, isAlone ? "" : `stored ${date}`];
-      const isChosen = plan.id === this.current?.id;
-      const choose = planButton(plan.name, facts.filter(Boolean).join(", "), isChosen, () => this.pick(plan.id));
-      const remove = button("×", () => void this.remove(plan), {
-        class: "remove",
-        "aria-label": `Delete ${plan.name}`,
-      });
+      const facts = [size, state, storedAs(plan, this.found)].filter(Boolean).join(", ");
+      const choose = planButton(name, facts, id === this.current?.id, () => this.pick(id));
+      const remove = button("×", () => void this.remove(plan), { class: "remove", "aria-label": `Delete ${name}` });
       return h("li", {}, choose, remove);
     });
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));

@@ -3,6 +3,7 @@
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
 import { attempt, InputError, say } from "./notices";
+import { nameIn } from "./plan_caption";
 import type { PlanSummary, Venue } from "./types";
 
 interface Row {
@@ -84,7 +85,7 @@ export class VenueForm {
 
   private draw(): void {
     const left = this.listed.filter(({ id }) => !this.chosen.some(({ plan }) => plan.id === id));
-    show(this.choice, ...left.map((plan) => h("option", { value: plan.id }, plan.name)));
+    show(this.choice, ...left.map((plan) => h("option", { value: plan.id }, nameIn(plan, this.listed))));
     this.choice.disabled = this.add.disabled = left.length === 0;
     show(
       this.rows,
