@@ -82,13 +82,15 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     page.locator("#opening-form-sill").press("Tab")
     _assert_accessible(page)
     page.mouse.click(*_on_screen(page, 8, 5.2))
-    for name, value in (("north", "10"), ("anchor", "48.13722, 11.57569")):
+    # Of two points, the second is north of the first and beside it in the plan.
+    points = "0, 0, 48.13722, 11.57569; 4.5 0 48.13726 11.57569"
+    for name, value in (("north", "10"), ("anchor", "48.1, 11.5"), ("north", ""), ("anchor", points)):
         page.locator(f"#plan-form-{name}").fill(value)
         page.locator(f"#plan-form-{name}").press("Tab")
     page.get_by_role("button", name="Store the plan").click()
     expect(page.locator("#plan-facts")).to_contain_text("1 rooms")
     plan = _stored(desktop, "New plan")["plan"]
-    assert (plan["north_deg"], plan["anchor"]["latitude"]) == pytest.approx((10.0, 48.13722))
+    assert (plan["north_deg"], plan["anchor"]["latitude"]) == pytest.approx((90.0, 48.13722))
     (room,) = plan["rooms"]
     assert (room["name"], room["type"]) == ("Workshop", "garage")
     assert sorted(map(tuple, room["polygon"])) == [

@@ -7,6 +7,7 @@ export type RoomDocument = Schemas["RoomDocument"];
 export type OpeningDocument = Schemas["OpeningDocument"];
 export type OpeningKind = OpeningDocument["kind"];
 export type PlanDocument = Schemas["FloorPlanDocument"];
+export type AnchorDocument = Schemas["AnchorDocument"];
 export type PlanSummary = Schemas["FloorPlanSummary"];
 export type PlanEvent = Schemas["PlanEvent"];
 export type Venue = Schemas["VenueSummary"];

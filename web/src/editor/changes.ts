@@ -2,7 +2,7 @@
 
 import { USUAL_HEIGHTS_M } from "../layout";
 import { distanceTo } from "../plan_drawing";
-import type { OpeningDocument, OpeningKind, PlanDocument, Point, RoomDocument } from "../types";
+import type { AnchorDocument, OpeningDocument, OpeningKind, PlanDocument, Point, RoomDocument } from "../types";
 
 /** Maximum distance of an opening from its wall. */
 export const NEAR_WALL_M = 0.35;
@@ -253,6 +253,8 @@ export function typesByName(sent: PlanDocument, stored: PlanDocument): string {
 /** Scale the whole plan, except heights. */
 export function scaled(plan: PlanDocument, factor: number): PlanDocument {
   const all = (points: Point[]): Point[] => points.map(([x, y]) => rounded([factor * x, factor * y]));
+  const known = plan.anchor?.control_points?.map((point) => ({ ...point, x: factor * point.x, y: factor * point.y }));
+  const anchor = known && { ...plan.anchor, control_points: known as AnchorDocument["control_points"] };
   const scaledRoom = (room: RoomDocument): RoomDocument => ({
     ...room,
     polygon: all(room.polygon),
@@ -261,6 +263,7 @@ export function scaled(plan: PlanDocument, factor: number): PlanDocument {
   });
   return {
     ...plan,
+    ...(anchor && { anchor }),
     rooms: plan.rooms.map(scaledRoom),
     openings: (plan.openings ?? []).map((opening) => ({ ...opening, line: all(opening.line) as [Point, Point] })),
     ...(plan.fixtures ? { fixtures: plan.fixtures.map((f) => ({ ...f, outline: all(f.outline) })) } : {}),

@@ -2,11 +2,12 @@
 
 import { button, h, show } from "../dom";
 import { say } from "../notices";
-import type { OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from "../types";
+import type { AnchorDocument, OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from "../types";
 import * as change from "./changes";
 import type { EditActions, Selection } from "./handles";
 
 type RoomType = NonNullable<RoomDocument["type"]>;
+type Value = number | null | undefined;
 
 const ROOM_TYPES: RoomType[] = [
   "unknown",
@@ -28,8 +29,9 @@ const ROOM_TYPES: RoomType[] = [
 ];
 // Height (m) that the service assumes for plans without one, as a field shows it.
 const ASSUMED = "2.5 assumed";
-// Latitude and longitude, as maps give them.
-const DEGREES = /^\s*(-?\d+(?:\.\d+)?)\s*[,;\s]\s*(-?\d+(?:\.\d+)?)\s*$/;
+// Between the numbers of a place, as maps and tables give them.
+const SEPARATORS = /[\s,;]+/;
+const PLACES = "latitude, longitude of x 0, y 0, or x, y, latitude, longitude of two points";
 // Rooms that a hint names.
 const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
@@ -57,37 +59,43 @@ export function setFormPlan(plan: PlanDocument): void {
 
 function planForm(plan: PlanDocument, { edit }: EditActions): (HTMLElement | null)[] {
   const set = (values: Partial<PlanDocument>): boolean => edit({ ...current, ...values });
-  const { latitude, longitude } = plan.anchor ?? {};
-  const place = latitude == null || longitude == null ? "" : `${latitude.toFixed(7)}, ${longitude.toFixed(7)}`;
+  const setCeiling = (value: Value): boolean => set({ ceiling_height_m: value });
   return [
     h("h3", {}, "The whole plan"),
     text("plan-form-name", "Name", plan.name ?? "", (name) => set({ name })),
-    number(
-      "plan-form-ceiling",
-      "Ceiling, m",
-      plan.ceiling_height_m,
-      (value) => set({ ceiling_height_m: value }),
-      ASSUMED,
-    ),
+    number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, setCeiling, ASSUMED),
     ownCeilings(plan, edit),
     number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) =>
       set({ camera_height_m: value ?? undefined }),
     ),
     number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
-    text("plan-form-anchor", "Latitude, longitude of x 0, y 0", place, (value) => {
-      const [latitudeDeg, longitudeDeg] = (DEGREES.exec(value) ?? []).slice(1).map(Number);
-      const anchor = { ...current.anchor, latitude: latitudeDeg, longitude: longitudeDeg };
-      if (latitudeDeg !== undefined) set({ anchor });
-      else if (value.trim() === "") set({ anchor: null });
-      else say(`“${value}” must be latitude and longitude in degrees, such as 48.13722, 11.57569.`);
+    text("plan-form-anchor", `Place on Earth: ${PLACES}`, anchorText(plan.anchor ?? {}), (value) => {
+      const anchor = anchorIn(value);
+      if (anchor === null && value.trim() !== "") say(`“${value}” is no place on Earth. Give ${PLACES}.`);
+      else set({ anchor });
     }),
     completeKinds(plan, edit),
-    h(
-      "p",
-      { class: "hint" },
-      `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click an element to change it.`,
-    ),
+    h("p", { class: "hint" }, `${plan.rooms.length} rooms. Click an element to change it.`),
   ];
+}
+
+/** Return the place of a plan on Earth as text. */
+function anchorText({ latitude, longitude, control_points: points }: AnchorDocument): string {
+  if (points) return points.map((point) => Object.values(point).join(", ")).join("; ");
+  return latitude == null || longitude == null ? "" : `${latitude.toFixed(7)}, ${longitude.toFixed(7)}`;
+}
+
+/** Read the place on Earth of a plan's origin or of two of its points, besides its altitude; null if it is neither. */
+function anchorIn(text: string): AnchorDocument | null {
+  const numbers = text.trim().split(SEPARATORS).map(Number),
+    altitude_m = current.anchor?.altitude_m;
+  if (numbers.some(Number.isNaN)) return null;
+  const pointAt = (first: number) => {
+    const [x, y, latitude, longitude] = numbers.slice(first) as [number, number, number, number];
+    return { x, y, latitude, longitude };
+  };
+  if (numbers.length === 2) return { latitude: numbers[0], longitude: numbers[1], altitude_m };
+  return numbers.length === 8 ? { control_points: [pointAt(0), pointAt(4)], altitude_m } : null;
 }
 
 /** Name the rooms with ceilings of their own, to which the height of the plan does not apply. */
@@ -127,6 +135,7 @@ function completeKinds(plan: PlanDocument, edit: EditActions["edit"]): HTMLEleme
 
 function roomForm(room: RoomDocument, index: number, { edit, select }: EditActions): HTMLElement[] {
   const set = (values: Partial<RoomDocument>): boolean => edit(change.changeRoom(current, index, values));
+  const hint = current.ceiling_height_m == null ? ASSUMED : `${current.ceiling_height_m} of the plan`;
   return [
     h("h3", {}, "Room"),
     text("room-form-name", "Name", room.name ?? "", (name) =>
@@ -135,13 +144,7 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: EditActio
     choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) =>
       set({ type, types: type === "unknown" ? [] : undefined }),
     ),
-    number(
-      "room-form-ceiling",
-      "Ceiling, m",
-      room.ceiling_height_m,
-      (value) => set({ ceiling_height_m: value }),
-      current.ceiling_height_m == null ? ASSUMED : `${current.ceiling_height_m} of the plan`,
-    ),
+    number("room-form-ceiling", "Ceiling, m", room.ceiling_height_m, (value) => set({ ceiling_height_m: value }), hint),
     button("Remove this room", () => {
       select({ kind: "none" });
       edit(change.removeRoom(current, index));
@@ -156,7 +159,7 @@ function openingForm(opening: OpeningDocument, index: number, { edit, select }: 
     h("h3", {}, "Opening"),
     choice("opening-form-kind", "Kind", opening.kind, OPENING_KINDS, (kind) => set({ kind })),
     number("opening-form-width", "Width, m", change.widthOf(opening), (value) => {
-      if (value !== null && value > 0) edit(change.widenOpening(current, index, value));
+      if (value != null && value > 0) edit(change.widenOpening(current, index, value));
     }),
     number("opening-form-sill", "From, m over the floor", opening.sill_m, (value) => set({ sill_m: value })),
     number("opening-form-head", "To, m over the floor", opening.head_m, (value) => set({ head_m: value })),
@@ -183,30 +186,14 @@ function text(id: string, label: string, value: string, set: (value: string) => 
   return field(id, label, input);
 }
 
-function number(
-  id: string,
-  label: string,
-  value: number | null | undefined,
-  set: (value: number | null) => void,
-  absent = "unknown",
-): HTMLElement {
-  const input = h("input", {
-    type: "number",
-    step: "any",
-    placeholder: absent,
-    value: value == null ? null : String(Math.round(value * 1000) / 1000),
-  });
+function number(id: string, label: string, value: Value, set: (value: Value) => void, absent = "unknown"): HTMLElement {
+  const shown = value == null ? null : Math.round(value * 1000) / 1000;
+  const input = h("input", { type: "number", step: "any", placeholder: absent, value: shown });
   input.addEventListener("change", () => set(input.value.trim() === "" ? null : input.valueAsNumber));
   return field(id, label, input);
 }
 
-function choice<T extends string>(
-  id: string,
-  label: string,
-  value: T,
-  options: T[],
-  set: (value: T) => void,
-): HTMLElement {
+function choice<T extends string>(id: string, label: string, value: T, options: T[], set: (value: T) => void) {
   const input = h("select", {}, ...options.map((option) => h("option", { selected: option === value }, option)));
   input.addEventListener("change", () => set(input.value as T));
   return field(id, label, input);
