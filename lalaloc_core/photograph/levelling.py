@@ -61,6 +61,8 @@ _FOCAL_FLOOR = 0.03
 _Mode = tuple[np.ndarray, float, np.ndarray]
 # Largest gap between two pieces of a line and offset across it (shares of the longer side), and their largest turn.
 _GAP, _OFFSET, _TURN = 0.03, 0.006, np.radians(9.0)
+# Log odds from which a picture lies on its side: its lines fit a camera on its side better than an upright one.
+ON_SIDE = 4.0
 # Shortest chain, and its least distance from the centre (shares of half of the diagonal).
 _SHORTEST, _OFF_CENTRE = 0.3, 0.25
 # Fewest chains, and the share of their weight that must bend more than half as much. They lie on several sides of the
@@ -143,6 +145,28 @@ def estimate_attitude(lines: Lines) -> Attitude:
     if not len(lines.length):
         return Attitude(pitch=0.0, roll=0.0, pitch_sd=float(_PRIOR[0]), roll_sd=float(_PRIOR[1]))
     return _attitude(_refined(lines, _starts(lines)))
+
+
+def turned_attitude(lines: Lines, upright: Attitude) -> tuple[Attitude, float]:
+    """Return the most probable tilt after a quarter turn of the picture clockwise, and its log odds to `upright`.
+
+    The same directions explain the lines either way, as the vertical one and a horizontal one change places: towards a
+    wall they tell nothing. Towards a corner, walls would need a steep pitch, which is rare.
+    """
+    if not len(lines.length):
+        return upright, 0.0
+    normal, middle = (rays[:, ::-1] * (1.0, 1.0, -1.0) for rays in (lines.normal, lines.middle))
+    turned = replace(lines, normal=normal, middle=middle)
+    attitude = estimate_attitude(turned)
+    return attitude, _fit(turned, attitude) - _fit(lines, upright)
+
+
+def _fit(lines: Lines, attitude: Attitude) -> float:
+    """Return the log probability of an attitude, whose three directions count alike."""
+    directions = _directions(np.array([attitude.pitch, attitude.roll, attitude.yaw]))
+    density = _densities(_errors(lines, directions), _sigmas(lines, _SIGMA)[:, None]).mean(axis=1)
+    prior = 0.5 * float(np.square(np.array([attitude.pitch, attitude.roll]) / _PRIOR).sum())
+    return float(_weights(lines) @ np.log(_SHARES.sum() * density + _OUTLIERS)) - prior
 
 
 def estimate_calibration(
