@@ -73,11 +73,21 @@ def test_headings_equal_those_of_enumeration() -> None:
     place = int(joint.sum(axis=(1, 2, 3)).argmax())
     best = int(joint[place].sum(axis=(1, 2)).argmax())
     rows = [best, int(joint[place].sum(axis=(0, 2)).argmax()), int(joint[place].sum(axis=1)[best].argmax())]
-    found = turn_search._most_probable(seen, heading, relative, prior)
+    found = turn_search._most_probable(seen, heading, relative, prior, 1e-12)
     expected = [heading[number][row] for number, row in enumerate(rows)]
     # Headings lie between hypotheses, nearest to the best.
     off = wrap_angle(np.array(found.headings) - np.array(expected) + expected[0])
     assert np.abs(off).max() < math.tau / 4
+
+
+def test_misread_photograph_does_not_choose_the_place() -> None:
+    heading = [math.tau / 8 * np.arange(8)] * 3
+    seen = [np.zeros((20, 8)) for _ in heading]
+    # Two photographs agree on a place, and the third fits another one better than all others.
+    seen[0][3, 2], seen[1][3, 5], seen[2][11, 1] = 6.0, 6.0, 20.0
+    relative = [RelativeHeading(number, 0.0, 0.0) for number in range(3)]
+    found = turn_search._most_probable(seen, heading, relative, np.zeros(20), 0.2)
+    assert found.headings[1] == pytest.approx(3.0 * math.tau / 8)
 
 
 def test_unknown_relative_headings_are_found(search: partial[SearchedTurn]) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.localise.album.evidence import Arrays, log_sums
-from lalaloc_core.localise.belief import suppress
+from lalaloc_core.localise.belief import or_misread, suppress
 
 # Deviation (radians) of a turn by overlap, and probability that it is wrong.
 _TURN_SD, _WRONG_TURN = math.radians(4.0), 0.02
@@ -60,10 +60,9 @@ class States:
     def evidence(self, misread: float) -> Float[np.ndarray, "r"]:
         """Return the log likelihood of every room for one of the photographs, which is misread with a probability.
 
-        Each photograph of a spot has the evidence of all, which counts once for all of them. A photograph that is
-        misread fits all rooms as it fits other homes, which bounds what one photograph can say against a room.
+        Each photograph of a spot has the evidence of all, which counts once for all of them.
         """
-        return np.logaddexp(math.log1p(-misread) + self.rooms / self.photographs, math.log(misread))
+        return or_misread(self.rooms / self.photographs, misread)
 
     def changed(self, log: Float[np.ndarray, "m"], photographs: int | None = None) -> States:
         """Return the states with another log likelihood; that of rooms changes with that of the states kept of each."""

@@ -29,6 +29,7 @@ from lalaloc_core.localise.belief.posterior import (
     Support,
     WeightedPlaces,
     area_shares,
+    or_misread,
     probability_map,
     weighted_places,
 )

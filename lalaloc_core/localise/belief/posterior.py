@@ -17,6 +17,7 @@ all pairs:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -122,6 +123,14 @@ def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.nd
     """Return the log prior of every pose of a grid: its room's area, shared by the room's poses."""
     count = np.bincount(poses.room_index, minlength=len(areas_m2))
     return np.log(areas_m2[poses.room_index] / count[poses.room_index])
+
+
+def or_misread(log_ratio: Float[np.ndarray, "*n"], share: float) -> Float[np.ndarray, "*n"]:
+    """Return log likelihoods of places, over the usual one, by a photograph that is misread with a probability.
+
+    A misread photograph fits all places as usual, which bounds what one photograph can say against a place.
+    """
+    return np.logaddexp(math.log1p(-share) + log_ratio, math.log(share))
 
 
 class _SortedPlaces:

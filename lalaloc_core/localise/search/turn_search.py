@@ -4,10 +4,11 @@ Headings that are not known are searched first, over the places p of the grid. W
 photograph i under heading h, T the temperature, and r the first photograph of a group whose relative headings are
 known up to a deviation,
 
-    log P(p) = Σ_groups log Σ_{h_r} Π_{i in group} Σ_{h_i} exp(-T c_i(p, h_i)) w(h_i - h_r - a_i),
+    log P(p) = Σ_groups log Σ_{h_r} Π_{i in group} (ε + (1 - ε) / n_i Σ_{h_i} exp(-T c_i(p, h_i)) w(h_i - h_r - a_i)),
 
-where w is a Gaussian about the stated or measured relative heading a_i with a floor, as one can be wrong. The headings
-that are most probable at the best place make one query of all photographs, which is searched as any other.
+where w is a Gaussian about the stated or measured relative heading a_i with a floor, as one can be wrong, ε the share
+of misread photographs, and n_i the mean of the sum over places and headings. The headings that are most probable at the
+best place make one query of all photographs, which is searched as any other.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from jaxtyping import Float
 from lalaloc_core.bundle import Manifest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import area_shares
+from lalaloc_core.localise.belief import area_shares, or_misread
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, PoseGrid
 from lalaloc_core.localise.match.cost_terms import latent_distances
@@ -126,7 +127,8 @@ def searched_turn(
         seen.append(log_likelihood(query, index))
         yield None
     heading = [query.roll + query.frame_heading for query in queries]
-    return _most_probable(seen, heading, relative, area_shares(grid.poses, plan.areas_m2)[index])
+    prior = area_shares(grid.poses, plan.areas_m2)[index]
+    return _most_probable(seen, heading, relative, prior, encoder.manifest.album.misread)
 
 
 def _most_probable(
@@ -134,13 +136,20 @@ def _most_probable(
     heading: Sequence[Float[np.ndarray, "_"]],
     relative: Sequence[RelativeHeading],
     prior: Float[np.ndarray, "p"],
+    misread: float,
 ) -> SearchedTurn:
     """Return the most probable headings at the most probable place.
 
-    `seen` has the log likelihood by place and hypothesis of each photograph, `heading` the headings of its hypotheses.
+    `seen` has the log likelihood by place and hypothesis of each photograph, `heading` the headings of its hypotheses,
+    and `misread` is the probability that one of them fits all places alike.
     """
+
+    def bounded(log: Float[np.ndarray, "p k"]) -> Float[np.ndarray, "p k"]:
+        usual = np.logaddexp.reduce((log + prior[:, None]).ravel()) - np.logaddexp.reduce(prior)
+        return or_misread(log - usual + math.log(log.shape[1]), misread)
+
     first = {angle.group: number for number, angle in reversed(list(enumerate(relative)))}
-    groups = {group: seen[number].copy() for group, number in first.items()}
+    groups = {group: bounded(seen[number]) for group, number in first.items()}
     linked = {}
     for number, angle in enumerate(relative):
         reference = first[angle.group]
@@ -148,7 +157,7 @@ def _most_probable(
             off = wrap_angle(heading[number][:, None] - heading[reference] - angle.heading)
             linked[number] = np.exp(-0.5 * np.square(off / _deviation(angle, heading[number]))) + _FLOOR
             best = seen[number].max(axis=1, keepdims=True)
-            groups[angle.group] += np.log(np.exp(seen[number] - best) @ linked[number]) + best
+            groups[angle.group] += bounded(np.log(np.exp(seen[number] - best) @ linked[number]) + best)
     total = prior + sum(np.logaddexp.reduce(log_likelihood, axis=1) for log_likelihood in groups.values())
     place = int(total.argmax())
     references = {group: _peak(found[place], heading[first[group]]) for group, found in groups.items()}
