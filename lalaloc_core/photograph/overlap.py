@@ -113,10 +113,10 @@ def _spread(place: Float[np.ndarray, "n 2"], response: Float[np.ndarray, "n"]) -
     return np.lexsort((-response, rank))[:_MAX_FEATURES]
 
 
-def _alike(
-    one: Float[np.ndarray, "n 128"], other: Float[np.ndarray, "k 128"]
+def best_matches(
+    one: Float[np.ndarray, "n 128"], other: Float[np.ndarray, "k 128"], max_ratio: float = _MAX_RATIO
 ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """Return pairs of descriptors that are each other's best match, and clearly better than the second best."""
+    """Return pairs of unit descriptors that are each other's best match, and clearly better than the second best."""
     if min(len(one), len(other)) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     alike, every = one @ other.T, np.arange(len(one))
@@ -125,7 +125,7 @@ def _alike(
     alike[every, best] = -1.0
     distance, next_distance = (np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)) for cosine in (top, alike.max(axis=1)))
     alike[every, best] = top
-    kept = np.flatnonzero(distance < _MAX_RATIO * next_distance)
+    kept = np.flatnonzero(distance < max_ratio * next_distance)
     kept = kept[alike[:, best[kept]].argmax(axis=0) == kept]
     return kept, best[kept]
 
@@ -159,7 +159,7 @@ def find_links(
 
     def link(pair: tuple[int, int], min_matches: int, min_share: float) -> Link | None:
         first, second = pair
-        one, other = _alike(rooted[first], rooted[second])
+        one, other = best_matches(rooted[first], rooted[second])
         matched = np.stack([rays[first][one], rays[second][other]])
         # In frames that are about level, with the headings of the cameras.
         level = matched[0] @ axes[first], matched[1] @ axes[second]

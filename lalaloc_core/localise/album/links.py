@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lalaloc_core.localise.album.entry import AlbumPhotograph, Descriptors
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.photograph.cameras import camera_axes
-from lalaloc_core.photograph.overlap import turn_between
+from lalaloc_core.photograph.overlap import best_matches, turn_between
 
 # Largest ratio of the distances of descriptors to the best and to the second best match.
 _MAX_RATIO = 0.9
@@ -126,7 +126,7 @@ def _compared(
     other_rays: Float[np.ndarray, "m 3"],
 ) -> Found | None:
     """Return the number of matches, and the turn if a rotation explains enough of them; None without matches."""
-    kept, best = _alike(one, other)
+    kept, best = best_matches(one, other, _MAX_RATIO)
     if not len(kept):
         return None
     matched = rays[kept], other_rays[best]
@@ -134,23 +134,6 @@ def _compared(
         return len(kept), math.nan
     found = turn_between(*matched, _MIN_MATCHES, _MIN_SHARE, _MAX_TILT, np.random.default_rng(0))
     return len(kept), math.nan if found is None else found[0]
-
-
-def _alike(
-    one: Float[np.ndarray, "n 128"], other: Float[np.ndarray, "m 128"]
-) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
-    """Return pairs of descriptors that are each other's best match, and clearly better than the second best."""
-    if min(len(one), len(other)) < 2:
-        return np.zeros(0, int), np.zeros(0, int)
-    alike = one @ other.T
-    each = np.arange(len(one))
-    best = alike.argmax(axis=1)
-    mutual = alike.argmax(axis=0)[best] == each
-    top = alike[each, best].copy()
-    alike[each, best] = -1.0
-    distance, next_distance = (np.sqrt(np.maximum(1.0 - cosine, 0.0)) for cosine in (top, alike.max(axis=1)))
-    kept = np.flatnonzero(mutual & (distance < _MAX_RATIO * next_distance))
-    return kept, best[kept]
 
 
 def _similarity(photographs: Sequence[AlbumPhotograph]) -> Float[np.ndarray, "n n"]:
