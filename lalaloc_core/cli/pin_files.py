@@ -62,7 +62,7 @@ def write_pin_files(
         pins = [row.pin for row in rows if row.pin and row.entry["plan"] == plan_id]
         write_file(out / name, plan_svg(plan, over=pins_svg(plan, pins)))
     title = " / ".join(dict.fromkeys(plan.name for plan in pinned.plans))
-    lines = [*report_notes(document["counts"], document["camera_height_m"]), *copied]
+    lines = [*report_notes(document["counts"], document["camera_height_m"], pinned.album.warnings), *copied]
     (out / "report.pdf").write_bytes(draw_pdf(report_pages(title, plans, rows, lines), DPI))
     return document
 
@@ -74,8 +74,8 @@ def _collection(plans: Mapping[str, FloorPlan], entries: Sequence[dict[str, Any]
         plan = plans.get(entry["plan"])
         if plan is None or plan.anchor is None:
             continue
-        names = ("number", "photograph", "taken", "plan", "room", "state")
-        properties = {name: entry[name] for name in names} | {"confidence": round(entry["confidence"], 4)}
+        properties = {name: entry[name] for name in ("number", "photograph", "taken", "plan", "room", "state")}
+        properties |= {name: round(entry[name], 4) for name in ("room_confidence", "confidence", "within_1m")}
         features.append(place_feature(plan.anchor, entry, properties))
     return {"type": "FeatureCollection", "features": features}
 

@@ -12,7 +12,7 @@ from typing import Any
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, PLAN, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
-from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table, print_warnings
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.shown_text import printable, probability_text
 
@@ -26,7 +26,7 @@ folder FOLDER: folder of photographs, up to 500; never changed
 --json: print JSON instead of a table
 {BUNDLE}
 """
-_HEAD = ("no", "photograph", "room", "x m", "y m", "heading °", "confidence", "state")
+_HEAD = ("no", "photograph", "room", "x m", "y m", "heading °", "room right", "within 1 m", "state")
 
 
 def add_commands(commands: Any) -> None:
@@ -61,6 +61,7 @@ def _pin(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"'{arguments.out}' cannot be written: {error.strerror}") from error
     for note in (*document["notes"], *moved):
         print(f"note: {note}", file=sys.stderr)
+    print_warnings((row["photograph"], text) for row in document["photographs"] for text in row.get("warnings", ()))
     if arguments.json:
         print_json(document, JSON_DECIMALS)
     else:
@@ -129,7 +130,7 @@ def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], li
 
 def _row(entry: dict[str, Any]) -> tuple[str, ...]:
     if entry["room"] is None:
-        return (str(entry["number"]), entry["photograph"], "-", "-", "-", "-", "-", "set aside")
+        return (str(entry["number"]), entry["photograph"], *6 * ("-",), "set aside")
     heading = entry["heading_deg"]
     return (
         str(entry["number"]),
@@ -138,6 +139,7 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
         f"{entry['position']['x_m']:.2f}",
         f"{entry['position']['y_m']:.2f}",
         "-" if heading is None else f"{heading:.0f}",
-        probability_text(entry["confidence"], 0),
+        probability_text(entry["room_confidence"], 0),
+        probability_text(entry["within_1m"], 0),
         entry["state"].replace("_", " "),
     )

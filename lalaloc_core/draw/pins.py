@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import Any, Final
 
 from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, shortened, words, xml_text
@@ -31,14 +32,17 @@ _INNER = WIDTH - 2 * _MARGIN
 _COLUMNS, _ROWS, _GAP, _CAPTION, _PLAN = 2, 3, 36, 64, 380
 _TOP = _MARGIN + 70
 _LINES = 46
+# Letters of a line under the plan.
+_LINE = 105
 THUMBNAIL = (800, 600)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnPin:
-    """A pin to draw: its number, place (m), heading (degrees) and state."""
+    """A pin to draw: its number, title, place (m), heading (degrees) and state."""
 
     number: int
+    title: str
     x_m: float
     y_m: float
     heading_deg: float | None
@@ -57,7 +61,7 @@ def pins_svg(plan: FloorPlan, pins: Sequence[DrawnPin]) -> str:
         if math.hypot(x - pin.x_m, y + pin.y_m) > 0.01 * radius
     ]
     leaders = f'<path d="{"".join(moved)}" stroke="{INK}" stroke-width="{0.15 * radius:.4f}"/>' if moved else ""
-    return leaders + "".join(_pin_svg(pin, *place, radius) for pin, place in zip(pins, placed, strict=True))
+    return leaders + "".join(pin_svg(pin, *place, radius) for pin, place in zip(pins, placed, strict=True))
 
 
 def arrow_svg(heading_deg: float, radius: float) -> str:
@@ -69,12 +73,14 @@ def arrow_svg(heading_deg: float, radius: float) -> str:
     )
 
 
-def _pin_svg(pin: DrawnPin, x: float, y: float, radius: float) -> str:
+def pin_svg(pin: DrawnPin, x: float, y: float, radius: float) -> str:
+    """Draw a pin at a point in metres, y pointing down."""
     arrow = "" if pin.heading_deg is None else arrow_svg(pin.heading_deg, radius)
     size = radius * (1.25 if pin.number < 100 else 0.95)
     return (
         f'<g class="pin {xml_text(pin.state)}" transform="translate({x:.3f} {y:.3f})" '
-        f'fill="{PIN_COLOURS[pin.state]}">{arrow}<circle r="{radius:.4f}" stroke="#fff" '
+        f'fill="{PIN_COLOURS[pin.state]}"><title>{xml_text(pin.title)}</title>{arrow}'
+        f'<circle r="{radius:.4f}" stroke="#fff" '
         f'stroke-width="{0.14 * radius:.4f}"/><text y="{0.36 * size:.4f}" font-size="{size:.4f}" fill="#fff" '
         f'font-weight="bold" text-anchor="middle">{pin.number}</text></g>'
     )
@@ -102,15 +108,16 @@ class ReportRow:
     def pin(self) -> DrawnPin | None:
         """Its pin; None if it is set aside."""
         named = {name: self.entry[name] for name in ("number", "heading_deg", "state")}
-        return None if self.entry["position"] is None else DrawnPin(**self.entry["position"], **named)
+        title = "{number} {photograph} {room}".format_map(self.entry)
+        return None if self.entry["position"] is None else DrawnPin(title=title, **self.entry["position"], **named)
 
 
-def report_notes(counts: Mapping[str, int], camera_height_m: float | None) -> list[str]:
-    """Return the lines under the first plan: the number of photographs by state, and the height of the cameras."""
+def report_notes(counts: Mapping[str, int], camera_height_m: float | None, warnings: Sequence[str]) -> list[str]:
+    """Return the lines under the first plan: the number of photographs by state, camera height and warnings."""
     lines = [", ".join(f"{count} {state.replace('_', ' ')}" for state, count in counts.items() if count)]
     if camera_height_m is not None:
         lines.append(f"Cameras were {camera_height_m:.2f} m above the floor.")
-    return lines
+    return lines + [line for warning in warnings for line in wrap(warning, _LINE)]
 
 
 def report_pages(
@@ -146,7 +153,7 @@ def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: in
         parts.append(words(x + 30, y, f"{state}: {meaning}", 20, fill=INK))
         x += 360
     for line, note in enumerate(notes):
-        parts.append(words(_MARGIN, y + 40 + 30 * line, shortened(note, 105), 18, fill=MUTED))
+        parts.append(words(_MARGIN, y + 40 + 30 * line, shortened(note, _LINE), 18, fill=MUTED))
     return document(WIDTH, HEIGHT, title, parts)
 
 
@@ -186,7 +193,8 @@ def _photograph(row: ReportRow, box: tuple[float, float, float, float]) -> str:
         f"{pin.number}</text></g>"
     )
     parts.append(words(x + 76, middle - 4, shortened(row.entry["photograph"], 34), 20))
-    facts = f"{row.entry['taken'] or ''}   {probability_text(row.entry['confidence'], 0)} sure of the room"
+    room, place = (probability_text(row.entry[name], 0) for name in ("room_confidence", "within_1m"))
+    facts = f"{row.entry['taken'] or ''}   room {room}, within 1 m {place}"
     parts.append(words(x + 76, middle + 20, shortened(facts.strip(), 52), 16, fill=MUTED))
     return "".join(parts)
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from lalaloc_core.draw.canvas import INK, PAPER, xml_text
+from lalaloc_core.draw.pins import ReportRow, pin_svg
 from lalaloc_core.draw.plan import Bounds, svg_around
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.entry import Correction
@@ -78,14 +77,12 @@ def _fault(field: str, message: str) -> InvalidRequestError:
     return InvalidRequestError([(f"correction.{field}", message)])
 
 
-# Colours of pins by state, from Okabe and Ito's palette; uncertain ones have a dashed edge as well.
-COLOURS = {"sure": "#007a5a", "corrected": "#0067a5", "uncertain": "#c84f00"}
 _COLUMNS: tuple[str, ...] = (
     "number", "name", "taken_at", "state", "confidence", "floorplan_id", "level", "room_id", "room", "x_m", "y_m",
     "heading_deg", "latitude", "longitude", "reason", "room_confidence", "within_1m",
 )  # fmt: skip
-# Radius of a pin, and length of its arrow, as shares of the drawing's size.
-_RADIUS, _ARROW = 0.016, 2.6
+# Radius of a pin as a share of the drawing's size.
+_RADIUS = 0.016
 
 
 def pins_csv(photographs: Sequence[AlbumPhotographAnswer]) -> bytes:
@@ -124,10 +121,11 @@ def pins_geojson(photographs: Sequence[AlbumPhotographAnswer]) -> dict[str, Any]
 def pins_svg(name: str, bounds_m: Bounds, photographs: Sequence[AlbumPhotographAnswer]) -> tuple[str, str]:
     """Return the parts of a drawing before and after its rooms: a pin with its number and arrow for each photograph."""
     head, tail = svg_around(name, bounds_m)
-    size_m = _RADIUS * max(bounds_m[2] - bounds_m[0], bounds_m[3] - bounds_m[1], 1.0)
-    marks = [_mark(photograph, photograph.pin, size_m) for photograph in photographs if photograph.pin is not None]
+    radius_m = _RADIUS * max(bounds_m[2] - bounds_m[0], bounds_m[3] - bounds_m[1], 1.0)
+    rows = [ReportRow(report_entry(row, row.name or ""), bytes) for row in photographs if row.pin is not None]
+    marks = [pin_svg(pin, pin.x_m, -pin.y_m, radius_m) for row in rows if (pin := row.pin) is not None]
     end = tail.rindex("</svg>")
-    return head, tail[:end] + "".join(marks) + tail[end:]
+    return head, tail[:end] + "\n".join(marks) + tail[end:]
 
 
 def report_entry(photograph: AlbumPhotographAnswer, name: str) -> dict[str, Any]:
@@ -150,26 +148,3 @@ def _row(photograph: AlbumPhotographAnswer) -> dict[str, Any]:
     if pin.geopose is not None:
         row |= {"latitude": pin.geopose.position.lat, "longitude": pin.geopose.position.lon}
     return row
-
-
-def _mark(photograph: AlbumPhotographAnswer, pin: PinAnswer, radius_m: float) -> str:
-    if (place := pin.place) is None:
-        return ""
-    x, y, colour = place.position.x_m, -place.position.y_m, COLOURS[pin.state]
-    dashes = f' stroke-dasharray="{0.5 * radius_m:.3f}"' if pin.state == "uncertain" else ""
-    arrow = ""
-    if place.heading_deg is not None:
-        turn = math.radians(place.heading_deg)
-        reach = _ARROW * radius_m
-        tip = x + reach * math.sin(turn), y - reach * math.cos(turn)
-        sides = ((x + radius_m * math.sin(turn + side), y - radius_m * math.cos(turn + side)) for side in (-0.7, 0.7))
-        points = " ".join(f"{a:.3f},{b:.3f}" for a, b in (tip, *sides))
-        arrow = f'<polygon points="{points}" fill="{colour}"/>'
-    title = f"{photograph.number} {photograph.name or ''} {place.room}".strip()
-    return (
-        f'<g class="pin"><title>{xml_text(title)}</title>{arrow}'
-        f'<circle cx="{x:.3f}" cy="{y:.3f}" r="{radius_m:.3f}" fill="{PAPER}" stroke="{colour}" '
-        f'stroke-width="{0.3 * radius_m:.3f}"{dashes}/>'
-        f'<text x="{x:.3f}" y="{y + 0.36 * radius_m:.3f}" font-size="{radius_m:.3f}" fill="{INK}" '
-        f'text-anchor="middle">{photograph.number}</text></g>\n'
-    )

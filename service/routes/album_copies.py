@@ -101,8 +101,8 @@ async def _archive(call: ApiCall, album: AlbumRecord, files: list[UploadedFile],
                 notes.append(f"'{entry['photograph']}' cannot be copied: {error}")
         rows.append(ReportRow(entry, partial(bytes, picture)))
     if rows:
-        states = Counter(row.entry["state"] for row in rows)
-        lines = report_notes(states, json.loads(album.solution or "{}").get("camera_height_m"))
+        states, solution = Counter(row.entry["state"] for row in rows), json.loads(album.solution or "{}")
+        lines = report_notes(states, solution.get("camera_height_m"), solution.get("warnings", ()))
         pages = partial(report_pages, album.name, plans, rows, lines)
         members["report.pdf"] = "report.pdf", [await call.runtime.decoder.report(pages, context)]
     if notes:

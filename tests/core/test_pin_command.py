@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -18,9 +19,13 @@ from PIL import ExifTags, Image
 from lalaloc_core.cli import main
 from lalaloc_core.draw.canvas import document, words
 from lalaloc_core.draw.pdf import draw_pdf
+from lalaloc_core.draw.pins import report_notes
+from lalaloc_core.localise.album.solve import _MISFIT_WARNING
+from lalaloc_core.photograph.cameras import Perspective
 from lalaloc_core.photograph.placed_copy import Place, placed_copy
 from lalaloc_core.shown_text import no_formula, printable
 from tests.core.fault_photographs import FOLDER
+from tests.core.taken import PHONE, jpeg, sphere, take
 from tests.painted import picture_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -76,6 +81,31 @@ def test_text_of_the_report_can_be_selected(pinned: tuple[Path, Path]) -> None:
     assert all(name in pages[0] for name in ("bathroom", "corridor", "3 sure, 1 set aside"))
     assert any("kitchen.jpg" in page and page.startswith("kitchen") for page in pages)
     assert "broken.jpg" in pages[-1]
+
+
+def test_warnings_about_the_album_are_lines_of_the_report() -> None:
+    count, *lines = report_notes({"sure": 0, "uncertain": 3}, None, [_MISFIT_WARNING.format(60.0)])
+    assert count == "3 uncertain"
+    assert " ".join(lines) == _MISFIT_WARNING.format(60.0)
+    assert max(map(len, lines)) <= 105
+
+
+@pytest.mark.slow
+def test_photographs_on_their_side_are_turned_and_named_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, camera = tmp_path / "visit", Perspective.of_hfov(640, 480, math.radians(67.3))
+    folder.mkdir()
+    for number, heading_deg in enumerate((40.0, 50.0)):
+        upright = take(sphere("living_room"), camera, heading_deg=heading_deg)
+        (folder / f"{number}.jpg").write_bytes(jpeg(np.rot90(upright).copy(), PHONE))
+    command = ["pin", str(EXAMPLES / "flat.json"), str(folder), "--out", str(tmp_path / "out"), "--no-copies"]
+    assert main(command) == 0
+    out, errors = capsys.readouterr()
+    assert "warning: 0.jpg and 1 more: the photograph lies on its side" in errors
+    assert re.search(r"heading °\s+room right\s+within 1 m\s+state", out)
+    pins = json.loads((tmp_path / "out" / "pins.json").read_text())["photographs"]
+    assert {pin["room"] for pin in pins} == {"living room"}
 
 
 def test_selected_text_lies_over_its_picture() -> None:

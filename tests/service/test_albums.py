@@ -179,7 +179,7 @@ def test_pins_as_geojson_csv_and_svg(client: httpx.Client, solved: str, plan_id:
     assert float(rows[0]["x_m"]) == found[0]["pin"]["place"]["position"]["x_m"]
     drawing = client.get(path, headers={"Accept": "image/svg+xml"})
     assert drawing.headers["content-type"] == "image/svg+xml"
-    assert drawing.text.count('<g class="pin">') == 3
+    assert drawing.text.count('<g class="pin ') == 3
     assert "kitchen" in drawing.text
     assert "script" not in drawing.text
     bare = create(client, upload(client, FLAT))
@@ -526,7 +526,7 @@ def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: st
     drawing = {"Accept": "image/svg+xml"}
     path = f"/albums/{album_id}/photographs"
     assert_problem(client.get(path, headers=drawing), 422, "invalid-request")
-    assert client.get(path, headers=drawing, params={"floorplan_id": upper}).text.count('class="pin"') == 1
+    assert client.get(path, headers=drawing, params={"floorplan_id": upper}).text.count('class="pin ') == 1
     assert client.delete(f"/venues/{venue['id']}").status_code == 204
     assert_problem(client.get(f"/albums/{album_id}"), 404, "unknown-album")
 

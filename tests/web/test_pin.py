@@ -64,6 +64,7 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
     expect(page.locator("#problems")).to_contain_text("left out: 1")
     expect(page.locator("#plan .pin")).to_have_count(3)
     expect(page.locator(".card img")).to_have_count(3)
+    expect(page.locator(".card", has_text="kitchen.jpg")).to_contain_text(re.compile(r"kitchen, .* %, within 1 m .* %"))
     pin = page.locator("#pin-1")
     before = pin.get_attribute("transform")
     # By keyboard alone: the pin moves, its arrow turns, and both are undone.

@@ -5,7 +5,7 @@ import { button, h, s } from "./dom";
 import { degrees, layoutLines, radians } from "./layout";
 import type { Floors, PinnedAt, Row } from "./pin_floors";
 import type { Thumbnail } from "./pin_photographs";
-import { percent } from "./plain_words";
+import { percent, plainWords } from "./plain_words";
 import { equirectangular } from "./projection";
 import type { Point } from "./types";
 
@@ -30,7 +30,8 @@ export function factsOf({ pin }: Row): string {
   if (pin === null) return "Waiting for its pin";
   const reason = pin.reason === "" ? "" : `: ${pin.reason}`;
   if (pin.place === null) return `Set aside${reason}`;
-  return `${pin.place.room}, ${pin.state === "corrected" ? "corrected" : percent(pin.room_confidence)}${reason}`;
+  const shares = `${percent(pin.room_confidence)}, within 1 m ${percent(pin.within_1m)}`;
+  return `${pin.place.room}, ${pin.state === "corrected" ? "corrected" : shares}${reason}`;
 }
 
 /** Return what a new revision of the plan changed about a pin; null if nothing. */
@@ -127,7 +128,7 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
       h("strong", { class: "name" }, `${row.number} ${row.name ?? ""}`),
       h("p", {}, factsOf(row)),
       h("p", { class: "hint" }, row.view.taken_at?.replace("T", " ").slice(0, 16)),
-      ...(pin?.warnings ?? []).map((text) => h("p", { class: "hint" }, text)),
+      ...(pin?.warnings ?? []).map((text) => h("p", { class: "hint" }, plainWords(text))),
     ),
     others,
     h(
