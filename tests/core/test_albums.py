@@ -26,6 +26,7 @@ from lalaloc_core.localise.album.links import pair_odds
 from lalaloc_core.localise.album.pins import Pin, PinPose, RoomShare, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
 from lalaloc_core.localise.album.solve import MAX_ROOMS, calibrated, misread_share, solve_album
+from lalaloc_core.localise.album.solve import _pin as _pin_of
 from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
@@ -181,6 +182,19 @@ def test_photograph_that_shows_no_wall_is_not_sure(ground: AlbumGround, photogra
     pin = solve_album(ground, encoder(), [blind]).pins[0]
     assert pin.state in ("set_aside", "uncertain")
     assert pin.within_1m < 0.2
+
+
+def test_photograph_of_an_album_that_fits_badly_is_uncertain_and_not_set_aside(
+    ground: AlbumGround, photographs: list[AlbumPhotograph]
+) -> None:
+    memory, kitchen = AlbumMemory(), photographs[0]
+    solve_album(ground, encoder(), [kitchen], memory=memory)
+    states = States.of(memory.evidence[kitchen.id], encoder().manifest.ring_sectors)
+    rooms = len(ground.plan.rooms)
+    share = np.append(np.full(rooms, 0.3 / rooms), 0.7)
+    pins = [_pin_of(ground, kitchen, states, share, None, fits=fits) for fits in (True, False)]
+    assert [pin.state for pin in pins] == ["set_aside", "uncertain"]
+    assert pins[1].confidence == pytest.approx(0.3 / rooms)
 
 
 def test_correction_of_an_unknown_room_is_refused(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:

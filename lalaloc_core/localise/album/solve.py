@@ -297,7 +297,9 @@ def _pin(
     )
     if constraint is not None:
         return _corrected(ground, base, constraint)
-    if share[rooms] > 0.5 or not suggestions:
+    # Photographs of a home that is read badly fit elsewhere better, all of them.
+    is_elsewhere = share[rooms] > 0.5 and (fits or _outside(photograph) > 0.0)
+    if is_elsewhere or not suggestions:
         reason = "it fits none of the rooms of the plan better than rooms of other buildings"
         if _outside(photograph) > 0.0:
             reason = "no furniture or fittings are recognised in it, as in photographs of façades and gardens"

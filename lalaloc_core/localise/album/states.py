@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -101,13 +102,17 @@ def turned_together(states: Sequence[States], turns: Mapping[tuple[int, int], fl
     found, photographs = [state.log.copy() for state in states], [state.photographs for state in states]
     step = TWO_PI / _HEADINGS
     spread = -0.5 * np.square(np.arange(-2, 3) * step / _TURN_SD)
+    linked: defaultdict[int, list[tuple[int, float]]] = defaultdict(list)
     for (first, second), turn in turns.items():
-        for own, other, change in ((first, second, turn), (second, first, -turn)):
-            column = np.rint(states[other].heading / step).astype(int)
-            floor = float(states[other].log.min(initial=0.0))
-            table = np.full((poses, _HEADINGS), floor)
-            for apart, penalty in zip(range(-2, 3), spread, strict=True):
-                np.maximum.at(table, (states[other].pose, (column + apart) % _HEADINGS), states[other].log + penalty)
+        linked[second].append((first, turn))
+        linked[first].append((second, -turn))
+    # One large table at a time, as many photographs can be of one spot.
+    for other, owns in linked.items():
+        column = np.rint(states[other].heading / step).astype(int)
+        table = np.full((poses, _HEADINGS), float(states[other].log.min(initial=0.0)))
+        for apart, penalty in zip(range(-2, 3), spread, strict=True):
+            np.maximum.at(table, (states[other].pose, (column + apart) % _HEADINGS), states[other].log + penalty)
+        for own, change in owns:
             wanted = np.rint((states[own].heading + change) / step).astype(int) % _HEADINGS
             seen = table[states[own].pose, wanted]
             # With a wrong turn, the other photograph can be anywhere.
