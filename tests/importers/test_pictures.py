@@ -171,17 +171,101 @@ def test_furniture_at_outlined_walls_is_no_wall(is_hatched: bool):
     assert shapely.hausdorff_distance(room, shapely.box(1.2, 1.2, 10.8, 7.8)) < 0.06
 
 
-def test_single_line_is_a_window_outside_and_a_passage_inside():
+def two_rooms() -> tuple[Image.Image, ImageDraw.ImageDraw]:
+    """Return a picture of two rooms at 1 cm per pixel, and its pen."""
+    page = Image.new("RGB", (900, 500), "white")
+    pen = ImageDraw.Draw(page)
+    pen.rectangle((100, 100, 800, 400), outline="black", width=20)
+    pen.line((450, 100, 450, 400), fill="black", width=12)
+    return page, pen
+
+
+@pytest.mark.parametrize("symbol", ["leaf and arc", "leaf", "pale arc"])
+def test_door_with_a_half_open_leaf_or_a_pale_arc_is_a_door(symbol: str):
+    page, pen = two_rooms()
+    pen.rectangle((440, 200, 460, 290), fill="white")
+    if "leaf" in symbol:
+        pen.line((450, 200, 514, 264), fill="black", width=4)
+    if "arc" in symbol:
+        pen.arc((360, 110, 540, 290), 0 if symbol == "pale arc" else 45, 90, fill=(225, 225, 225))
+    (door,) = lines(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document, "door")
+    assert door.length == pytest.approx(0.9, abs=0.03)
+
+
+@pytest.mark.parametrize("lines_of", ["bow", "broken", "pale"])
+def test_window_of_curved_or_broken_or_pale_lines_closes_its_room(lines_of: str):
+    page, pen = two_rooms()
+    pen.rectangle((180, 90, 380, 125), fill="white")
+    for level in (103, 110, 117):
+        if lines_of == "bow":
+            pen.arc((280 - 145, level - 35, 280 + 145, level + 255), 226, 314, fill="black")
+        elif lines_of == "pale":
+            pen.line((180, level, 380, level), fill=(228, 228, 228))
+        else:
+            for x in range(180 + level % 5, 380, 12):
+                pen.line((x, level, x + 6, level), fill="black")
+    plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document
+    (window,) = lines(plan, "window")
+    assert window.length == pytest.approx(2.0, abs=0.05)
+    assert len(plan["rooms"]) == 2
+
+
+def test_walls_of_less_than_three_pixels_are_walls():
+    page, _ = two_rooms()
+    content = picture_file(page.resize((150, 83), Image.Resampling.BOX))
+    assert len(import_plan(content, ImportOptions(metres_per_pixel=0.06)).document["rooms"]) == 2
+
+
+def test_walls_that_are_paler_than_coloured_floors_are_walls():
+    page, pen = two_rooms()
+    pen.rectangle((100, 100, 800, 400), fill=(150, 180, 210))
+    pen.rectangle((120, 120, 444, 380), fill=(120, 200, 100))
+    pen.rectangle((456, 120, 780, 380), fill=(200, 100, 100))
+    pen.rectangle((440, 200, 460, 290), fill=(200, 100, 100))
+    pen.arc((366, 110, 546, 290), 0, 90, fill=(180, 85, 85), width=2)
+    plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document
+    assert sorted(room.area for room in shapes(plan)) == pytest.approx([3.24 * 2.6] * 2, rel=0.03)
+    assert len(lines(plan, "door")) == 1
+
+
+def test_thin_strokes_across_walls_of_two_heavy_lines_do_not_hide_them():
     page = Image.new("L", (900, 500), 255)
     pen = ImageDraw.Draw(page)
-    pen.rectangle((100, 100, 800, 400), outline=0, width=20)
-    pen.line((450, 100, 450, 400), fill=0, width=12)
+    for box in ((100, 100, 800, 400), (113, 113, 443, 387), (457, 113, 787, 387)):
+        pen.rectangle(box, outline=0, width=3)
+    for k in range(140, 800, 30):
+        for x, y in ((k, 102), (k, 398), (102, 0.4 * k + 70), (798, 0.4 * k + 70), (444, 0.4 * k + 70)):
+            pen.ellipse((x - 11, y - 11, x + 11, y + 11), outline=0)
+            pen.line((x - 16, y - 9, x + 16, y + 12), fill=0)
+    assert len(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document["rooms"]) == 2
+
+
+def test_openings_that_look_like_doors_inside_are_doors_outside():
+    page = Image.new("L", (1500, 500), 255)
+    pen = ImageDraw.Draw(page)
+    pen.rectangle((100, 100, 1400, 400), outline=0, width=20)
+    for x in (400, 700, 1000):
+        pen.line((x, 100, x, 400), fill=0, width=12)
+        pen.rectangle((x - 6, 200, x + 6, 290), fill=255, outline=150)
+    for x in (160, 480, 800, 1100):
+        pen.rectangle((x, 100, x + 150, 119), fill=255, outline=150)
+        pen.rectangle((x + 12, 106, x + 138, 112), outline=150)
+    pen.rectangle((1200, 381, 1290, 400), fill=255, outline=150)
+    # A closet of half a metre.
+    pen.line((100, 330, 400, 330), fill=0, width=10)
+    plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document
+    assert len(lines(plan, "door")) == len(lines(plan, "window")) == 4
+    assert len(plan["rooms"]) == 5
+
+
+def test_single_line_is_a_window_outside_and_a_passage_inside():
+    page, pen = two_rooms()
     for box, line in [
         ((200, 95, 320, 125), ((200, 110), (320, 110))),
         ((440, 200, 460, 290), ((450, 200), (450, 290))),
     ]:
-        pen.rectangle(box, fill=255)
-        pen.line(line, fill=0, width=2)
+        pen.rectangle(box, fill="white")
+        pen.line(line, fill="black", width=2)
     plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01))
     assert len(plan.document["rooms"]) == 2
     (window,) = lines(plan.document, "window")

@@ -272,30 +272,21 @@ class WallAreas:
 
     def __init__(self, parts: Sequence[shapely.Polygon]) -> None:
         self.parts = parts
-        shapely.prepare(list(parts))
         self._areas = shapely.STRtree(parts)
         rings = shapely.get_parts(shapely.boundary(np.array(parts, dtype=object)))
         points, ring = shapely.get_coordinates(rings, return_index=True)
         pairs = np.stack([points[:-1], points[1:]], axis=1)[ring[:-1] == ring[1:]]
         self._edges = shapely.STRtree(np.asarray(shapely.linestrings(pairs)))
 
-    def covers(self, point: Float[np.ndarray, "2"]) -> bool:
-        """Return whether a point lies in a wall or on its edge."""
-        place = shapely.Point(point)
-        return any(self.parts[index].intersects(place) for index in self._areas.query(place))
-
-    def distance_along(self, ray: shapely.LineString) -> float:
-        """Return the distance from the start of a ray to the first wall on it, infinite if there is none."""
-        origin = shapely.get_coordinates(ray)[0]
-        if self.covers(origin):
-            return 0.0
-        edges = self._edges.geometries[self._edges.query(ray, predicate="intersects")]
-        hits = shapely.intersection(edges, ray)
-        return float(shapely.distance(hits, shapely.Point(origin)).min(initial=math.inf))
-
-    def meets(self, line: shapely.LineString) -> bool:
-        """Return whether a line meets a wall."""
-        return len(self._edges.query(line, predicate="intersects")) > 0 or self.covers(shapely.get_coordinates(line)[0])
+    def distances_along(self, rays: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n"]:
+        """Return the distance from the start of each ray to the first wall on it, infinite if there is none."""
+        lines, origins = np.asarray(shapely.linestrings(rays)), np.asarray(shapely.points(rays[:, 0]))
+        found = np.full(len(rays), math.inf)
+        ray, edge = self._edges.query(lines, predicate="intersects")
+        hits = shapely.intersection(self._edges.geometries[edge], lines[ray])
+        np.minimum.at(found, ray, shapely.distance(hits, origins[ray]))
+        found[self._areas.query(origins, predicate="intersects")[0]] = 0.0
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,8 @@ class WallConfig:
     # Largest thickness of a wall; thicker areas are rooms. Smallest thickness; shorter ends are rounded corners.
     thickest: float = 0.55
     thinnest: float = 0.03
+    # Largest width of a pier whose side is the jamb of glass; none if it is no thicker than a wall.
+    widest_pier: float = 0.0
     # Widths of an opening; wider gaps stay open and join the rooms beside them.
     widest_gap: float = 1.9
     narrowest_gap: float = 0.3
@@ -22,8 +24,9 @@ class WallConfig:
     nib: float = 0.28
     # Ends of lines nearer than this to another line are joined to it.
     snap: float = 0.06
-    # Smallest area of a room; smaller areas are ducts.
+    # Smallest area and depth of a room; smaller areas are ducts, and shallower ones are inside walls.
     smallest_room_m2: float = 0.6
+    shallowest_room: float = 0.55
     # Largest depth of corners that pixels cut off the ends of walls.
     blunt: float = 0.0
 

@@ -28,6 +28,8 @@ _OUT_OF_LINE_M, _SLIT_M = 0.35, 0.001
 _MOSTLY_SINGLE, _SMALLEST_COUNTED_M2 = 0.5, 1.0
 # Long outlines (m) bound a wall if they are this slim nearly everywhere, and nowhere wider, relative to the thickest.
 _LONG_M, _USUAL, _WIDEST = 10.0, 0.75, 2.5
+# Ends of walls before which gaps are looked for at a time, and a distance farther than any gap (m).
+_ENDS_AT_A_TIME, _FAR_M = 1000, 1e9
 # Piers are so much thicker than the usual ends of walls, and shorter than so many times their own thickness.
 _PIER, _PIER_NIB = 1.6, 2.0
 
@@ -140,15 +142,20 @@ def find_gaps(
             ends += _ends(np.asarray(ring.coords), config)
             if config.blunt:
                 blunt += _ends(np.asarray(ring.simplify(config.blunt).coords), config)
-    usual = float(np.median([wall.thickness for wall in ends])) if ends else 0.0
-    found: list[Gap] = []
-    for index, wall in enumerate((*ends, *blunt)):
+    usual = float(np.median([wall.thickness for wall in ends if wall.thickness <= config.thickest] or [0.0]))
+    # Most ends are found twice, as they are and blunt.
+    found: dict[tuple[tuple[float, float], tuple[float, float]], Gap] = {}
+    all_ends = [*ends, *blunt]
+    for begin in range(0, len(all_ends), _ENDS_AT_A_TIME):
         check_time()
-        gap = _gap_before(wall, areas, config)
-        if gap is not None and (gap.is_between_ends or not wall.is_pier(usual)):
-            # The direction of a blunt end is inexact, so its gap needs a symbol.
-            found.append(gap if index < len(ends) else replace(gap, is_sure=False))
-    ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
+        for index, gap in _gaps_before(all_ends[begin : begin + _ENDS_AT_A_TIME], areas, config):
+            wall = all_ends[begin + index]
+            is_broad = wall.thickness > config.thickest
+            if gap.is_between_ends or is_broad or not wall.is_pier(usual):
+                # The direction of a blunt end is inexact, so its gap needs a symbol, as that beside a broad pier.
+                gap = gap if begin + index < len(ends) and not is_broad else replace(gap, is_sure=False)
+                found.setdefault((gap.start, gap.end), gap)
+    ranked = [(priority, gap.width, gap) for gap in found.values() if (priority := rank(gap)) is not None]
     gaps = [gap for _, _, gap in sorted(ranked, key=lambda item: item[:2])]
     return [gaps[index] for index in without_overlaps([gap.shape for gap in gaps], 0.25, check_time)]
 
@@ -201,7 +208,8 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
     found = []
     for i in range(len(points)):
         following = (i + 1) % len(points)
-        if not config.thinnest <= lengths[i] <= config.thickest or min(turns[i - 1], turns[i]) < _CORNER:
+        widest = max(config.thickest, config.widest_pier)
+        if not config.thinnest <= lengths[i] <= widest or min(turns[i - 1], turns[i]) < _CORNER:
             continue
         nib = max(lengths[i - 1], lengths[following])
         outward = directions[i - 1] if lengths[i - 1] >= lengths[following] else -directions[following]
@@ -209,39 +217,39 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
     return found
 
 
-def _gap_before(wall: _End, areas: WallAreas, config: WallConfig) -> Gap | None:
-    """Return the gap in front of the end of a wall, None if nothing lies within the limits of width."""
-    outward = wall.outward
-    distances = []
-    for share in (0.15, 0.5, 0.85):
-        origin = wall.start + share * (wall.end - wall.start) + 0.5 * config.thinnest * outward
-        ray = shapely.LineString([origin, origin + config.widest_gap * outward])
-        distances.append(0.5 * config.thinnest + areas.distance_along(ray))
+def _gaps_before(walls: Sequence[_End], areas: WallAreas, config: WallConfig) -> list[tuple[int, Gap]]:
+    """Return the gaps in front of ends of walls that are within the limits of width, with the number of each end."""
+    start, outward = np.array([wall.start for wall in walls]), np.array([wall.outward for wall in walls])
+    edge = np.array([wall.end for wall in walls]) - start
+    origins = start[:, None] + np.array([0.15, 0.5, 0.85])[:, None] * edge[:, None]
+    origins = (origins + 0.5 * config.thinnest * outward[:, None]).reshape(-1, 2)
+    rays = np.stack([origins, origins + config.widest_gap * np.repeat(outward, 3, axis=0)], axis=1)
+    distances = np.minimum(0.5 * config.thinnest + areas.distances_along(rays), _FAR_M).reshape(-1, 3)
     # One of the three rays can miss if the walls are not quite in line.
-    nearest, middle, farthest = sorted(distances)
-    width = farthest if farthest - middle <= 0.25 * config.thickest else middle
-    if width - nearest > _OUT_OF_LINE_M or not config.narrowest_gap <= width <= config.widest_gap:
-        return None
-    is_between_ends = _faces_an_end(wall, width, areas)
-    is_sure = width - nearest <= 0.25 * config.thickest and (
-        wall.nib >= config.nib or (is_between_ends and width <= _MAX_BETWEEN_NIBS)
-    )
-    # Overlap both walls slightly, so that no slit stays open.
-    near, far = -0.02 * outward, (width + 0.02) * outward
-    shape = shapely.Polygon([wall.start + near, wall.end + near, wall.end + far, wall.start + far])
-    if not shape.is_valid:
-        return None
-    begin = 0.5 * (wall.start + wall.end)
-    reach = begin + width * outward
-    return Gap(shape, point_xy(begin), point_xy(reach), is_sure, is_between_ends)
-
-
-def _faces_an_end(wall: _End, width: float, areas: WallAreas) -> bool:
-    """Return whether the other side of a gap is the end of a wall of similar thickness."""
-    a, b = wall.start + (width + 0.02) * wall.outward, wall.end + (width + 0.02) * wall.outward
-    side = 0.12 * (b - a) / np.linalg.norm(b - a)
-    outside = shapely.LineString([a - side, a - 0.3 * side]), shapely.LineString([b + 0.3 * side, b + side])
-    return not any(areas.meets(piece) for piece in outside)
+    nearest, middle, farthest = np.sort(distances, axis=1).T
+    width = np.where(farthest - middle <= 0.25 * config.thickest, farthest, middle)
+    is_gap = (width - nearest <= _OUT_OF_LINE_M) & (width >= config.narrowest_gap) & (width <= config.widest_gap)
+    # The other side is the end of a wall of similar thickness if no wall lies beside the corners of the gap.
+    a = start + (width + 0.02)[:, None] * outward
+    b, side = a + edge, 0.12 * edge / np.linalg.norm(edge, axis=1)[:, None]
+    outside = np.stack([np.stack([a - side, a - 0.3 * side], axis=1), np.stack([b + 0.3 * side, b + side], axis=1)])
+    is_at_face = np.zeros(len(walls), bool)
+    to_walls = areas.distances_along(outside[:, is_gap].reshape(-1, 2, 2))
+    is_at_face[is_gap] = np.isfinite(to_walls).reshape(2, -1).any(axis=0)
+    found = []
+    for index in np.flatnonzero(is_gap).tolist():
+        wall, width_m = walls[index], float(width[index])
+        is_sure = width_m - float(nearest[index]) <= 0.25 * config.thickest and (
+            wall.nib >= config.nib or (not is_at_face[index] and width_m <= _MAX_BETWEEN_NIBS)
+        )
+        # Overlap both walls slightly, so that no slit stays open.
+        near, far = -0.02 * wall.outward, (width_m + 0.02) * wall.outward
+        shape = shapely.Polygon([wall.start + near, wall.end + near, wall.end + far, wall.start + far])
+        begin = 0.5 * (wall.start + wall.end)
+        if shape.is_valid:
+            reach = point_xy(begin + width_m * wall.outward)
+            found.append((index, Gap(shape, point_xy(begin), reach, is_sure, not is_at_face[index])))
+    return found
 
 
 def _faces(
@@ -368,20 +376,20 @@ def _insides(
             islands = [parts[k] for k in tree.query(hole, predicate="intersects") if k != index]
             inside = hole.difference(shapely.union_all(islands)) if islands else hole
             for floor in polygons_from_geometry(inside):
-                if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config):
+                if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config.shallowest_room):
                     rooms.append(floor.simplify(0.004))
     # Rooms inside an island of walls are found twice.
     rooms.sort(key=lambda room: -room.area)
     return [rooms[index] for index in without_overlaps(rooms, 0.5)]
 
 
-def _is_thin(face: shapely.Polygon, config: WallConfig) -> bool:
-    return face.buffer(-0.5 * config.thickest).is_empty
+def _is_thin(face: shapely.Polygon, depth_m: float) -> bool:
+    return face.buffer(-0.5 * depth_m).is_empty
 
 
 def _is_wall(face: shapely.Polygon, config: WallConfig) -> bool:
     """Return whether the area between lines is a wall, at most widened by shafts, chimneys and acute corners."""
-    if _is_thin(face, config):
+    if _is_thin(face, config.thickest):
         return True
     usual = 2.0 * face.area / face.length
     is_slim = face.length >= _LONG_M and usual <= _USUAL * config.thickest

@@ -27,7 +27,7 @@ from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, f
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
 from lalaloc_core.importers.drawing.storeys_beside import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
-from lalaloc_core.importers.picture.ink import blank_outside, drawn_extent
+from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
@@ -43,8 +43,8 @@ _MAX_EXTENT_M = 1000.0
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Read the plan in a picture, as a draft."""
-    gray, warmth, paper_m_per_pixel = _open(content, budget)
     builder = ReportBuilder("picture", is_draft=True)
+    gray, warmth, paper_m_per_pixel = _open(content, builder, budget)
     if _has_dark_ground(gray):
         gray, warmth = 255 - gray, None
         builder.notes.append("the picture shows light lines on a dark ground and was inverted")
@@ -121,7 +121,7 @@ def _read_plan(
 
 
 def _open(
-    content: bytes, budget: Budget
+    content: bytes, builder: ReportBuilder, budget: Budget
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, float | None]:
     """Return the grey picture on white, its warmth, and the length of a pixel on paper if the file gives it."""
     limit = budget.limits.max_plan_pixels
@@ -148,6 +148,9 @@ def _open(
                 gray = np.asarray(flat.convert("L"))
                 grey_modes = ("1", "L", "LA", "I", "I;16", "F")
                 warmth = None if upright.mode in grey_modes else _warmth(flat)
+                if (with_dark_walls := darken_pale_walls(np.asarray(flat.convert("RGB")))) is not None:
+                    gray, warmth = with_dark_walls, None
+                    builder.notes.append("walls are the areas of one colour between the floors, which are darker")
     except InvalidFloorPlanError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:

@@ -94,12 +94,13 @@ def read_texts(
     try:
         factor, ink = _resized_ink(gray, _TILE_PX, straighten=straighten)
         has_letters = _has_letters(ink)
-        boxes = _boxes(ink, builder, budget) if has_letters else []
-        is_small = has_letters and min((_height(box) for _, box in boxes), default=0.0) < _LEGIBLE_PX
+        parts = _boxes(ink, builder, budget) if has_letters else []
+        is_small = has_letters and min((_height(box) for _, box, _ in parts), default=0.0) < _LEGIBLE_PX
         if max(rows, columns) > _TILE_PX and is_small and _share_of_time(budget) < _SHARE_OF_TIME / 3.0:
             finer_factor, finer = _resized_ink(gray, READ_PX, straighten=straighten)
-            if len(found_finer := _boxes(finer, builder, budget)) >= len(boxes):
-                factor, ink, boxes = finer_factor, finer, found_finer
+            if len(finer_parts := _boxes(finer, builder, budget)) >= len(parts):
+                factor, ink, parts = finer_factor, finer, finer_parts
+        boxes = _texts(parts, builder, budget)
     except MemoryError:
         builder.warnings.append(
             "texts were not read for lack of memory: name the rooms, or raise the limit (LALALOC_IMPORT_MEMORY_BYTES)"
@@ -200,10 +201,8 @@ class _Reader:
 _reader = cache(_Reader)
 
 
-def _boxes(ink: Ink, builder: ReportBuilder, budget: Budget) -> list[tuple[str, Corners]]:
-    """Return the texts with their corners in pixels; of texts in two tiles the larger one."""
-    reader = _reader()
-    parts = _whole_texts(_detect_texts(ink, reader, builder, budget))[:_MAX_TEXTS]
+def _texts(parts: Sequence[_Part], builder: ReportBuilder, budget: Budget) -> list[tuple[str, Corners]]:
+    """Return the texts with their corners in pixels."""
     found: list[tuple[str, Corners]] = []
     for begin in range(0, len(parts), _BATCH):
         if begin and _share_of_time(budget) > _SHARE_OF_TIME:
@@ -213,13 +212,13 @@ def _boxes(ink: Ink, builder: ReportBuilder, budget: Budget) -> list[tuple[str, 
             )
             break
         batch = parts[begin : begin + _BATCH]
-        texts = reader.texts([crop for _, _, crop in batch])
+        texts = _reader().texts([crop for _, _, crop in batch])
         found += [(text, box) for text, (_, box, _) in zip(texts, batch, strict=True) if text]
     return found
 
 
-def _detect_texts(ink: Ink, reader: _Reader, builder: ReportBuilder, budget: Budget) -> list[_Part]:
-    """Return the texts of all tiles; one that a tile cuts is also in the next, as a whole."""
+def _boxes(ink: Ink, builder: ReportBuilder, budget: Budget) -> list[_Part]:
+    """Return the texts of all tiles before they are read; one that a tile cuts is also in the next, as a whole."""
     rows, columns = ink.gray.shape
     parts: list[_Part] = []
     for index, (y, x) in enumerate((y, x) for y in _starts(rows) for x in _starts(columns)):
@@ -229,10 +228,10 @@ def _detect_texts(ink: Ink, reader: _Reader, builder: ReportBuilder, budget: Bud
         if index and _share_of_time(budget) > 0.5 * _SHARE_OF_TIME:
             builder.warnings.append("texts in a part of the picture were not read, for lack of time; name its rooms")
             break
-        for box, crop in reader.boxes(cv2.cvtColor(ink.gray[tile], cv2.COLOR_GRAY2BGR)):
+        for box, crop in _reader().boxes(cv2.cvtColor(ink.gray[tile], cv2.COLOR_GRAY2BGR)):
             placed = box + np.array([x, y])
             parts.append((shapely.Polygon(placed), placed, crop))
-    return [part for part in parts if part[0].is_valid]
+    return _whole_texts([part for part in parts if part[0].is_valid])[:_MAX_TEXTS]
 
 
 def _share_of_time(budget: Budget) -> float:

@@ -27,7 +27,7 @@ from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark
 from lalaloc_core.importers.picture.wall_symbols import GapContent, GapReader, windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
-_CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.05)
+_CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.05, shallowest_room=0.4, widest_pier=1.2)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 # Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
@@ -49,6 +49,9 @@ _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M = 1.2
 # Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
 _WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
+# Least number of doors that are drawn without a swing, least share of other openings that have more lines, and share of
+# a line that is drawn: dashes in an inner wall are a beam.
+_DOORS_ALIKE, _UNLIKE, _DASHED = 3, 0.5, 0.7
 # Smallest shape (m²) inside a room that is counted if it is not used.
 _COUNTED_M2 = 0.05
 # Usual width of lines (pixels).
@@ -173,10 +176,11 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         contents[id(gap)] = found = reader.classify(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
-        relative = gap.shape.area / gap.width / walls.thickness_m
+        depth_m = gap.shape.area / gap.width
+        relative = depth_m / walls.thickness_m
         if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
             return None
-        if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
+        if found.kind != "pane" and (gap.width > _WIDEST_WITH_ONE_LINE_M or depth_m > _CONFIG.thickest):
             return None
         return ("swing", "pane", "line", "nothing").index(found.kind)
 
@@ -231,12 +235,14 @@ def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder, budget: Budge
     if not reading.is_dark:
         panes = windows_in_walls(reading.walls, ink, budget.check_time)
         candidates += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
-    found = []
-    for start, end, content in candidates:
-        width = math.dist(start, end)
+    placed = [
+        (content, math.dist(start, end), _is_between_rooms(start, end, reading.walls.thickness_m, rooms))
+        for start, end, content in candidates
+    ]
+    found, lines_of_doors = [], _lines_of_doors(placed)
+    for (start, end, _), (content, width, is_inner) in zip(candidates, placed, strict=True):
         budget.check_time()
-        is_inner = _is_between_rooms(start, end, reading.walls.thickness_m, rooms)
-        kind = _kind(content, width, is_inner=is_inner)
+        kind = _kind(content, width, lines_of_doors, is_inner=is_inner)
         found.append(SketchedOpening(kind, start, end))
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
@@ -244,7 +250,20 @@ def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder, budget: Budge
     return found
 
 
-def _kind(content: GapContent, width: float, *, is_inner: bool) -> OpeningKind:
+def _lines_of_doors(placed: Sequence[tuple[GapContent, float, bool]]) -> float:
+    """Return the number of lines in doors that are drawn without a swing, if windows have more; else 0.
+
+    Openings have a width (m), and are between rooms or not.
+    """
+    panes = [(opening.lines, is_inner and m <= _WIDEST_DOOR_M) for opening, m, is_inner in placed if opening.lines > 1]
+    doors = [lines for lines, is_door in panes if is_door]
+    usual = float(np.median(doors or [0]))
+    have_more = [lines > usual for lines, is_door in panes if not is_door]
+    least = max(_DOORS_ALIKE, sum(opening.kind == "swing" for opening, *_ in placed))
+    return usual if len(doors) >= least and np.mean(have_more or [False]) >= _UNLIKE else 0.0
+
+
+def _kind(content: GapContent, width: float, lines_of_doors: float, *, is_inner: bool) -> OpeningKind:
     """Classify an opening. Lines in an inner wall are a door without a swing, in an outer wall a window."""
     if content.kind == "swing":
         return "door"
@@ -252,8 +271,10 @@ def _kind(content: GapContent, width: float, *, is_inner: bool) -> OpeningKind:
         return "passage"
     if abs(content.warmth) >= _COLOURED:
         return "door" if content.warmth > 0.0 else "window"
-    if content.kind == "line" and is_inner:
+    if is_inner and (content.kind == "line" or content.confidence < _DASHED):
         return "passage"
+    if content.kind == "pane" and 0 < content.lines <= lines_of_doors:
+        return "door"
     return "door" if is_inner and width <= _WIDEST_DOOR_M else "window"
 
 
@@ -275,7 +296,7 @@ def _doubt(content: GapContent, kind: OpeningKind) -> str | None:
     if content.kind == "line":
         return "a single line is drawn in it"
     if content.kind == "pane" and kind == "door":
-        return "it is drawn like a window, but " + ("brown" if content.warmth >= _COLOURED else "in an inner wall")
+        return "it is drawn like a window, but " + ("brown" if content.warmth >= _COLOURED else "as doors inside are")
     return f"{content.confidence:.0%} of its symbol is drawn" if content.confidence < _SURE else None
 
 

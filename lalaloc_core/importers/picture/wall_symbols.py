@@ -1,4 +1,4 @@
-"""Symbols in walls: the arc of a door or the lines of a window in a gap, and windows drawn into walls of two lines.
+"""Symbols in walls: the leaf of a door or the lines of a window in a gap, and windows drawn into walls of two lines.
 
 These are lines along the middle, closed at both ends.
 """
@@ -13,20 +13,27 @@ from typing import Literal
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from lalaloc_core.importers.common.geometry import opening_line, side_lengths
 from lalaloc_core.importers.common.sketch import SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
-from lalaloc_core.importers.picture.ink import COLOURLESS, Ink
+from lalaloc_core.importers.picture.ink import COLOURLESS, Ink, faint_lines
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
 # Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (pixels).
 _ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
 _NEAR_PX = 2
 _DOOR_M = (0.5, 2.4)
-_ARC_POINTS = 28
-# Contrast of 255: of a line's pixels, of a line's mean, and of the paper between two lines.
-_FAINT, _DIP, _RISE = 22.0, 30.0, 12.0
+# Leaves that are no full arc's: smallest share of one without an arc, and largest inked share beside a symbol.
+_LEAF_ALONE, _BESIDE = 0.95, 0.4
+# Lines of panes that a scan broke: smallest inked shares, of the whole line and of each quarter.
+_BROKEN, _BROKEN_QUARTER = 0.35, 0.15
+# Widths of bow windows (m), and their smallest and largest depths relative to them.
+_BOW_M, _BOW = (0.8, 4.0), (0.08, 0.5)
+# Contrast of 255: of a line's pixels, of the mean of a line at an edge of its gap, and between a line and the paper
+# beside it; the part of a line's contrast that its pixels have; and of arcs as thin as a hair.
+_FAINT, _DIP, _RISE, _OF_DEPTH, _HAIRLINE = 22.0, 30.0, 12.0, 0.25, 12.0
 # A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular.
 _MIN_LENGTH_M, _OF_WALL = 0.4, (0.12, 0.72)
 _FULL, _LONG = 0.8, 3.0
@@ -38,14 +45,16 @@ class GapContent:
     """Content of a gap.
 
     Attributes:
-        kind: "swing" for the arc of a door, "pane" for two or more lines along the wall, "line" for a single line.
+        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single line.
         warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
+        lines: number of lines along the wall.
         leaf_m: width of the leaf that swings, 0 without one.
     """
 
     kind: Literal["swing", "pane", "line", "nothing"]
     confidence: float
     warmth: float = 0.0
+    lines: int = 0
     leaf_m: float = 0.0
 
 
@@ -54,99 +63,114 @@ class GapReader:
 
     def __init__(self, ink: Ink, walls: WallMask) -> None:
         self._ink = ink
-        reach = 2 * _NEAR_PX - 1
+        reach = np.ones((2 * _NEAR_PX - 1,) * 2, np.uint8)
         # Exclude walls, because a hatch would match any arc.
-        lines = ink.lines & ~walls.mask
-        self._near = cv2.dilate(lines.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+        hairlines = ink.lines | faint_lines(ink.gray, ink.metres_per_pixel, _HAIRLINE)
+        drawn = [(lines & ~walls.mask).astype(np.uint8) for lines in (ink.lines, hairlines)]
+        # There is no ink outside the picture.
+        self._near, self._near_hairlines = (np.pad(cv2.dilate(lines, reach) > 0, 1) for lines in drawn)
 
     def classify(self, gap: Gap) -> GapContent:
         """Return the most likely content of a gap."""
-        arc, leaves = self._arc(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else (0.0, 1)
-        if arc >= _ARC:
-            return GapContent("swing", arc, leaf_m=gap.width / leaves)
+        swing, leaves = 0.0, 1
+        if _DOOR_M[0] <= gap.width <= _DOOR_M[1]:
+            swing, leaves = self._swing(gap, self._near)
+            if swing < _ARC:
+                swing, leaves = self._swing(gap, self._near_hairlines, is_pale=True)
+        if swing >= _ARC:
+            return GapContent("swing", swing, leaf_m=gap.width / leaves)
         lines, share, warmth = self._lines(gap)
+        if lines < 2 and gap.is_sure and gap.is_between_ends and _BOW_M[0] <= gap.width <= _BOW_M[1]:
+            depths = np.arange(*_BOW, 2.0 * self._ink.metres_per_pixel / gap.width)
+            bows = [self._lines(gap, side * float(depth)) for depth in depths for side in (1.0, -1.0)]
+            bow = max(bows, key=lambda found: found[:2])
+            if bow[0] >= 2 and bow[1] >= _ARC:
+                lines, share, warmth = bow
         if lines >= 2:
-            return GapContent("pane", share, warmth)
+            return GapContent("pane", share, warmth, lines)
         if lines == 1 and share >= _ONE_LINE:
-            return GapContent("line", share, warmth)
-        return GapContent("nothing", 1.0 - max(arc, share if lines else 0.0))
+            return GapContent("line", share, warmth, lines)
+        return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
-    def _arc(self, gap: Gap) -> tuple[float, int]:
-        """Return the inked share of the best quarter circle about an end of the gap, and the number of leaves."""
-        start, end = np.array(gap.start), np.array(gap.end)
-        along = (end - start) / gap.width
-        across = np.array([-along[1], along[0]])
-        half = 0.5 * gap.shape.area / gap.width
-        best = 0.0, 1
-        for leaves in (1, 2):
-            for side in (1.0, -1.0):
-                hinges = [self._best_swing(start, along, side * across, half, gap.width / leaves)]
-                hinges.append(self._best_swing(end, -along, side * across, half, gap.width / leaves))
-                # Both of two leaves must be visible.
-                share = max(hinges) if leaves == 1 else min(hinges)
-                if share > best[0]:
-                    best = share, leaves
-        return best
+    def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int]:
+        """Return the drawn share of the best symbol of a door in a gap, and the number of its leaves.
 
-    def _best_swing(
-        self,
-        hinge: Float[np.ndarray, "2"],
-        along: Float[np.ndarray, "2"],
-        across: Float[np.ndarray, "2"],
-        half_wall: float,
-        width: float,
-    ) -> float:
-        angles = np.radians(np.linspace(12.0, 82.0, _ARC_POINTS))
-        best = 0.0
-        for offset in (half_wall, 0.0, -half_wall):
-            centre = hinge + offset * across
-            for radius in width * np.array([1.0, 0.96, 0.92, 1.04]):
-                arc = centre + radius * (np.cos(angles)[:, None] * along + np.sin(angles)[:, None] * across)
-                share = self._inked_share(arc)
-                if _ARC_WITH_LEAF <= share < _ARC:
-                    reach = np.linspace(0.15, 0.95, _ARC_POINTS)[:, None]
-                    leaf = self._inked_share(centre + radius * reach * across)
-                    share = max(share, _ARC if leaf >= _LEAF else 0.0)
-                best = max(best, share)
-        return best
+        It is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open, or such a
+        leaf alone. A pale arc must stand out from what is drawn beside it.
+        """
+        start, end = self._ink.to_pixels(np.array([gap.start, gap.end]))
+        width = math.dist(start, end)
+        along = (end - start) / width
+        half = 0.5 * gap.shape.area / gap.width / self._ink.metres_per_pixel
+        angles, reach = np.radians(np.arange(12.0, 91.0, 2.0)), np.arange(0.16, 1.25, 0.04)
+        # Number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
+        count, side, hinge, offset, angle, distance = np.meshgrid(
+            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], angles, reach, indexing="ij", sparse=True
+        )
+        radius = width / count * distance
+        x = width * hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle)
+        y = offset + side * radius * np.sin(angle)
+        columns = (start[0] + 1.0 + x * along[0] - y * along[1]).astype(np.intp)
+        rows = (start[1] + 1.0 + x * along[1] + y * along[0]).astype(np.intp)
+        is_inked = near[rows.clip(0, near.shape[0] - 1), columns.clip(0, near.shape[1] - 1)]
+        # Radii are 0.92, 0.96, 1 and 1.04 of the width, and angles of the arc are at most 82 degrees.
+        arcs, leaves = is_inked[..., :36, 19:23], is_inked[..., :21].mean(axis=-1)
+        shares = arcs.mean(axis=-2)
+        if is_pale:
+            beside = np.maximum(is_inked[..., :36, 15:19].mean(axis=-2), is_inked[..., :36, 23:27].mean(axis=-2))
+            shares = np.where(beside <= _BESIDE, shares, 0.0)
+        has_leaf = (shares >= _ARC_WITH_LEAF) & (leaves[..., -1:] >= _LEAF)
+        shares = np.where(has_leaf, np.maximum(shares, _ARC), shares)
+        # Leaves at 24 to 76 degrees, and the arc up to six degrees before each.
+        up_to = (np.cumsum(arcs, axis=-2) / np.arange(1, 37)[:, None])[..., 3:30, :].max(axis=-1)
+        leaf, outer = leaves[..., 6:33], is_inked[..., 9:21].mean(axis=-1)
+        beside = np.maximum(outer[..., :27], outer[..., 12:39])
+        ends = is_inked[..., 6:33, 24:].mean(axis=-1) <= _BESIDE
+        is_slanted = (beside <= _BESIDE) & ends & (leaf >= np.where(up_to >= _ARC, _LEAF, _LEAF_ALONE))
+        slanted = np.where(is_slanted, np.maximum(0.5 * (leaf + up_to), _ARC), 0.0)
+        best = np.maximum(shares.max(axis=(-2, -1)), slanted.max(axis=(-2, -1)))
+        # Both of two leaves must be visible.
+        one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
+        return (two, 2) if two > one else (one, 1)
 
-    def _lines(self, gap: Gap) -> tuple[int, float, float]:
+    def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float]:
         """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
 
-        The mean of the pixels along a line reveals even thin and faint lines.
+        The mean of the pixels along a line reveals even thin and faint lines. `bow` is the depth of a curve that they
+        follow, relative to the gap's width.
         """
         start, end = np.array(gap.start), np.array(gap.end)
         along = (end - start) / gap.width
         across = np.array([-along[1], along[0]])
-        pixel = self._ink.metres_per_pixel
+        # Curves are many, and are sampled half as finely.
+        pixel, step = self._ink.metres_per_pixel, (0.25 if bow == 0.0 else 0.5) * self._ink.metres_per_pixel
         half = 0.5 * gap.shape.area / gap.width + 2.0 * pixel
-        offsets = np.arange(-half, half + 0.25 * pixel, 0.25 * pixel)
-        reach = np.linspace(0.08, 0.92, max(8, math.ceil(gap.width / pixel)))
-        points = start + (reach * gap.width)[None, :, None] * along + offsets[:, None, None] * across
+        offsets = np.arange(-half, half + step, step)
+        reach = np.linspace(0.08, 0.92, max(8, math.ceil(0.25 * gap.width / step)))
+        places = offsets[:, None] + 4.0 * bow * gap.width * (reach * (1.0 - reach))[None]
+        points = start + (reach * gap.width)[None, :, None] * along + places[..., None] * across
         columns, rows = (self._ink.to_pixels(points.reshape(-1, 2)) - 0.5).astype(np.float32).T
         maps = columns.reshape(len(offsets), len(reach)), rows.reshape(len(offsets), len(reach))
         values = cv2.remap(self._ink.gray, *maps, cv2.INTER_LINEAR, borderValue=255)
-        profile = values.mean(axis=1)
-        shares = (values < 255.0 - _FAINT).mean(axis=1)
-        found = [index for index in _dips(profile) if shares[index] >= _LINE]
-        best = sorted((float(shares[index]) for index in found), reverse=True)
+        found: dict[int, float] = {}
+        for index, level in _dips(values.mean(axis=1)):
+            depth = level - float(values[index].mean())
+            inked = values[index] < level - min(_FAINT, _OF_DEPTH * depth)
+            quarters = [part.mean() for part in np.array_split(inked, 4)]
+            is_broken = bow == 0.0 and inked.mean() >= _BROKEN and min(quarters) >= _BROKEN_QUARTER
+            if is_broken or inked.mean() >= _LINE:
+                found[index] = float(inked.mean())
+        best = sorted(found.values(), reverse=True)
         warmth = 0.0
         if found and self._ink.warmth is not None:
             colours = cv2.remap(self._ink.warmth, *maps, cv2.INTER_LINEAR, borderValue=COLOURLESS)
-            warmth = float(colours[found].mean()) - COLOURLESS
+            warmth = float(colours[list(found)].mean()) - COLOURLESS
         return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth
 
-    def _inked_share(self, points_m: Float[np.ndarray, "n 2"]) -> float:
-        """Return the share of points near ink; there is none outside the picture."""
-        columns, rows = np.floor(self._ink.to_pixels(points_m)).astype(int).T
-        height, width = self._near.shape
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        return float(self._near[rows[inside], columns[inside]].sum() / len(rows))
 
-
-def _dips(profile: Float[np.ndarray, "n"]) -> list[int]:
-    """Return the indices of a profile's minima that are darker than paper and separated by a rise."""
-    found: list[int] = []
+def _dips(profile: Float[np.ndarray, "n"]) -> list[tuple[int, float]]:
+    """Return the indices of a profile's minima that a rise separates, each with the level of the paper beside it."""
+    lows: list[int] = []
     lowest = highest = 0
     falling = True
     for index, value in enumerate(profile):
@@ -154,15 +178,21 @@ def _dips(profile: Float[np.ndarray, "n"]) -> list[int]:
             if value < profile[lowest]:
                 lowest = index
             elif value > profile[lowest] + _RISE:
-                if profile[lowest] < 255.0 - _DIP:
-                    found.append(lowest)
+                lows.append(lowest)
                 falling, highest = False, index
         elif value > profile[highest]:
             highest = index
         elif value < profile[highest] - _RISE:
             falling, lowest = True, index
-    if falling and profile[lowest] < 255.0 - _DIP:
-        found.append(lowest)
+    if falling:
+        lows.append(lowest)
+    found = []
+    for before, low, after in zip([0, *lows], lows, [*lows[1:], len(profile)], strict=False):
+        level = float(min(profile[before : low + 1].max(), profile[low:after].max()))
+        if level - profile[low] > _RISE:
+            found.append((low, level))
+        elif profile[low] < 255.0 - _DIP:
+            found.append((low, 255.0))
     return found
 
 
@@ -226,19 +256,12 @@ def _side_by_side(first: np.ndarray, second: np.ndarray, ink: Ink, walls: WallMa
     line = 0.5 * walls.thickness_m / ink.metres_per_pixel
     if shapely.distance(a, b) > line:
         return False
-    lengths = sorted(max(_sides(corners)) for corners in (first, second))
+    lengths = sorted(side_lengths(strip)[1] for strip in (a, b))
     shared = a.buffer(line, cap_style="square", join_style="mitre").intersection(b)
     return lengths[0] > 0.8 * lengths[1] and shared.length > lengths[0]
 
 
-def _sides(corners: np.ndarray) -> tuple[float, float]:
-    return float(np.linalg.norm(corners[1] - corners[0])), float(np.linalg.norm(corners[2] - corners[1]))
-
-
 def _window(group: list[np.ndarray], ink: Ink) -> SketchedOpening:
-    corners = cv2.boxPoints(cv2.minAreaRect(np.concatenate(group).astype(np.float32)))
-    if np.linalg.norm(corners[1] - corners[0]) < np.linalg.norm(corners[2] - corners[1]):
-        corners = np.roll(corners, -1, axis=0)
-    ends = ink.to_plan(np.array([0.5 * (corners[0] + corners[3]), 0.5 * (corners[1] + corners[2])]))
-    (x0, y0), (x1, y1) = ends
-    return SketchedOpening("window", (float(x0), float(y0)), (float(x1), float(y1)))
+    ends = opening_line(shapely.MultiPoint(ink.to_plan(np.concatenate(group))).convex_hull)
+    assert ends is not None
+    return SketchedOpening("window", *ends)
