@@ -19,8 +19,7 @@ class UploadedFile:
     """
 
     def __init__(self, file: IO[bytes], name: str | None = None) -> None:
-        self.name = name
-        self._file = file
+        self.name, self._file = name, file
         self._lock = threading.Lock()
         self._size = file.seek(0, io.SEEK_END)
 

@@ -62,12 +62,8 @@ class AlbumSolver:
 
         `reads` are threads for the database, whose calls can read and write the features of an album.
         """
-        self._store = store
-        self._plans = plans
-        self._localiser = localiser
-        self._reads = reads
-        self._settings = settings
-        self._telemetry = telemetry
+        self._store, self._plans, self._localiser = store, plans, localiser
+        self._reads, self._settings, self._telemetry = reads, settings, telemetry
         self._owner = uuid.uuid4().hex
         self._changed = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None

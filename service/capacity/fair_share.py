@@ -40,8 +40,7 @@ class Shares:
     """Units held per client. Not thread-safe: for one event loop, or under the owner's lock."""
 
     def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.in_use = 0
+        self.limit, self.in_use = limit, 0
         self._held: Counter[str] = Counter()
 
     def held_by(self, client: str) -> int:
@@ -132,8 +131,7 @@ class FairSemaphore:
     """
 
     def __init__(self, limit: int, accounts: CpuAccounts, *, cores: int | None = None) -> None:
-        self._accounts = accounts
-        self._cores = cores
+        self._accounts, self._cores = accounts, cores
         self._lock = threading.Lock()
         self._shares = Shares(limit)
         self._waiting: FairQueue[Future[None]] = FairQueue(accounts)

@@ -109,8 +109,7 @@ class BoundedReads:
 
     def __init__(self, *, threads: int, max_pending: int, wait_s: float) -> None:
         self._threads = Threads("lalaloc-reads", threads)
-        self._max_pending = max_pending
-        self._wait_s = wait_s
+        self._max_pending, self._wait_s = max_pending, wait_s
         self._begun: set[asyncio.Future[Any]] = set()
 
     async def run(self, tenant: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

@@ -36,8 +36,7 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
 
     def __init__(self, store: Store, limit_bytes: int, telemetry: Telemetry) -> None:
         super().__init__(limit_bytes, grid_bytes)
-        self._store = store
-        self._telemetry = telemetry
+        self._store, self._telemetry = store, telemetry
 
     def cached(self, key: GridKey) -> PoseGrid | None:
         """Return a grid from memory."""
@@ -98,8 +97,7 @@ class _LeaseHeartbeat:
     """
 
     def __init__(self, renew: Callable[[], bool], every_s: float) -> None:
-        self._renew = renew
-        self._every_s = every_s
+        self._renew, self._every_s = renew, every_s
         self._beat_at = monotonic()
         self.lost = False
 
@@ -125,12 +123,8 @@ class GridBuilder:
         settings: Settings,
         telemetry: Telemetry,
     ) -> None:
-        self._store = store
-        self._encoders = encoders
-        self._cache = cache
-        self._cores = cores
-        self._settings = settings
-        self._telemetry = telemetry
+        self._store, self._encoders, self._cache = store, encoders, cache
+        self._cores, self._settings, self._telemetry = cores, settings, telemetry
         self._owner = uuid.uuid4().hex
         # Leases of the running jobs, all on the one thread of `GridJobs`.
         self._heartbeats: list[_LeaseHeartbeat] = []

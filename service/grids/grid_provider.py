@@ -104,12 +104,8 @@ class GridProvider:
         telemetry: Telemetry,
         cores: FairSemaphore,
     ) -> None:
-        self._store = store
-        self._encoders = encoders
-        self._model_sha256 = model_sha256
-        self._settings = settings
-        self._telemetry = telemetry
-        self._cores = cores
+        self._store, self._encoders, self._model_sha256 = store, encoders, model_sha256
+        self._settings, self._telemetry, self._cores = settings, telemetry, cores
         self.cache = GridCache(store, settings.storage.grid_cache_bytes, telemetry)
         self._jobs = GridBuilder(store, encoders, self.cache, cores, settings, telemetry).jobs
         self._unprepared = 0

@@ -25,11 +25,8 @@ class Sweeper:
     def __init__(
         self, store: Store, grids: GridProvider, telemetry: Telemetry, *, sweep_s: float, keep_answers_s: float
     ) -> None:
-        self._store = store
-        self._grids = grids
-        self._telemetry = telemetry
-        self._sweep_s = sweep_s
-        self._keep_answers_s = keep_answers_s
+        self._store, self._grids, self._telemetry = store, grids, telemetry
+        self._sweep_s, self._keep_answers_s = sweep_s, keep_answers_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sweeper", daemon=True)
 

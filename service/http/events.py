@@ -53,8 +53,7 @@ class EventStream(StreamingResponse):
     def __init__(self, events: AsyncGenerator[bytes], max_s: float) -> None:
         # Proxies must not buffer events.
         super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
-        self._events = events
-        self._max_s = max_s
+        self._events, self._max_s = events, max_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the stream."""
@@ -84,13 +83,8 @@ class ProgressEvents(Generic[EventT]):
         max_s: float,
         heartbeat_s: float,
     ) -> None:
-        self._look = look
-        self._deleted = deleted
-        self._final = final
-        self._admission = admission
-        self._reads = reads
-        self._max_s = max_s
-        self._heartbeat_s = heartbeat_s
+        self._look, self._deleted, self._final, self._admission = look, deleted, final, admission
+        self._reads, self._max_s, self._heartbeat_s = reads, max_s, heartbeat_s
         self._subscribers: set[_Subscriber[EventT]] = set()
         self._watch: asyncio.Task[None] | None = None
 

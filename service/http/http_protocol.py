@@ -48,8 +48,7 @@ class Pace:
     """Pace of bytes or events that arrive on several connections."""
 
     def __init__(self, each_s: float) -> None:
-        self._each_s = each_s
-        self._free_at = 0.0
+        self._each_s, self._free_at = each_s, 0.0
 
     def wait_s(self, count: int) -> float:
         """Return the time (s) until more may arrive on a connection, after the next `count`."""
@@ -85,12 +84,8 @@ class PacedParser:
             may_read: tells whether the protocol itself wants more bytes.
             spent: receives the CPU time (s) of each turn.
         """
-        self.events_left = EVENTS_PER_TURN
-        self._transport = transport
-        self._parse = parse
-        self._piece_bytes = piece_bytes
-        self._may_read = may_read
-        self._spent = spent
+        self.events_left, self._transport, self._parse = EVENTS_PER_TURN, transport, parse
+        self._piece_bytes, self._may_read, self._spent = piece_bytes, may_read, spent
         self._waiting = bytearray()
         self._timer: asyncio.TimerHandle | None = None
         self._is_blocked = False
@@ -258,8 +253,7 @@ class _Bounds:
     """
 
     def __init__(self, head_deadline_s: float, max_connections: int) -> None:
-        self.head_deadline_s = head_deadline_s
-        self.max_connections = max_connections
+        self.head_deadline_s, self.max_connections = head_deadline_s, max_connections
         self.dropping = Pace(_DROPPING_S)
         self._penalties: dict[str, Pace] = {}
 

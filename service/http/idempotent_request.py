@@ -55,8 +55,7 @@ class IdempotentRequest:
     """
 
     def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str) -> None:
-        self._claims = claims
-        self._request = request
+        self._claims, self._request = claims, request
         self._place = (tenant, f"{request.method} {routed_path(request.scope)}"[:_MAX_ROUTE])
         self._key = _key_of(request)
 

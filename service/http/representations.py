@@ -103,8 +103,7 @@ class LinesResponse(Response):
         # Proxies must not hold lines back.
         super().__init__(None, 200, {"X-Accel-Buffering": "no"})
         del self.headers["content-length"]
-        self._lines = lines
-        self._patience_s = patience_s
+        self._lines, self._patience_s = lines, patience_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the answer."""

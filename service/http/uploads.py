@@ -205,8 +205,7 @@ class _Body:
     """
 
     def __init__(self, request: Request, limits: UploadLimits, envelope_bytes: int = 0) -> None:
-        self._request = request
-        self._limits = limits
+        self._request, self._limits = request, limits
         self._max_bytes = limits.max_bytes + envelope_bytes
         try:
             with TemporaryFile():

@@ -90,8 +90,7 @@ class RemotePhotographEncoder(PhotographEncoder):
 
     def __init__(self, bundle: Bundle, settings: Settings, encoder: DeploymentHandle) -> None:
         super().__init__(bundle, threads=settings.cores.onnx_threads)
-        self._deadline_s = settings.requests.request_deadline_s
-        self._encoder = encoder
+        self._deadline_s, self._encoder = settings.requests.request_deadline_s, encoder
 
     def query(
         self,
@@ -116,8 +115,7 @@ class RemoteOptimiser:
     """Remote LPO; if a job fails for any reason, the query keeps the VDR pose, as with `LpoPool`."""
 
     def __init__(self, lpo: DeploymentHandle | None, telemetry: Telemetry) -> None:
-        self._lpo = lpo
-        self._telemetry = telemetry
+        self._lpo, self._telemetry = lpo, telemetry
 
     def start(self) -> None:
         """Do nothing: Ray starts the replicas."""
@@ -158,10 +156,7 @@ class RemoteLocaliser:
     """Localisation by search replicas; queries about the same plan or venue go to the same one."""
 
     def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
-        self.model = model
-        self._search = search
-        self._settings = settings
-        self._telemetry = telemetry
+        self.model, self._search, self._settings, self._telemetry = model, search, settings, telemetry
 
     async def answer(self, where: Where, query: AnyQuery[AnswerT]) -> AnswerT:
         """See `Localiser.answer`."""

@@ -170,9 +170,7 @@ class IngressReplica:
     """HTTP API: the normal application, with search replicas as its localisers."""
 
     def __init__(self, settings: Settings, lpo: DeploymentHandle | None, search: DeploymentHandle) -> None:
-        self._settings = settings
-        self._lpo = lpo
-        self._search = search
+        self._settings, self._lpo, self._search = settings, lpo, search
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
         backends = Backends(

@@ -55,8 +55,7 @@ class Converter:
     """Pool of conversion workers with a bounded queue. Thread-safe."""
 
     def __init__(self, settings: Settings, telemetry: Telemetry) -> None:
-        self._settings = settings
-        self._telemetry = telemetry
+        self._settings, self._telemetry = settings, telemetry
         self._pool: _Pool | None = None
         self._predicting: _Pool | None = None
         self._lock = threading.Lock()

@@ -75,10 +75,7 @@ class RenditionCache:
 
         `max_pending` files are made or wait, shared between clients. A prediction needs one of the `turns`, and a core.
         """
-        self._plans = plans
-        self._converter = converter
-        self._bundle = bundle
-        self._step_m = step_m
+        self._plans, self._converter, self._bundle, self._step_m = plans, converter, bundle, step_m
         self._threads = Threads("lalaloc-renditions", _THREADS)
         self._cache: BoundedCache[_Key, Rendition] = BoundedCache(limit_bytes, lambda made: len(made.content))
         self._pending: dict[_Key, _PendingJob] = {}

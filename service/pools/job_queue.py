@@ -57,14 +57,8 @@ class PendingJob:
         client: str = "",
         on_news: Callable[[Any], None] = lambda _value: None,
     ) -> None:
-        self.content = content
-        self.digest = digest
-        self.deadline = deadline
-        self.client = client
-        self.on_news = on_news
-        self.deaths = 0
-        self.stops = 0
-        self.stalled = False
+        self.content, self.digest, self.deadline, self.client = content, digest, deadline, client
+        self.on_news, self.deaths, self.stops, self.stalled = on_news, 0, 0, False
         self.future: Future[Any] = Future()
 
     @property
@@ -94,9 +88,7 @@ class JobQueue:
         `served_by` tells whether a worker is expected to be warm at a time (`monotonic`); without shares in the
         `workers`, a client can use all of them.
         """
-        self.accounts = accounts
-        self._served_by = served_by
-        self._workers = workers
+        self.accounts, self._served_by, self._workers = accounts, served_by, workers
         self._waiting: FairQueue[PendingJob] = FairQueue(accounts)
         self._room = Shares(limit)
         self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)

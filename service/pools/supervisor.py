@@ -66,16 +66,11 @@ class Supervisor:
 
     def __init__(self, spec: WorkerSpec, index: int, queue: JobQueue, on_restart: Callable[[str], None]) -> None:
         """Create a supervisor, which `start` starts; closing the queue ends its thread after the current job."""
-        self.ready = False
-        self.warmed_up = False
+        self.ready, self.warmed_up = False, False
         self.fault: str | None = None
-        self._spec = spec
-        self._index = index
-        self._queue = queue
-        self._on_restart = on_restart
-        self._failed_starts = 0
-        self._start_s = self._spec.start_s
-        self._starts_at = monotonic()
+        self._spec, self._index, self._queue = spec, index, queue
+        self._on_restart, self._failed_starts = on_restart, 0
+        self._start_s, self._starts_at = spec.start_s, monotonic()
         self._process: BaseProcess | None = None
         # Job of the worker, also of one that died: until the next worker is ready, only this job's client goes without.
         self._held: PendingJob | None = None
@@ -256,8 +251,7 @@ class Watchdog:
         """Prepare the timer of a process, in seconds."""
         self.verdict: Literal["stalled", "stopped"] | None = None
         self.cpu_s: float | None = None
-        self._process = process
-        self._limit_s = limit_s
+        self._process, self._limit_s = process, limit_s
         self._lock = threading.Lock()
         self._ended = False
 
@@ -279,8 +273,7 @@ class Watchdog:
         with self._lock:
             if self._ended:
                 return
-            self._ended = True
-            self.verdict = verdict
+            self._ended, self.verdict = True, verdict
             self._process.kill()
 
     def _arm(self, pause_s: float) -> None:

@@ -52,8 +52,7 @@ class _Places:
         self._revisions = dict(zip(ids, [record.revision_id for record in ground.records], strict=True))
         self._levels = dict(zip(ids, ground.levels, strict=True))
         self._anchors = dict(zip(ids, ground.anchors, strict=True))
-        self._height_m = camera_height_m
-        self._is_same_place = is_same_place
+        self._height_m, self._is_same_place = camera_height_m, is_same_place
 
     def pin(self, pin: Pin, earlier: PinAnswer | None, dropped: str | None) -> PinAnswer:
         """Return a pin, with what changed since `earlier`."""

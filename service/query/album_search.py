@@ -45,10 +45,7 @@ class AlbumSearch:
     """Solver of albums, on a thread of its own: a solve can take longer than queries may wait."""
 
     def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, cores: FairSemaphore) -> None:
-        self._parts = parts
-        self._queries = queries
-        self._threads = threads
-        self._cores = cores
+        self._parts, self._queries, self._threads, self._cores = parts, queries, threads, cores
         # Found by an earlier solve of the same album; a solve takes it out, as two must not share it.
         self._memories = BoundedCache[str, AlbumMemory](_MEMORY_BYTES, _size_of)
 

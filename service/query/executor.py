@@ -59,9 +59,7 @@ class Executor:
     """Compute threads of queries."""
 
     def __init__(self, settings: Settings, optimiser: Optimiser, telemetry: Telemetry, cores: FairSemaphore) -> None:
-        self._lpo_deadline_s = settings.lpo.deadline_s
-        self._optimiser = optimiser
-        self._telemetry = telemetry
+        self._lpo_deadline_s, self._optimiser, self._telemetry = settings.lpo.deadline_s, optimiser, telemetry
         self._steps = StepRunner(optimiser, telemetry)
         self._threads = Threads(
             "localise", with_headroom(settings.cores.compute_threads), telemetry.cpu_accounts, cores
@@ -108,8 +106,7 @@ class StepRunner:
     """Runner of steps up to a pause, to a job for an LPO worker, or to the result."""
 
     def __init__(self, optimiser: Optimiser, telemetry: Telemetry) -> None:
-        self._optimiser = optimiser
-        self._telemetry = telemetry
+        self._optimiser, self._telemetry = optimiser, telemetry
 
     def next(self, steps: SearchSteps[T], result: object, timeout_s: Callable[[], float]) -> RefinementJob | T | None:
         """Continue a search after the result of its last job; `timeout_s` returns the time left for refinement."""

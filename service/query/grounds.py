@@ -50,12 +50,8 @@ class Grounds:
         search: VenueSearch,
     ) -> None:
         self._latents_alone = not encoder.predicts_profile
-        self._grids = grids
-        self._queries = queries
-        self._reads = reads
-        self._plans = plans
-        self.executor = executor
-        self.search = search
+        self._grids, self._queries, self._reads = grids, queries, reads
+        self._plans, self.executor, self.search = plans, executor, search
 
     async def site(
         self,
@@ -118,9 +114,7 @@ class PlanSite:
     def __init__(
         self, grounds: Grounds, record: PlanRecord, form: HeightFields, hinted: HintFields | SessionDocument | None
     ) -> None:
-        self._grounds = grounds
-        self._record = record
-        self.north = record.plan.north
+        self._grounds, self._record, self.north = grounds, record, record.plan.north
         self.height = stated_height(form, record)
         self._hints = NO_HINTS if hinted is None else stated_hints(hinted, record.plan)
 
@@ -145,12 +139,8 @@ class VenueSite:
     def __init__(
         self, grounds: Grounds, where: VenueRecord, form: HeightFields, hints: VenueHints, max_poses: int | None
     ) -> None:
-        self._grounds = grounds
-        self._where = where
-        self.id = where.id
-        self._form = form
-        self._hints = hints
-        self._max_poses = max_poses
+        self._grounds, self._where, self.id = grounds, where, where.id
+        self._form, self._hints, self._max_poses = form, hints, max_poses
         self._warnings: list[str] = []
         self.north = None if where.anchor is None else heading_from_degrees(where.anchor.north_deg)
         self.ready = PlanList()

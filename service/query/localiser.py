@@ -47,8 +47,7 @@ class LocalLocaliser:
 
     def __init__(self, parts: QueryParts, queries: Slots, album_threads: Threads, cores: FairSemaphore) -> None:
         self.model = ModelAnswer.of(parts.bundle)
-        self._parts = parts
-        self._queries = queries
+        self._parts, self._queries = parts, queries
         single, albums = SingleSearch(parts), AlbumSearch(parts, queries, album_threads, cores)
         self._albums = albums
         self._searches: dict[type[AnyQuery[Any]], Callable[[Where, Any], Awaitable[Any]]] = {

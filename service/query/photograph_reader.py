@@ -33,9 +33,7 @@ class PhotographReader:
     def __init__(
         self, decoder: Decoder, encoder: PhotographEncoder, executor: Executor, *, compass_tolerance_deg: float
     ) -> None:
-        self._decoder = decoder
-        self._encoder = encoder
-        self._executor = executor
+        self._decoder, self._encoder, self._executor = decoder, encoder, executor
         self._compass_tolerance_deg = compass_tolerance_deg
 
     async def decode(

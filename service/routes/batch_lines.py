@@ -52,10 +52,7 @@ class BatchLines:
         answer: AnswerOf,
         on_end: Callable[[int], object] = lambda _index: None,
     ) -> None:
-        self._call = call
-        self._line_model = line
-        self._answer_one = answer
-        self._on_end = on_end
+        self._call, self._line_model, self._answer_one, self._on_end = call, line, answer, on_end
         self._common_error: Exception | None = None
 
     async def lines(self, photographs: Photographs) -> AsyncGenerator[str]:

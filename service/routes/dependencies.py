@@ -226,8 +226,7 @@ class _Page:
     """Page of a list that a request asks for."""
 
     def __init__(self, limit: Limit = 100, cursor: After = None) -> None:
-        self._limit = limit
-        self._cursor = cursor
+        self._limit, self._cursor = limit, cursor
 
     def read(
         self,

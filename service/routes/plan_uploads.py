@@ -272,8 +272,7 @@ class _LatestStep:
     """Latest step of an import; a client that reads slowly misses some, so they take no memory."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self._step = _WAITING
+        self._loop, self._step = loop, _WAITING
         self._changed = asyncio.Event()
 
     def put(self, step: ImportStep) -> None:

@@ -60,8 +60,7 @@ class AccessControl:
         # A container port that is published locally is reached over a network address of the container.
         published_here = settings.access.published_host is not None and is_local((settings.access.published_host, 0))
         self._allow_anonymous = settings.access.allow_anonymous or published_here
-        self._pages = settings.access.cors_origin_set
-        self._hosts = settings.access.allowed_host_names
+        self._pages, self._hosts = settings.access.cors_origin_set, settings.access.allowed_host_names
         self._keys = KeyCache(keys, fresh_s=settings.access.key_cache_s)
         self._rates = RateLimits(settings)
         self._tokens: TokenVerifier | None = None
@@ -195,8 +194,7 @@ class RateLimits:
 
     def __init__(self, settings: Settings) -> None:
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
-        self._per_minute = settings.access.rate_per_minute
-        self._burst = settings.access.rate_burst
+        self._per_minute, self._burst = settings.access.rate_per_minute, settings.access.rate_burst
         self._refused = RateLimitItemPerMinute(REFUSED_KEYS_PER_MINUTE, namespace="refused")
 
     async def count(self, caller: Identity) -> None:

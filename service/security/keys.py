@@ -97,9 +97,7 @@ class KeyCache:
     """
 
     def __init__(self, keys: ApiKeys, *, fresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._keys = keys
-        self._fresh_s = fresh_s
-        self._clock = clock
+        self._keys, self._fresh_s, self._clock = keys, fresh_s, clock
         self._known: BoundedCache[str, _CachedKey] = BoundedCache(_MEMORY_BYTES, lambda _: _RECORD_BYTES)
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lalaloc-keys")
         self._breaker = CircuitBreaker(clock)

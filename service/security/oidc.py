@@ -74,9 +74,7 @@ class TokenVerifier:
         clock: Callable[[], float] = time.monotonic,
         now: Callable[[], float] = time.time,
     ) -> None:
-        self._settings = settings
-        self._clock = clock
-        self._now = now
+        self._settings, self._clock, self._now = settings, clock, now
         self._registry = _Registry(algorithms=ALGORITHMS, strict_check_header=False)
         self._published: _Published | None = None
         self._tried_s = -float("inf")

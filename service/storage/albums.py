@@ -39,8 +39,7 @@ class Albums:
     """Albums of all tenants, each visible to its own tenant."""
 
     def __init__(self, database: Database, quota: StorageQuota) -> None:
-        self._database = database
-        self._quota = quota
+        self._database, self._quota = database, quota
 
     def add(self, tenant: str, album_id: str, new: NewAlbum, *, ttl_s: float, limit: int) -> AlbumRecord:
         """Store an album; return the one that exists under this id, if the request is repeated."""

@@ -30,8 +30,7 @@ class IdempotencyKeys:
     def __init__(
         self, database: Database, quota: StorageQuota, lease_s: float = MIN_LEASE_S, *, max_bytes: int = 64 * 2**20
     ) -> None:
-        self._database = database
-        self._quota = quota
+        self._database, self._quota = database, quota
         # Time limit of a request, after which the next attempt takes over. If the first one is still alive, both work
         # under the same token: work is done twice, nothing is stored twice.
         self._lease_s = lease_s
@@ -149,8 +148,7 @@ class KeptAnswers:
     """Kept answers of all tenants, each visible to its own tenant; answers are deleted with their plan."""
 
     def __init__(self, database: Database, quota: StorageQuota) -> None:
-        self._database = database
-        self._quota = quota
+        self._database, self._quota = database, quota
 
     def add(self, tenant: str, plan_id: str, content_of: Callable[[str], str], *, limit: int) -> str | None:
         """Keep an answer, and delete the tenant's oldest ones beyond `limit`.

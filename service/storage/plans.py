@@ -51,10 +51,8 @@ class Plans:
     """Plans of all tenants; calls treat plans of other tenants as missing."""
 
     def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
-        self._database = database
-        # Receives every plan that is read or stored at its current revision.
-        self._cache = cache
-        self._quota = quota
+        # The cache receives every plan that is read or stored at its current revision.
+        self._database, self._cache, self._quota = database, cache, quota
         self._parse: Callable[[PlanDocument], FloorPlan | None] = PlanDocument.plan
         self._parsing = SingleFlight[str, FloorPlan | None]()
 

@@ -58,8 +58,7 @@ class Sessions:
     """Sessions of all tenants, each visible to its own tenant."""
 
     def __init__(self, database: Database, quota: StorageQuota, claim_s: float) -> None:
-        self._database = database
-        self._quota = quota
+        self._database, self._quota = database, quota
         # Time limit (s) of a photograph, after which another one can be sent.
         self._claim_s = claim_s
 

@@ -181,8 +181,7 @@ class PlanLookup:
     """Lookup of plans and venues for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, max_age_s: float) -> None:
-        self._store = store
-        self._max_age_s = max_age_s
+        self._store, self._max_age_s = store, max_age_s
         self._breaker = CircuitBreaker()
 
     async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:

@@ -44,8 +44,7 @@ class StoredGrids:
     """Stored pose grids; a grid is stored completely or not at all."""
 
     def __init__(self, database: Database, quota: StorageQuota) -> None:
-        self._database = database
-        self._quota = quota
+        self._database, self._quota = database, quota
 
     def get(self, key: GridKey) -> PoseGrid | None:
         """Return a grid; None if it is not stored, or damaged and to be computed again."""

@@ -31,10 +31,8 @@ class VenueImports:
     """Venues of all tenants with their plans."""
 
     def __init__(self, database: Database, cache: PlanCache, quota: StorageQuota) -> None:
-        self._database = database
-        # Receives the plans, as far as it has room for unread ones.
-        self._cache = cache
-        self._quota = quota
+        # The cache receives the plans, as far as it has room for unread ones.
+        self._database, self._cache, self._quota = database, cache, quota
 
     def add(
         self, tenant: str, venue_id: str, name: str, plans: Sequence[NewPlan], *, max_plans: int, max_venues: int

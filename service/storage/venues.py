@@ -53,8 +53,7 @@ class Venues:
     """Venues of all tenants; a venue of another tenant counts as missing."""
 
     def __init__(self, database: Database, quota: StorageQuota) -> None:
-        self._database = database
-        self._quota = quota
+        self._database, self._quota = database, quota
         self._counts: LRUCache[tuple[str, str, float], tuple[VenueState, VenueCounts]] = LRUCache(_COUNTED)
         self._lock = threading.Lock()
 

@@ -85,9 +85,7 @@ class PlanIndices:
         limit_bytes: int,
     ) -> None:
         """Create the cache; the file, without a path a temporary one, is opened on first use."""
-        self._store = store
-        self._grids = grids
-        self._reads = reads
+        self._store, self._grids, self._reads = store, grids, reads
         self._path, self._file_bytes = path, file_bytes
         # Keys are digests of the plans' grids in order.
         self._indices: BoundedCache[bytes, Indexed] = BoundedCache(

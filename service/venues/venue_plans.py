@@ -71,11 +71,8 @@ class VenuePlans:
         idle_cores: IdleCores | None = None,
     ) -> None:
         """Limit the memory of the rows to `limit_bytes`, and the poses of the chosen plans to `max_poses`."""
-        self._store = store
-        self._grids = grids
-        self._reads = reads
-        self._max_poses = max_poses
-        self._idle_cores = idle_cores
+        self._store, self._grids, self._reads = store, grids, reads
+        self._max_poses, self._idle_cores = max_poses, idle_cores
         self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: ROW_BYTES * len(venue.rows))
 
     async def members(self, tenant: str, venue_id: str) -> PlanList:

@@ -61,10 +61,7 @@ class VenueSearch:
     """Reader of the plans of venues that a photograph is compared with."""
 
     def __init__(self, *, plans: VenuePlans, indices: IndexSource, encoder: PhotographEncoder, queries: Slots) -> None:
-        self._plans = plans
-        self._indices = indices
-        self._encoder = encoder
-        self._queries = queries
+        self._plans, self._indices, self._encoder, self._queries = plans, indices, encoder, queries
 
     async def ready(
         self, tenant: str, venue_id: str, hints: VenueHints, context: QueryContext

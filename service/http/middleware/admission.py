@@ -118,8 +118,7 @@ class _Rests:
     """
 
     def __init__(self, accounts: CpuAccounts, client: str, *, query: bool) -> None:
-        self._accounts = accounts
-        self._client = client
+        self._accounts, self._client = accounts, client
         self._free_bytes = _FREE_BYTES if query else 0
         self.spent_s = 0.0
 
@@ -147,10 +146,7 @@ class _ReadPermit:
     """Permit to compute the answer to a read, of which a request holds at most one."""
 
     def __init__(self, semaphore: FairSemaphore, client: str, rests: _Rests) -> None:
-        self._semaphore = semaphore
-        self._client = client
-        self._rests = rests
-        self._is_held = False
+        self._semaphore, self._client, self._rests, self._is_held = semaphore, client, rests, False
 
     @asynccontextmanager
     async def until_the_answer(self, *, needed: bool) -> AsyncIterator[None]:
@@ -189,8 +185,7 @@ class _BodyBudget:
     """Budget of one request's body, which takes the stated length, or one step after the other."""
 
     def __init__(self, budget: BytesInFlight, client: str, stated_bytes: int | None) -> None:
-        self._budget = budget
-        self._client = client
+        self._budget, self._client = budget, client
         self._first_bytes = _STEP_BYTES if stated_bytes is None else stated_bytes
         self._taken = self._received = 0
 
@@ -219,15 +214,10 @@ class _Connection:
     def __init__(
         self, receive: Receive, send: Send, body: _BodyBudget, rests: _Rests, *, on_answer: Callable[[], None]
     ) -> None:
-        self._body = body
-        self._rests = rests
-        self._on_answer = on_answer
-        self._begun = False
-        self.answered = False
-        # Of the answer; 0 before it begins.
-        self.status = 0
-        self._receive = receive
-        self._send = send
+        self._body, self._rests, self._on_answer = body, rests, on_answer
+        self._begun, self.answered = False, False
+        # Status of the answer; 0 before it begins.
+        self.status, self._receive, self._send = 0, receive, send
         self._gone = asyncio.Event()
         self._watch: asyncio.Task[None] | None = None
         self._worker: asyncio.Task[object] | None = None

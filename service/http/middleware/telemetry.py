@@ -41,8 +41,7 @@ class TelemetryMiddleware:
     """
 
     def __init__(self, app: ASGIApp, telemetry: Telemetry, routes: Sequence[Route]) -> None:
-        self._app = app
-        self._telemetry = telemetry
+        self._app, self._telemetry = app, telemetry
         self._routes = tuple(routes)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -126,9 +125,7 @@ class _Exchange:
     """Observer of the bytes received and sent for one request."""
 
     def __init__(self, log_fields: RequestLogFields, receive: Receive, send: Send) -> None:
-        self._log_fields = log_fields
-        self._receive = receive
-        self._send = send
+        self._log_fields, self._receive, self._send = log_fields, receive, send
         self._status: int | None = None
         self.complete = False
 
