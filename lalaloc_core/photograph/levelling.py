@@ -158,7 +158,12 @@ def turned_attitude(lines: Lines, upright: Attitude) -> tuple[Attitude, float]:
     normal, middle = (rays[:, ::-1] * (1.0, 1.0, -1.0) for rays in (lines.normal, lines.middle))
     turned = replace(lines, normal=normal, middle=middle)
     attitude = estimate_attitude(turned)
-    return attitude, _fit(turned, attitude) - _fit(lines, upright)
+    fit = _fit(turned, attitude)
+    log_odds = fit - _fit(lines, upright)
+    if log_odds >= ON_SIDE:
+        # Where the field of view is estimated, `upright` is that of one value, and `lines` are seen with the mean.
+        log_odds = min(log_odds, fit - _fit(lines, estimate_attitude(lines)))
+    return attitude, log_odds
 
 
 def _fit(lines: Lines, attitude: Attitude) -> float:

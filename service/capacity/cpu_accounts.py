@@ -52,8 +52,7 @@ class CpuAccounts:
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self.share: Callable[[str], float] = lambda _client: 1.0
-        self._clock = clock
-        self._lock = threading.Lock()
+        self._clock, self._lock = clock, threading.Lock()
         self._accounts: dict[str, _Account] = {}
 
     def charge(self, client: str, cpu_s: float, *, rests: bool = False) -> None:

@@ -98,8 +98,7 @@ class _LeaseHeartbeat:
 
     def __init__(self, renew: Callable[[], bool], every_s: float) -> None:
         self._renew, self._every_s = renew, every_s
-        self._beat_at = monotonic()
-        self.lost = False
+        self._beat_at, self.lost = monotonic(), False
 
     def beat(self) -> None:
         if not self.lost and monotonic() >= self._beat_at:

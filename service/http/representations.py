@@ -248,8 +248,7 @@ def _tags(request: Request, name: str) -> Tags | None:
         found.append((tag[1] is not None, tag[2]))
         end = tag.end()
     if not found or end < len(text):
-        raise InvalidRequestError(
-            [(name, f"is '{text[:100]}', which is neither * nor a list of entity tags in double quotes")]
-        )
+        fault = f"is '{text[:100]}', which is neither * nor a list of entity tags in double quotes"
+        raise InvalidRequestError([(name, fault)])
     strong = frozenset(opaque for weak, opaque in found if not weak)
     return Tags(any=False, strong=strong, all=frozenset(opaque for _, opaque in found))

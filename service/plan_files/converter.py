@@ -58,8 +58,7 @@ class Converter:
         self._settings, self._telemetry = settings, telemetry
         self._pool: _Pool | None = None
         self._predicting: _Pool | None = None
-        self._lock = threading.Lock()
-        self._closed = False
+        self._lock, self._closed = threading.Lock(), False
         telemetry.gauge(
             "lalaloc_import_queue_depth", "Plan files waiting for a worker.", lambda: self._count("waiting")
         )

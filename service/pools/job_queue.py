@@ -92,8 +92,7 @@ class JobQueue:
         self._waiting: FairQueue[PendingJob] = FairQueue(accounts)
         self._room = Shares(limit)
         self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)
-        self._changed = threading.Condition()
-        self._closed = False
+        self._changed, self._closed = threading.Condition(), False
 
     def __len__(self) -> int:
         return len(self._waiting)

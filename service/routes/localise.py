@@ -107,15 +107,13 @@ async def localise(
     idempotent = call.idempotent(media)
     form, parts, context = await read_query(call, LocaliseForm, "max_photograph_bytes", files={PHOTO})
     if form.venue_id is not None and is_picture:
-        raise errors.InvalidRequestError(
-            [("venue_id", f"cannot be drawn as {media}: a picture shows one plan; set floorplan_id")]
-        )
+        fault = f"cannot be drawn as {media}: a picture shows one plan; set floorplan_id"
+        raise errors.InvalidRequestError([("venue_id", fault)])
     (content,) = photographs_of(parts, form, call)
     if parts.named(FEATURES):
         if picture in ("both", "photograph"):
-            raise errors.InvalidRequestError(
-                [("picture", f"is '{picture}', but {FEATURES} have no photograph; set plan")]
-            )
+            fault = f"is '{picture}', but {FEATURES} have no photograph; set plan"
+            raise errors.InvalidRequestError([("picture", fault)])
         picture = "plan" if is_picture else None
 
     async def respond(_token: str) -> Response:

@@ -258,7 +258,6 @@ def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
         return None
     xx, xy, yy = given
     if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + _ROUNDED):
-        raise errors.InvalidRequestError(
-            [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}; xx and yy must be at least 0, and xy² at most xx·yy")]
-        )
+        fault = f"is {xx:g}, {xy:g}, {yy:g}; xx and yy must be at least 0, and xy² at most xx·yy"
+        raise errors.InvalidRequestError([("covariance_m2", fault)])
     return xx, xy, yy

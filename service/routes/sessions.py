@@ -161,9 +161,8 @@ def _check_size(record: PlanRecord, call: ApiCall) -> None:
     """Check that the belief over a plan can be computed for every photograph."""
     poses = grid_size(record.plan, call.settings.grids.grid_step_m)
     if poses > MAX_POSES:
-        raise errors.InvalidRequestError(
-            [("floorplan_id", f"the plan has about {poses} grid poses; the limit of sessions is {MAX_POSES}")]
-        )
+        fault = f"the plan has about {poses} grid poses; the limit of sessions is {MAX_POSES}"
+        raise errors.InvalidRequestError([("floorplan_id", fault)])
 
 
 def _stored_pose(session: SessionRecord) -> StoredPose | None:

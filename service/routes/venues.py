@@ -264,15 +264,13 @@ def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
 def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
     limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
-        raise errors.InvalidRequestError(
-            [("plans", f"has {len(documents)} floor plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)")]
-        )
+        fault = f"has {len(documents)} floor plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)"
+        raise errors.InvalidRequestError([("plans", fault)])
     counted = Counter(document.floorplan_id for document in documents)
     twice = [plan_id for plan_id, count in counted.items() if count > 1]
     if twice:
-        raise errors.InvalidRequestError(
-            [("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times; give it once")]
-        )
+        fault = f"has floor plan '{twice[0]}' {counted[twice[0]]} times; give it once"
+        raise errors.InvalidRequestError([("plans", fault)])
     if wrong := [plan_id for plan_id in counted if not is_id(plan_id)]:
         raise errors.InvalidRequestError([("plans", f"floor plan '{wrong[0]}' does not exist")])
     return [VenueMember(document.floorplan_id, document.level, document.name) for document in documents]
@@ -281,9 +279,8 @@ def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMem
 def _removed(document: VenueChangeDocument) -> set[str]:
     removed = set(document.remove)
     if both := removed & {plan.floorplan_id for plan in document.plans}:
-        raise errors.InvalidRequestError(
-            [("remove", f"has floor plan '{min(both)[:64]}', which is also in plans; give it in one of them")]
-        )
+        fault = f"has floor plan '{min(both)[:64]}', which is also in plans; give it in one of them"
+        raise errors.InvalidRequestError([("remove", fault)])
     return removed
 
 

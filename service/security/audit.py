@@ -100,13 +100,11 @@ class AuditTrail:
     """Writer of the entries of one replica."""
 
     def __init__(self, log: AuditLog) -> None:
-        self._log = log
-        self._lock = threading.Lock()
+        self._log, self._lock = log, threading.Lock()
         self._counted: dict[AuditEntry, AuditEntry] = {}
         self._per_actor = Counter[str]()
         self._waiting: deque[AuditEntry] = deque()
-        self._lost = 0
-        self._stop = threading.Event()
+        self._lost, self._stop = 0, threading.Event()
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="lalaloc-audit")
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
 

@@ -273,6 +273,7 @@ class WallAreas:
     def __init__(self, parts: Sequence[shapely.Polygon]) -> None:
         self.parts = parts
         self._areas = shapely.STRtree(parts)
+        shapely.prepare(self._areas.geometries)
         rings = shapely.get_parts(shapely.boundary(np.array(parts, dtype=object)))
         points, ring = shapely.get_coordinates(rings, return_index=True)
         pairs = np.stack([points[:-1], points[1:]], axis=1)[ring[:-1] == ring[1:]]
@@ -285,7 +286,9 @@ class WallAreas:
         ray, edge = self._edges.query(lines, predicate="intersects")
         hits = shapely.intersection(self._edges.geometries[edge], lines[ray])
         np.minimum.at(found, ray, shapely.distance(hits, origins[ray]))
-        found[self._areas.query(origins, predicate="intersects")[0]] = 0.0
+        # A tree's predicate would prepare the points, and look at all edges of an area for each.
+        ray, area = self._areas.query(origins)
+        found[ray[shapely.intersects(self._areas.geometries[area], origins[ray])]] = 0.0
         return found
 
 
