@@ -180,7 +180,8 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         relative = depth_m / walls.thickness_m
         if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
             return None
-        if found.kind != "pane" and (gap.width > _WIDEST_WITH_ONE_LINE_M or depth_m > _CONFIG.thickest):
+        # Gaps overlap both walls by 2 cm, so that narrow ones seem deeper by up to a tenth.
+        if found.kind != "pane" and (gap.width > _WIDEST_WITH_ONE_LINE_M or depth_m > 1.1 * _CONFIG.thickest):
             return None
         return ("swing", "pane", "line", "nothing").index(found.kind)
 
