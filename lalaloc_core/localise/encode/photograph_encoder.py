@@ -28,7 +28,8 @@ from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDi
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
 from lalaloc_core.photograph.patches import joined_patches
 
-_ArgumentT, _ResultT = TypeVar("_ArgumentT"), TypeVar("_ResultT")
+_ArgumentT = TypeVar("_ArgumentT")
+_ResultT = TypeVar("_ResultT")
 
 
 class PhotographEncoder:
