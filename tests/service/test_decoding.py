@@ -70,6 +70,18 @@ def black(width: int, height: int, kind: str, **options: object) -> bytes:
 
 
 @pytest.mark.slow
+def test_query_survives_a_killed_decoder(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
+    with start_app(tmp_path) as client:
+        plan_id = upload(client)
+        for _ in range(3):
+            ready(client)
+            os.kill(decoder(), signal.SIGKILL)
+            assert localise(client, plan_id, sphere, **QUICK).status_code == 200
+        assert metric(client, RESTARTS) == 3.0
+    assert decoders() == [], "the pool left a process behind"
+
+
+@pytest.mark.slow
 def test_stalling_picture_is_rejected(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     slow = black_png(10_000, 5_000)
     with start_app(tmp_path, decode_stall_s=0.2) as client:

@@ -18,6 +18,7 @@ from typing import Any
 
 import httpx
 import pytest
+import sqlalchemy
 import yaml
 from fastapi.routing import iter_route_contexts
 from starlette.types import Receive, Scope, Send
@@ -380,6 +381,21 @@ def test_log_names_key_and_tenant_without_secret(start_app: StartApp, tmp_path: 
     lines = stream.getvalue()
     assert lines.count(f'"key": "{id_of(key)}", "tenant": "acme"') == 3
     assert key.split("_", 2)[2] not in lines
+
+
+def test_broken_store_reveals_no_stack_trace(start_app: StartApp, tmp_path: Path) -> None:
+    database = tmp_path / "own.sqlite3"
+    with start_app(tmp_path, database_url=f"sqlite:///{database}", log_level="error") as client:
+        plan_id = upload(client)
+        engine = sqlalchemy.create_engine(f"sqlite:///{database}")
+        with engine.begin() as connection:
+            connection.exec_driver_sql("UPDATE floorplans SET created_at = 'very-secret-detail'")
+        engine.dispose()
+        for path in ("/floorplans", f"/floorplans/{plan_id}", f"/floorplans/{plan_id}/mesh.glb"):
+            response = client.get(path)
+            problem = assert_problem(response, 500, "internal")
+            assert problem.keys() == {"type", "title", "status", "detail", "request_id"}
+            assert not re.search(r"secret|sqlalchemy|\.py|line \d", response.text)
 
 
 def test_api_description_states_scopes_and_refusals() -> None:
