@@ -355,20 +355,19 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
     direction = steps / np.maximum(np.linalg.norm(steps, axis=1), 1e-9)[:, None]
     group = {index: [index] for index in range(len(pieces))}
     ends = pieces.reshape(-1, 2)
-    apart = np.linalg.norm(ends[:, None] - ends[None], axis=2)
-    first, second = np.nonzero(apart < _GAP * side)
-    for a, b in zip(first.tolist(), second.tolist(), strict=True):
-        i, j = a // 2, b // 2
-        if i >= j:
-            continue
-        cosine = abs(float(direction[i] @ direction[j]))
-        # The far ends are on different sides, so that the pieces follow each other.
-        outward = (pieces[i, 1 - a % 2] - ends[a]) @ (pieces[j, 1 - b % 2] - ends[b])
-        gap = ends[b] - ends[a]
-        offset = min(abs(float(direction[k, 0] * gap[1] - direction[k, 1] * gap[0])) for k in (i, j))
-        follows = cosine > np.cos(_TURN) and outward < 0.0 and offset < _OFFSET * side
-        if follows and group[i] is not group[j]:
-            merged = sorted(group[i] + group[j])
+    x, y = ends.T
+    apart = np.square(np.subtract.outer(x, x)) + np.square(np.subtract.outer(y, y))
+    first, second = np.nonzero(apart < (_GAP * side) ** 2)
+    i, j = first // 2, second // 2
+    cosine = np.abs((direction[i] * direction[j]).sum(axis=1))
+    # The far ends are on different sides, so that the pieces follow each other.
+    outward = ((pieces[i, 1 - first % 2] - ends[first]) * (pieces[j, 1 - second % 2] - ends[second])).sum(axis=1)
+    gap = ends[second] - ends[first]
+    offset = np.minimum(*(np.abs(direction[k, 0] * gap[:, 1] - direction[k, 1] * gap[:, 0]) for k in (i, j)))
+    follows = (i < j) & (cosine > np.cos(_TURN)) & (outward < 0.0) & (offset < _OFFSET * side)
+    for piece, follower in zip(i[follows].tolist(), j[follows].tolist(), strict=True):
+        if group[piece] is not group[follower]:
+            merged = sorted(group[piece] + group[follower])
             group |= dict.fromkeys(merged, merged)
     return list({members[0]: members for members in group.values()}.values())
 
