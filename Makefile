@@ -94,7 +94,7 @@ neighbours: $(STAMP) ## measure every route beside another tenant, write docs/re
 	-$(BIN)/python -m benchmarks.neighbours --json docs/neighbours.json
 	$(BIN)/python -m scripts.write_docs
 
-pictures: $(STAMP) ## draw the pictures of README.md and docs/ into docs/images (needs Chromium; about 3 minutes)
+pictures: $(STAMP) ## draw the pictures of README.md and docs/ into docs/images (needs Chromium; about 2 minutes)
 	$(BIN)/python -m scripts.draw_pictures
 
 site: $(STAMP) ## build the documentation site into build/site; warnings are errors

@@ -134,8 +134,8 @@ def _pinned_folder(page: Page, url: str, folder: Path) -> None:
     taken = enumerate(itertools.product(_ROOMS, _AZIMUTHS_DEG))
     files = [_photograph(*view, 90.0, folder / f"IMG_{2041 + minute}.jpg", minute) for minute, view in taken]
     page.goto(f"{url}/pin")
-    page.locator("#plan-file").set_input_files(PLAN_PATH)
-    expect(page.locator("#plan .room").first).to_be_visible()
+    page.locator("#plan-choice").select_option(label="Example flat")
+    expect(page.locator("#plan")).to_contain_text("living room")
     page.locator("#photo-files").set_input_files(files)
     expect(page.locator("#pin-state")).to_contain_text("(solved)")
     expect(page.locator(".card img")).to_have_count(len(files))
