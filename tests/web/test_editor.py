@@ -57,6 +57,9 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
         {"name": "scan.png", "mimeType": "image/png", "buffer": picture_file(picture)}
     )
     expect(page.get_by_text("Set the scale next")).to_be_attached()
+    # Of two points, which are scaled with the plan, the second lies to the right in it and 4.45 m north on Earth.
+    page.locator("#plan-form-anchor").fill("0, 0, 48.13722, 11.57569; 6 0 48.13726 11.57569")
+    page.locator("#plan-form-anchor").press("Tab")
     # 600 pixels are 12 m by default, so the rectangle is 6 m wide; its real width is 4.5 m.
     _click(page, 2, 2)
     _click(page, 8, 2)
@@ -81,12 +84,6 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     page.locator("#opening-form-sill").fill("1.1")
     page.locator("#opening-form-sill").press("Tab")
     _assert_accessible(page)
-    page.mouse.click(*_on_screen(page, 8, 5.2))
-    # Of two points, the second is north of the first and beside it in the plan.
-    points = "0, 0, 48.13722, 11.57569; 4.5 0 48.13726 11.57569"
-    for name, value in (("north", "10"), ("anchor", "48.1, 11.5"), ("north", ""), ("anchor", points)):
-        page.locator(f"#plan-form-{name}").fill(value)
-        page.locator(f"#plan-form-{name}").press("Tab")
     page.get_by_role("button", name="Store the plan").click()
     expect(page.locator("#plan-facts")).to_contain_text("1 rooms")
     plan = _stored(desktop, "New plan")["plan"]
@@ -152,14 +149,16 @@ def test_ceiling_of_the_plan_applies_to_all_rooms(desktop: Visit) -> None:
     expect(page.locator("#plan-form-own-ceilings")).to_contain_text(
         "1 of 2 rooms have ceilings of their own: kitchen 2.40 m"
     )
-    page.locator("#plan-form-ceiling").fill("2.7")
-    page.locator("#plan-form-ceiling").press("Tab")
+    for name, value in (("ceiling", "2.7"), ("north", "10"), ("anchor", "48.13722, 11.57569")):
+        page.locator(f"#plan-form-{name}").fill(value)
+        page.locator(f"#plan-form-{name}").press("Tab")
     page.locator("#one-ceiling").click()
     expect(page.locator("#plan-form-own-ceilings")).to_have_count(0)
     page.locator("#save").click()
     expect(page.locator("#plan-facts")).to_contain_text("revision 2")
     stored = _stored(desktop, "Ceilings")
     assert [room["ceiling_height_m"] for room in stored["rooms"]] == [2.7, 2.7]
+    assert (stored["plan"]["north_deg"], stored["plan"]["anchor"]["longitude"]) == (10.0, 11.57569)
 
 
 @pytest.mark.slow
