@@ -14,8 +14,6 @@ from lalaloc_core.errors import InvalidFloorPlanError
 # Finer pictures are reduced to this resolution (m per pixel), and larger ones to so many pixels, each of which takes
 # half a microsecond: a flat of any size, or a storey of 35 m by 35 m, at the finest resolution.
 FINEST_M, _MOST_PIXELS = 0.01, 12_000_000
-# Coarser pictures are enlarged to this resolution (m per pixel), by at most a factor: walls have three pixels or more.
-_COARSEST_M, _MOST_ENLARGED = 0.03, 3.0
 # Warmth of grey pixels.
 COLOURLESS = 128.0
 # Lighting is evened out over this length.
@@ -30,11 +28,10 @@ _LINE_M, _FAINTEST, _OVER_NOISE = 0.07, 40.0, 8.0
 _LARGE_PARTS, _NEAR_PARTS = 0.1, 0.04
 # Range of Otsu's threshold: pencil is ink, pale floors are not.
 _THRESHOLD = (95.0, 205.0)
-# Walls of one colour: longer side (pixels) of the picture in which they are looked for, colours (of 4096) that are
-# tried, their least share of what is drawn, their tolerance (of 255), least area of a network relative to the square of
-# half its width, and shares of the box around it that are floors, and of floors that are of one tone.
-_NETWORK_PX, _MOST_COLOURS, _LEAST_COLOUR, _ALIKE = 500, 12, 0.04, 20.0
-_SLENDER, _FLOORS, _FLAT, _SAME_TONE = 200.0, 0.1, 0.6, 4
+# Walls of one colour: longer side (pixels) of the picture in which they are looked for, their least share of what is
+# drawn, tolerance (of 255), and least area relative to the square of half their width. Floors: least share of the
+# picture, and of pixels with the tone of their neighbours.
+_NETWORK_PX, _LEAST_COLOUR, _ALIKE, _SLENDER, _FLOORS, _FLAT, _SAME_TONE = 500, 0.04, 20.0, 200.0, 0.05, 0.6, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +80,12 @@ def read_ink(
 
     Rows of `gray` are from the top, and 255 is white; for `warmth` see `Ink`.
     """
-    enlarged = float(np.clip(metres_per_pixel / _COARSEST_M, 1.0, _MOST_ENLARGED))
-    factor = min(metres_per_pixel / FINEST_M, enlarged, math.sqrt(_MOST_PIXELS / gray.size))
-    if factor != 1.0:
-        size = (max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor)))
-        method = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_CUBIC
-        gray = cv2.resize(gray, size, interpolation=method).astype(np.uint8)
-        warmth = None if warmth is None else cv2.resize(warmth, size, interpolation=method).astype(np.uint8)
+    factor = min(metres_per_pixel / FINEST_M, math.sqrt(_MOST_PIXELS / gray.size), 1.0)
+    if factor < 1.0:
+        rows, columns = (max(1, round(size * factor)) for size in gray.shape)
+        gray = cv2.resize(gray, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        if warmth is not None:
+            warmth = cv2.resize(warmth, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
         metres_per_pixel /= factor
     even = _even_light(gray, metres_per_pixel)
     threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
@@ -140,9 +136,7 @@ def darken_pale_walls(colours: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, 
     codes[_of_tone(small, ground) > 0] = 4096
     counts = np.bincount(codes.ravel(), minlength=4097)[:4096]
     networks: list[tuple[float, Float[np.ndarray, "3"]]] = []
-    for code in np.argsort(-counts)[:_MOST_COLOURS]:
-        if counts[code] <= _LEAST_COLOUR * counts.sum():
-            break
+    for code in np.flatnonzero(counts > _LEAST_COLOUR * counts.sum()):
         tone = np.median(small[codes == code], axis=0)
         mask = _of_tone(small, tone)
         half = float(np.quantile(cv2.distanceTransform(mask, cv2.DIST_L2, 5)[mask > 0], 0.98))
@@ -151,15 +145,11 @@ def darken_pale_walls(colours: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, 
     if not networks:
         return None
     half, tone = min(networks, key=lambda network: float(network[1].sum()))
-    is_wall = _of_tone(small, tone)
-    x, y, width, height = cv2.boundingRect(is_wall)
-    box = slice(y, y + height), slice(x, x + width)
-    other = (1 - np.maximum(is_wall, _of_tone(small, ground)))[box]
+    other = 1 - np.maximum(_of_tone(small, tone), _of_tone(small, ground))
     is_floor = cv2.erode(other, np.ones((2 * round(half) + 1,) * 2, np.uint8)) > 0
-    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    steps = cv2.morphologyEx(gray, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))[box][is_floor]
+    steps = cv2.morphologyEx(small[..., 1], cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))[is_floor]
     is_flat = is_floor.mean() >= _FLOORS and (steps <= _SAME_TONE).mean() >= _FLAT
-    if not is_flat or np.median(small[box][is_floor].mean(axis=1)) >= tone.mean():
+    if not is_flat or np.median(small[is_floor].mean(axis=1)) >= tone.mean():
         return None
     # Grown by a pixel, as their edges are blurred. Thin dark lines on floors stay, whatever the floor's tone.
     parts = cv2.erode(_of_tone(colours, tone), np.ones((2, 2), np.uint8), anchor=(1, 1))

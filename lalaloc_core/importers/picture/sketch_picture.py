@@ -31,7 +31,9 @@ _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.0
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 # Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
-_LIKE_WALL = (0.4, 1.6)
+_LIKE_WALL = (0.4, 1.8)
+# Smallest such thickness beside a symbol that is drawn in part, and the share of that.
+_AS_WALL, _WEAK = 0.6, 0.8
 _MIN_ROOM_M2 = 0.8
 _MAX_ISLAND_M2 = 2.0
 # Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area, or all rooms of
@@ -180,8 +182,13 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         relative = depth_m / walls.thickness_m
         if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
             return None
+        is_weak = found.kind != "nothing" and found.confidence <= _WEAK
+        if is_weak and not (gap.is_sure and relative >= _AS_WALL):
+            return None
+        if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
+            return None
         # Gaps overlap both walls by 2 cm, so that narrow ones seem deeper by up to a tenth.
-        if found.kind != "pane" and (gap.width > _WIDEST_WITH_ONE_LINE_M or depth_m > 1.1 * _CONFIG.thickest):
+        if depth_m > 1.1 * _CONFIG.thickest and (found.kind != "pane" or gap.width <= _MAX_BARE_GAP_M):
             return None
         return ("swing", "pane", "line", "nothing").index(found.kind)
 
@@ -252,10 +259,7 @@ def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder, budget: Budge
 
 
 def _lines_of_doors(placed: Sequence[tuple[GapContent, float, bool]]) -> float:
-    """Return the number of lines in doors that are drawn without a swing, if windows have more; else 0.
-
-    Openings have a width (m), and are between rooms or not.
-    """
+    """Return the lines of doors without a swing, by openings with width (m) and place; 0 if windows have no more."""
     panes = [(opening.lines, is_inner and m <= _WIDEST_DOOR_M) for opening, m, is_inner in placed if opening.lines > 1]
     doors = [lines for lines, is_door in panes if is_door]
     usual = float(np.median(doors or [0]))

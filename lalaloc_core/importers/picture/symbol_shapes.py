@@ -131,9 +131,9 @@ def closed_shapes(ink: Ink, *, is_faint: bool = False) -> list[Shape]:
         x, y, width, height = stats[number, :4].tolist()
         left, top = max(x - 1, 0), max(y - 1, 0)
         window = labels[top : y + height + 1, left : x + width + 1] == number
-        contours, _ = cv2.findContours(window.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        contour = max(contours, key=cv2.contourArea)
-        if len(contour) < 3:
+        contours, _ = cv2.findContours(window.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        contour = max(contours, key=len)
+        if len(contour) < 4:
             continue
         # Contours run through the centres of pixels; outlines through the middle of lines.
         outline = shapely.Polygon(ink.to_plan(contour.reshape(-1, 2) + np.array([left + 0.5, top + 0.5])))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -42,9 +42,8 @@ _THICKEST_M, _IN_WALL, _STROKE_OF_HATCH_M, _HATCHED = 0.46, 0.5, 0.12, 0.62
 _CUT_CORNER_M, _SQUARE = 0.07, 0.8
 # Strokes of panes are paler than walls (of 255), thinner than walls (share), and long (m).
 _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
-# Heavy lines: share of ink that is darker than the darkest tone, their largest difference from it relative to white,
-# their share of all ink, and walls that they draw relative to those of all lines.
-_DARKEST, _AS_DARK, _HEAVY, _MORE_WALLS = 0.1, 0.15, (0.15, 0.85), 1.3
+# Widest notch (m) in a wall that is drawn with two lines.
+_NOTCH_M = 0.15
 # Outlines of walls in a picture, with those of the areas that they enclose.
 _MAX_OUTLINES = 10_000
 
@@ -86,23 +85,7 @@ def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
 
 
 def outlined_walls(ink: Ink) -> WallMask | None:
-    """Return walls drawn with two lines: the ink and the narrow white areas between its lines.
-
-    If a heavy pen draws more walls than all lines do, as thin ones cross them, its lines alone bound the white areas.
-    """
-    walls, square = _outlined_walls(ink), np.ones((2, 2), np.uint8)
-    tone = float(np.quantile(ink.gray[ink.mask], _DARKEST)) if ink.mask.any() else 0.0
-    opened = cv2.erode(cv2.dilate(ink.gray, square, anchor=(0, 0)), square, anchor=(1, 1))
-    heavy = ink.mask & (opened <= tone + _AS_DARK * (255.0 - tone))
-    is_other = _HEAVY[0] <= heavy.sum() / max(int(ink.mask.sum()), 1) <= _HEAVY[1]
-    by_pen = _outlined_walls(replace(ink, mask=heavy)) if is_other else None
-    if by_pen is None or (walls is not None and by_pen.mask.sum() < _MORE_WALLS * walls.mask.sum()):
-        return walls
-    _, labels = cv2.connectedComponents((~ink.mask).astype(np.uint8), connectivity=4)
-    return replace(by_pen, cavities=np.where(by_pen.mask, labels, 0))
-
-
-def _outlined_walls(ink: Ink) -> WallMask | None:
+    """Return walls drawn with two lines: the ink and the narrow white areas between its lines."""
     white = (~ink.mask).astype(np.uint8)
     count, found, sizes, _ = cv2.connectedComponentsWithStats(white, connectivity=4)
     labels, stats = np.asarray(found, dtype=np.int32), np.asarray(sizes)
@@ -218,6 +201,13 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
         return None  # Merged strokes of a hatch are not walls.
     thickness_range = _FILLED_RANGE if cavities is None else _OUTLINED_RANGE
     kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel, thickness_range)
+    if cavities is not None:
+        # What is drawn across a wall of two lines cuts it into pieces; no opening is as narrow.
+        notch = np.ones((round(_NOTCH_M / ink.metres_per_pixel),) * 2, np.uint8)
+        closed = cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, notch)
+        _, found, stats, _ = cv2.connectedComponentsWithStats(closed & ~kept, connectivity=8)
+        # Longer areas are panes of windows.
+        kept |= (stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) <= 2 * len(notch))[np.asarray(found)]
     return WallMask(kept, thickness, cavities) if kept.any() else None
 
 
@@ -256,7 +246,7 @@ def _without_furniture(
 
 def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[shapely.Polygon]:
     """Return walls as straightened polygons in plan metres."""
-    contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
         return []
     straight = max(_STRAIGHT_PX * ink.metres_per_pixel, _STRAIGHT_M)

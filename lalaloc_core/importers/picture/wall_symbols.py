@@ -77,15 +77,18 @@ class GapReader:
             swing, leaves = self._swing(gap, self._near)
             if swing < _ARC:
                 swing, leaves = self._swing(gap, self._near_hairlines, is_pale=True)
-        if swing >= _ARC:
-            return GapContent("swing", swing, leaf_m=gap.width / leaves)
+        found = GapContent("swing", swing, leaf_m=gap.width / leaves)
+        if swing > _ARC and leaves == 1:
+            return found
         lines, share, warmth = self._lines(gap)
         if lines < 2 and gap.is_sure and gap.is_between_ends and _BOW_M[0] <= gap.width <= _BOW_M[1]:
             depths = np.arange(*_BOW, 2.0 * self._ink.metres_per_pixel / gap.width)
             bows = [self._lines(gap, side * float(depth)) for depth in depths for side in (1.0, -1.0)]
             bow = max(bows, key=lambda found: found[:2])
             if bow[0] >= 2 and bow[1] >= _ARC:
-                lines, share, warmth = bow
+                return GapContent("pane", bow[1], bow[2], bow[0])
+        if swing > _ARC or (swing >= _ARC and (lines < 2 or share < _LINE)):
+            return found
         if lines >= 2:
             return GapContent("pane", share, warmth, lines)
         if lines == 1 and share >= _ONE_LINE:
