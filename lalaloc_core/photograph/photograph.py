@@ -24,15 +24,12 @@ from lalaloc_core.photograph.cameras import Around, Camera, Perspective, camera_
 from lalaloc_core.photograph.exif import ExifLens, Taken, read_exif_lens, read_taken
 from lalaloc_core.photograph.levelling import (
     MAX_ESTIMATED_SD,
-    ON_SIDE,
-    Attitude,
-    Lines,
     bend_warnings,
     estimate_attitude,
     estimate_calibration,
     find_segments,
     lines_of,
-    turned_attitude,
+    side_warnings,
 )
 from lalaloc_core.photograph.overlap import find_features
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
@@ -348,7 +345,7 @@ def photograph_of_picture(
 ) -> Photograph:
     """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
-    segments, quarter = find_segments(picture), 0
+    segments = find_segments(picture)
     warnings = lens.warnings
     if lens.camera is None:
         estimated_hfov, focal_sd, attitude = estimate_calibration(segments, width=columns, height=rows)
@@ -363,8 +360,7 @@ def photograph_of_picture(
         attitude = estimate_attitude(lines)
     warnings = (*warnings, *bend_warnings(segments, small))
     if purpose != "turn" and stated.pitch_deg is None and stated.roll_deg is None and not isinstance(camera, Around):
-        attitude, quarter, said = _by_side(picture, lines, attitude)
-        warnings = (*warnings, *said)
+        warnings = (*warnings, *side_warnings(lines, attitude))
     estimated = (
         Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
         for angle, sd in ((attitude.pitch, attitude.pitch_sd), (attitude.roll, attitude.roll_sd))
@@ -396,32 +392,12 @@ def photograph_of_picture(
         azimuths=seen_azimuths(small, tilt, roll.value),
         wall_direction=walls if math.isfinite(walls.sd) else None,
         patches=() if is_of_turn else cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
-        thumbnail=thumbnail_of(np.ascontiguousarray(np.rot90(picture, -quarter))),
+        thumbnail=thumbnail_of(picture),
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),
         overview=overlapping,
         warnings=warnings,
     )
-
-
-def _by_side(
-    picture: UInt8[np.ndarray, "h w 3"], lines: Lines, upright: Attitude
-) -> tuple[Attitude, int, tuple[str, ...]]:
-    """Return the attitude of a picture, and if it lies on its side the quarter turns clockwise to it and a warning."""
-    turned, log_odds = turned_attitude(lines, upright)
-    if log_odds < ON_SIDE:
-        return upright, 0, ()
-    third = picture.shape[1] // 3
-    # Ceilings are brighter than floors.
-    quarter = 1 if picture[:, :third].mean() > picture[:, -third:].mean() else -1
-    text = (
-        f"the photograph lies on its side: its lines fit that {math.exp(min(log_odds, 7.0)):.0f} times as well as an "
-        f"upright one, and the limit is {math.exp(ON_SIDE):.0f}. It was read turned by 90° to the "
-        f"{'right' if quarter > 0 else 'left'}: turn it and send it again, or state roll_deg (0 if it is upright)"
-    )
-    # Turned to the left, the picture is upside down beside `turned`.
-    pitch, roll = quarter * turned.pitch, quarter * 0.5 * math.pi + turned.roll
-    return replace(turned, pitch=pitch, roll=roll, yaw=quarter * turned.yaw), quarter, (text,)
 
 
 def field_warning(hfov: float, sd: float, origin: str) -> str:
