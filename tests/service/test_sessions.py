@@ -220,7 +220,7 @@ def test_session_in_a_venue_names_the_plan(
     empty = client.get(f"/sessions/{session_id}").json()
     assert (empty["venue_id"], empty["floorplan_id"], empty["floorplan_revision"]) == (venue_id, None, None)
     for number in (1, 2, 3):
-        motion = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
+        motion: dict[str, Any] = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
         sent = send(client, session_id, sphere, number=number, **motion)
         assert sent.status_code == 200, sent.text
     answer = sent.json()
@@ -303,7 +303,7 @@ def test_stored_bytes_of_a_long_session_are_bounded(start_app: StartApp, tmp_pat
         session_id = begin(client, upload(client))
         stored, answers = [], []
         for number in range(1, 241):
-            motion = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
+            motion: dict[str, Any] = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
             answer = send(client, session_id, sphere, number=number, **motion)
             answers.append(len(answer.content))
             stored.append(client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"])

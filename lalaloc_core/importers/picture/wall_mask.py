@@ -205,7 +205,7 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
         # What is drawn across a wall of two lines cuts it into pieces; no opening is as narrow.
         notch = np.ones((round(_NOTCH_M / ink.metres_per_pixel),) * 2, np.uint8)
         closed = cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, notch)
-        _, found, stats, _ = cv2.connectedComponentsWithStats(closed & ~kept, connectivity=8)
+        _, found, stats, _ = cv2.connectedComponentsWithStats((closed & ~kept).astype(np.uint8), connectivity=8)
         # Longer areas are panes of windows.
         kept |= (stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) <= 2 * len(notch))[np.asarray(found)]
     return WallMask(kept, thickness, cavities) if kept.any() else None
