@@ -275,7 +275,6 @@ class _Opened:
         """Return the format of a sphere that the picture holds, unless statements or metadata tell its camera."""
         stated, metadata = self.stated, self.metadata
         is_known = stated.hfov_deg is not None or stated.intrinsics is not None or metadata.part is not None
-        is_known |= metadata.declared and metadata.fault is None and is_twice_as_wide(self.width, self.height)
         if is_known or stated.projection not in (AUTO, "equirectangular") or metadata.refusal is not None:
             return None
         ratio = max(self.width, self.height) / min(self.width, self.height)

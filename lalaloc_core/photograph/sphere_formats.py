@@ -75,7 +75,7 @@ class Thumbnail:
 
     @cached_property
     def looks_spherical(self) -> bool:
-        """Whether it looks like a full sphere."""
+        """Result of `looks_spherical` for its pixels."""
         return looks_spherical(self.pixels)
 
     @cached_property

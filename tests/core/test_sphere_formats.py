@@ -161,10 +161,8 @@ def test_statement_turns_a_refusal_into_a_warning() -> None:
     view = opened(jpeg(pixels), StatedCamera(projection="equirectangular"))
     assert "two circles that are not stitched" in view.warnings[0]
     assert opened(jpeg(pixels), StatedCamera(hfov_deg=90.0)).warnings == ()
-    # Metadata of a full sphere are believed.
-    declared = opened(encoded(pixels, "JPEG", xmp(ProjectionType="equirectangular")))
-    assert declared.is_sphere
-    assert declared.warnings == ()
+    with pytest.raises(InvalidPhotographError, match="two circles"):
+        opened(encoded(pixels, "JPEG", xmp(ProjectionType="equirectangular")))
 
 
 @pytest.mark.parametrize("orientation", [6, 8])
