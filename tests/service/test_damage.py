@@ -8,7 +8,7 @@ import random
 import shutil
 import sqlite3
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import pytest
@@ -85,11 +85,15 @@ def test_file_that_is_damaged_while_the_service_runs_is_store_unavailable(
         assert client.get("/readyz").json()["database"] == "answers"
         assert "lalaloc_database_up 1.0" in client.get("/metrics").text
         path = _sqlite(tmp_path)
-        with sqlite3.connect(path) as raw:
-            raw.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        raw.close()
-        damage(path)
-        wait_for(lambda: client.post("/floorplans", json=FLAT).status_code != 201)
+
+        def refuses_when_damaged() -> bool:
+            # What a sweep wrote since the last attempt are whole pages of the log, which would heal the file.
+            with suppress(sqlite3.DatabaseError), closing(sqlite3.connect(path)) as raw:
+                raw.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            damage(path)
+            return client.post("/floorplans", json=FLAT).status_code != 201
+
+        wait_for(refuses_when_damaged)
         problem = assert_problem(client.post("/floorplans", json=FLAT), 503, "store-unavailable")
         assert "restore a backup" in problem["detail"]
         wait_for(lambda: client.get("/readyz").json()["database"] == "damaged")
