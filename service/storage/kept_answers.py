@@ -8,13 +8,13 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, and_, delete, or_, select, update
+from sqlalchemy import ColumnElement, Connection, and_, delete, exists, or_, select, update
 
 from service.errors import StorageQuotaError
 from service.storage.database import Database
 from service.storage.records import Claim, Claimed, Conflict, InProgress, StoredAnswer
 from service.storage.stored_bytes import ROW_BYTES, Account, StorageQuota, StoredBytes, deleted_bytes
-from service.storage.tables import FLOORPLANS, IDEMPOTENCY, KEPT_ANSWERS
+from service.storage.tables import ALBUMS, FLOORPLANS, IDEMPOTENCY, KEPT_ANSWERS, SESSIONS, VENUES
 
 KEPT_FOR = timedelta(hours=24)
 # Minimum time (s) that callers wait after a crash.
@@ -22,6 +22,11 @@ MIN_LEASE_S = 15.0
 # Keys per read when old ones are deleted.
 _BATCH_SIZE = 100
 _KEYS, _ANSWERS = IDEMPOTENCY.c, KEPT_ANSWERS.c
+# Answers about something that was stored, under the request's token, and deleted since: the request is executed again.
+_IS_GONE = and_(
+    _KEYS.status == 201,
+    *(~exists().where(made.c.id == _KEYS.token) for made in (FLOORPLANS, VENUES, SESSIONS, ALBUMS)),
+)
 
 
 class IdempotencyKeys:
@@ -49,7 +54,7 @@ class IdempotencyKeys:
         until_s = self._database.now_s() + self._lease_s
         size = ROW_BYTES + 2 * len(key)
         with self._database.writing(grows_by=size) as connection:
-            expired = _KEYS.created_at < now - KEPT_FOR
+            expired = or_(_KEYS.created_at < now - KEPT_FOR, _IS_GONE)
             freed = deleted_bytes(connection, delete(IDEMPOTENCY).where(*own, expired))
             statement = self._database.insert(IDEMPOTENCY).values(
                 tenant=tenant,

@@ -88,6 +88,10 @@ def test_repeated_upload_returns_the_same_plan(own: httpx.Client) -> None:
     # Another key or no key makes another upload.
     assert len({_post(own, "b").json()["id"], upload(own), upload(own)}) == 3
     assert _count(own) == 4
+    # What was deleted since is made anew.
+    assert own.delete(first.headers["location"]).status_code == 204
+    assert own.get(_post(own, "a").headers["location"]).status_code == 200
+    assert _count(own) == 4
 
 
 def test_answer_survives_a_restart(start_app: StartApp, tmp_path: Path) -> None:

@@ -311,7 +311,7 @@ def test_revisions_and_grids_are_limited(store: Store) -> None:
 
 # Idempotency and keys
 
-ANSWER = StoredAnswer(201, {"location": "/floorplans/x"}, b'{"id": "x"}')
+ANSWER = StoredAnswer(200, {"etag": '"x"'}, b'{"id": "x"}')
 
 
 def test_idempotent_request_is_carried_out_once(open_store: OpenStore) -> None:
