@@ -11,6 +11,7 @@ import inspect
 import json
 import tomllib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
@@ -109,10 +110,11 @@ def _set(raw: dict[str, Any], known: Mapping[str, Any], name: str, text: str) ->
 
 
 def _json(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+    # JSON knows neither .75 nor +1.
+    for read in (json.loads, int, float):
+        with suppress(ValueError):
+            return read(text)
+    return text
 
 
 def _read(path: Path) -> dict[str, Any]:

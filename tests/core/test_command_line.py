@@ -274,11 +274,12 @@ def test_configuration_is_a_file_with_changes(tmp_path: Path) -> None:
     file.write_text(
         'stage = "image"\nout = "runs/x"\nskip-bad = true\nset = {"image.batch" = 4}\nphotographs = ["a"]\n'
     )
-    words = [str(file), "preset=trunk", "set=image.supersample=[2,1]", "photographs=b"]
-    train = configured(COMMANDS["train"], words, {"minutes": ["2.5"], "from_": ["runs/y"]})
+    words = [str(file), "preset=trunk", "set=image.supersample=[2,1]", "set=image.optics=.5", "photographs=b"]
+    train = configured(COMMANDS["train"], words, {"minutes": [".75"], "steps": ["+9"], "from_": ["runs/y"]})
     assert (train.stage, train.preset, train.out, train.skip_bad) == ("image", "trunk", Path("runs/x"), True)
-    assert train.set_ == {"image.batch": 4, "image.supersample": [2, 1]}
-    assert (train.photographs, train.minutes, train.from_) == ((Path("a"), Path("b")), 2.5, Path("runs/y"))
+    assert train.set_ == {"image.batch": 4, "image.supersample": [2, 1], "image.optics": 0.5}
+    assert (train.photographs, train.minutes, train.steps) == ((Path("a"), Path("b")), 0.75, 9)
+    assert train.from_ == Path("runs/y")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
