@@ -22,10 +22,10 @@ export function choicesOf(label: string, kind: string, places: (PlanSummary | Ve
   return options.length > 0 && h("optgroup", { label }, ...options);
 }
 
-/** Return a saved folder as a choice, with its date. */
+/** Return a saved folder as a choice, by its date, which a long name would cut off, and its name. */
 export function folderOption(album: Pick<Schemas["AlbumSummary"], "id" | "name" | "updated_at">): HTMLOptionElement {
   const date = new Date(album.updated_at).toLocaleDateString("en-GB", { dateStyle: "medium" });
-  return h("option", { value: `album:${album.id}` }, `${album.name}, ${date}`);
+  return h("option", { value: `album:${album.id}` }, `${date}, ${album.name}`);
 }
 
 export class Floors {
