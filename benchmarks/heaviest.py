@@ -40,9 +40,16 @@ class Stored:
 
     plan_id: str
     plan_etag: str
+    album: str
     venue_id: str
     venue_etag: str
     member_ids: Sequence[str]
+
+    @classmethod
+    def of(cls, caller: Caller, plan_id: str, venue_id: str, venue_etag: str, member_ids: Sequence[str]) -> Stored:
+        """Return a plan and a venue that are ready, and store an album of the plan."""
+        plan_etag = caller.send("GET", f"/floorplans/{plan_id}").etag
+        return cls(plan_id, plan_etag, _store_album(caller, plan_id), venue_id, venue_etag, member_ids)
 
 
 Work = Callable[[Caller, Stored, int], None]
@@ -116,6 +123,15 @@ def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
     return created_id(answer), answer.etag, ids
 
 
+def _store_album(caller: Caller, plan_id: str, photographs: int = _PHOTOGRAPHS) -> str:
+    """Store an album of spheres, wait until it is solved, and return its path; empty if it is refused."""
+    if album := _create(caller, "/albums", _body({"floorplan_id": plan_id})):
+        for first in range(0, photographs, _PHOTOGRAPHS):
+            caller.send("POST", f"{album}/photographs", *_spheres(first=first))
+        caller.send("GET", f"{album}/events")
+    return album
+
+
 def _body(document: Mapping[str, Any]) -> bytes:
     return json.dumps(document, separators=(",", ":")).encode()
 
@@ -127,6 +143,11 @@ def _venue(plan_ids: Sequence[str], name: str = "venue") -> bytes:
 @cache
 def _sphere() -> bytes:
     return read_poses()[0].picture.read_bytes()
+
+
+def _spheres(*fields: tuple[str, str], first: int = 0) -> tuple[bytes, str]:
+    """Return a form with spheres; bytes after the picture make each another one."""
+    return form(fields, tuple(("photo", _sphere() + str(first + number).encode()) for number in range(_PHOTOGRAPHS)))
 
 
 @cache
@@ -287,8 +308,7 @@ def _sequence(*, padded: bool, venue: bool = False) -> Work:
 
 
 def _batch(caller: Caller, stored: Stored, _size: int) -> None:
-    files = _PHOTOGRAPHS * (("photo", _sphere()),)
-    caller.send("POST", "/localise/batch", *form((("floorplan_id", stored.plan_id),), files))
+    caller.send("POST", "/localise/batch", *_spheres(("floorplan_id", stored.plan_id)))
 
 
 def _post_venue(caller: Caller, stored: Stored, _size: int) -> None:
@@ -365,14 +385,8 @@ def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool =
 
 
 def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
-    if not (album := _create(caller, "/albums", _body({"floorplan_id": stored.plan_id}))):
+    if not (album := _store_album(caller, stored.plan_id, size)):
         return
-    for route in ("photographs", "copies"):
-        for first in range(0, size, _PHOTOGRAPHS):
-            # Bytes after the picture make it another one.
-            files = (("photo", _sphere() + str(first + number).encode()) for number in range(_PHOTOGRAPHS))
-            caller.send("POST", f"{album}/{route}", *form((), tuple(files)))
-        caller.send("GET", f"{album}/events")
     caller.send("GET", album)
     page = caller.send("GET", f"{album}/photographs")
     if page.status == 200 and (photographs := page.json()["photographs"]):
@@ -381,6 +395,10 @@ def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
         caller.send("GET", path)
         caller.send("DELETE", path)
     caller.send("DELETE", album)
+
+
+def _copy_album(caller: Caller, stored: Stored, _size: int) -> None:
+    caller.send("POST", f"{stored.album}/copies", *_spheres())
 
 
 def _tiny_chunks(caller: Caller, _stored: Stored, size: int) -> None:
@@ -435,7 +453,7 @@ _PLAN, _VENUE = "/floorplans/{floorplan_id}", "/venues/{venue_id}"
 _SESSION, _KEY = "/sessions/{session_id}", "/admin/keys/{key_id}"
 _ALBUM = "/albums/{album_id}"
 _PINNED = f"{_ALBUM}/photographs/{{photograph_id}}"
-_ALBUMS = ("POST /albums", f"GET {_ALBUM}/events", f"GET {_ALBUM}", f"DELETE {_ALBUM}", f"POST {_ALBUM}/copies")
+_ALBUMS = ("POST /albums", f"GET {_ALBUM}/events", f"GET {_ALBUM}", f"DELETE {_ALBUM}")
 _PHOTOGRAPHS_OF_ALBUM = f"POST {_ALBUM}/photographs", f"GET {_ALBUM}/photographs"
 _SESSIONS = ("POST /sessions", f"POST {_SESSION}/photographs")
 _TOO_LONG = frozenset({422})
@@ -515,6 +533,7 @@ LOADS = (
         _pin_album,
         500,
     ),
+    Load((f"POST {_ALBUM}/copies",), f"10 spheres, {VERTICES_PLAN}", _copy_album),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
     Load(

@@ -171,13 +171,8 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
             plan_ids = {name: created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
             preparing = lambda: heavy.send("GET", "/readyz").json()["plans_preparing"]  # noqa: E731
             harness.wait_until(lambda: not preparing(), "all plans are ready", _READY_TIMEOUT_S, 0.2)
-            venue_etag = heavy.send("GET", f"/venues/{venue_id}").etag
-            stored = {
-                name: Stored(
-                    plan_id, heavy.send("GET", f"/floorplans/{plan_id}").etag, venue_id, venue_etag, member_ids
-                )
-                for name, plan_id in plan_ids.items()
-            }
+            venue = venue_id, heavy.send("GET", f"/venues/{venue_id}").etag, member_ids
+            stored = {name: Stored.of(heavy, plan_id, *venue) for name, plan_id in plan_ids.items()}
         yield Template(data, keys["heavy"], keys["light"], light_plan_id, stored)
 
 

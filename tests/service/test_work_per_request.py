@@ -128,8 +128,7 @@ def stored(client: httpx.Client) -> dict[int, Stored]:
     caller, resources = _caller(client), {}
     for size in _SIZES:
         plan_id = upload(client, building(size, openings_per_room=2))
-        etag = client.get(f"/floorplans/{plan_id}").headers["etag"]
-        resources[size] = Stored(plan_id, etag, *store_venue(caller, size))
+        resources[size] = Stored.of(caller, plan_id, *store_venue(caller, size))
     return resources
 
 
