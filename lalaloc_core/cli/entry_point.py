@@ -12,7 +12,7 @@ import sys
 from lalaloc_core import __version__
 from lalaloc_core.cli import encoding, localising, pinning, plans, tracking
 from lalaloc_core.cli.options import add_options
-from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError
+from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError, MissingExtraError
 
 _MCP_OPTIONS = """
 --url URL: address of the service (default: %(default)s)
@@ -60,9 +60,8 @@ def main(argv: list[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("lalaloc"):
             raise
-        print(
-            f"error: '{error.name}' is not installed; pyproject.toml lists the extra that contains it", file=sys.stderr
-        )
+        extra = {"mcp": "mcp", "lab": "train", "bench": "train"}.get(command, "service")
+        print(f"error: {MissingExtraError(f'`lalaloc {command}`', extra)}", file=sys.stderr)
         return 1
     return 0
 
