@@ -243,6 +243,8 @@ def test_link_for_the_phone_has_the_key_of_the_pages_link_only(desktop: Visit) -
     assert "secret" not in page.locator("#phone-dialog").inner_html()
     assert desktop.client.get("/").headers["Permissions-Policy"].startswith("camera=(self), microphone=()")
     _no_violations(page)
+    page.goto(f"{lan}/pin")
+    expect(page.locator("#edit-plan")).to_have_attribute("href", f"/#plan={plan_id}&key=lalaloc_run")
 
 
 @pytest.mark.slow

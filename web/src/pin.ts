@@ -1,6 +1,6 @@
 /** Page at /pin: a plan or venue, a folder of photographs, and a pin for each. */
 
-import { api } from "./api";
+import { api, key } from "./api";
 import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
@@ -175,7 +175,7 @@ class PinPage {
       h("option", { value: floor.layout.rooms[index]!.id }, room.name ?? `Room ${index + 1}`),
     );
     show(this.filter, h("option", { value: "" }, "all"), ...rooms);
-    byId<HTMLAnchorElement>("edit-plan").href = `/#plan=${id}`;
+    byId<HTMLAnchorElement>("edit-plan").href = `/#plan=${id}${key.inLinks()}`;
     byId("edit-plan").hidden = false;
     this.draw();
   }

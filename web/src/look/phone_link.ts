@@ -41,7 +41,7 @@ export class PhoneLink {
       ),
     );
     this.link.href = this.link.textContent = address;
-    this.code.hidden = this.link.hidden = ["localhost", "127.0.0.1", "[::1]"].includes(location.hostname);
+    this.code.hidden = this.link.hidden = /^(localhost|127\..*|0\.0\.0\.0|\[::1?\])$/.test(location.hostname);
     this.warning.textContent = this.link.hidden
       ? "Phones cannot reach this address: run `make serve-lan` (`lalaloc-service serve --lan`) and open its link."
       : location.protocol === "https:"
