@@ -54,9 +54,9 @@ export function showAll(photos: readonly Photo[], choose: (photo: Photo) => void
 
 const nameOf = (photo: Photo): string => photo.file.name.replace(/^example-/, "");
 
-/** Quote a value of a CSV file; a leading sign of a formula would be run by spreadsheets. */
-function quoted(value: string): string {
-  const safe = /^[=+@\t\r]/.test(value) ? `'${value}` : value;
+/** Quote a value of a CSV file, which spreadsheets do not take for a formula, as in lalaloc_core/shown_text.py. */
+export function quoted(value: string): string {
+  const safe = /^\s*[-=+@＝＋－＠]|^[\t\r]/.test(value) ? `'${value}` : value;
   return /[",\r\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
 }
 

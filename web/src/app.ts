@@ -20,6 +20,7 @@ import type { ChosenVenue, Plan, PlanDocument } from "./types";
 import { Venues } from "./venues";
 
 // For tests.
+export { quoted } from "./all_answers";
 export { layoutLines } from "./layout";
 export { cameraAttitude } from "./look/orientation";
 export { toEarth, toPlan } from "./earth";

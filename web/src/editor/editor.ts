@@ -107,7 +107,7 @@ export class Editor {
   private async layOriginal(plan: Plan): Promise<void> {
     try {
       const traced = await this.traced.of(plan);
-      if (traced === null || this.base?.revision !== plan.revision) return;
+      if (traced === null || !this.isOpen || this.base?.revision !== plan.revision) return;
       await this.underlay.lay(traced);
       this.drawBar();
     } catch {
