@@ -42,8 +42,8 @@ def write_pin_files(
         OSError: a file cannot be written.
     """
     from lalaloc_core.draw.pdf import draw_pdf
-    from lalaloc_core.draw.pins import DPI, ReportRow, pins_svg, report_notes, report_pages
-    from lalaloc_core.draw.plan import plan_svg
+    from lalaloc_core.draw.pins import DPI, ReportRow, draw_pins, report_notes, report_pages
+    from lalaloc_core.draw.plan import extent_m, plan_svg
 
     plans = dict(zip(pinned.plan_ids, pinned.plans, strict=True))
     document: dict[str, Any] = pinned.document() | {"moved": list(moved)}
@@ -60,7 +60,7 @@ def write_pin_files(
     for number, (plan_id, plan) in enumerate(plans.items()):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
         pins = [row.pin for row in rows if row.pin and row.entry["plan"] == plan_id]
-        write_file(out / name, plan_svg(plan, over=pins_svg(plan, pins)))
+        write_file(out / name, plan_svg(plan, over=draw_pins(extent_m(plan), pins)))
     title = " / ".join(dict.fromkeys(plan.name for plan in pinned.plans))
     lines = [*report_notes(document["counts"], document["camera_height_m"], pinned.album.warnings), *copied]
     (out / "report.pdf").write_bytes(draw_pdf(report_pages(title, plans, rows, lines), DPI))

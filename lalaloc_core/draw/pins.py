@@ -49,9 +49,9 @@ class DrawnPin:
     state: str
 
 
-def pins_svg(plan: FloorPlan, pins: Sequence[DrawnPin]) -> str:
-    """Draw pins in metres, y pointing down; the plan's extent scales the marks."""
-    radius = extent_m(plan) / _PINS_PER_EXTENT
+def draw_pins(size_m: float, pins: Sequence[DrawnPin]) -> str:
+    """Draw pins in metres, y pointing down; the longer side of the plan's drawing scales the marks."""
+    radius = size_m / _PINS_PER_EXTENT
     placed: list[tuple[float, float]] = []
     for pin in pins:
         placed.append(_free((pin.x_m, -pin.y_m), placed, radius))
@@ -144,7 +144,7 @@ def _plan_page(title: str, plan: FloorPlan, rows: Sequence[ReportRow], count: in
     parts = [_heading(title, f"{plan.name}: {len(rows)} of {count} photographs")]
     foot = 120 + 30 * len(notes)
     box = (_MARGIN, _TOP + 10, _INNER, HEIGHT - _TOP - _MARGIN - foot)
-    parts.append(plan_part(plan, box, pins_svg(plan, pins)))
+    parts.append(plan_part(plan, box, draw_pins(extent_m(plan), pins)))
     y = HEIGHT - _MARGIN - foot + 60
     x = float(_MARGIN)
     names = (("sure", "room is probably right"), ("uncertain", "to be checked"), ("corrected", "stated by a person"))
@@ -162,7 +162,7 @@ def _room_page(plan: FloorPlan, members: Sequence[ReportRow], rows: Sequence[Rep
     numbers = f"{len(members)} photograph{'s' if len(members) > 1 else ''}"
     parts = [_heading(room, f"{plan.name}, {numbers}")]
     pins = [row.pin for row in members if row.pin is not None]
-    parts.append(plan_part(plan, (_MARGIN, _TOP, _INNER, _PLAN), pins_svg(plan, pins)))
+    parts.append(plan_part(plan, (_MARGIN, _TOP, _INNER, _PLAN), draw_pins(extent_m(plan), pins)))
     width = (_INNER - (_COLUMNS - 1) * _GAP) / _COLUMNS
     height = (HEIGHT - _TOP - _PLAN - _MARGIN - 30) / _ROWS
     for place, row in enumerate(rows):

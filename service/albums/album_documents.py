@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.draw.pins import ReportRow, pin_svg
+from lalaloc_core.draw.pins import ReportRow, draw_pins
 from lalaloc_core.draw.plan import Bounds, svg_around
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.entry import Correction
@@ -81,8 +81,6 @@ _COLUMNS: tuple[str, ...] = (
     "number", "name", "taken_at", "state", "confidence", "floorplan_id", "level", "room_id", "room", "x_m", "y_m",
     "heading_deg", "latitude", "longitude", "reason", "room_confidence", "within_1m",
 )  # fmt: skip
-# Radius of a pin as a share of the drawing's size.
-_RADIUS = 0.016
 
 
 def pins_csv(photographs: Sequence[AlbumPhotographAnswer]) -> bytes:
@@ -121,11 +119,11 @@ def pins_geojson(photographs: Sequence[AlbumPhotographAnswer]) -> dict[str, Any]
 def pins_svg(name: str, bounds_m: Bounds, photographs: Sequence[AlbumPhotographAnswer]) -> tuple[str, str]:
     """Return the parts of a drawing before and after its rooms: a pin with its number and arrow for each photograph."""
     head, tail = svg_around(name, bounds_m)
-    radius_m = _RADIUS * max(bounds_m[2] - bounds_m[0], bounds_m[3] - bounds_m[1], 1.0)
+    size_m = max(bounds_m[2] - bounds_m[0], bounds_m[3] - bounds_m[1], 1.0)
     rows = [ReportRow(report_entry(row, row.name or ""), bytes) for row in photographs if row.pin is not None]
-    marks = [pin_svg(pin, pin.x_m, -pin.y_m, radius_m) for row in rows if (pin := row.pin) is not None]
+    marks = draw_pins(size_m, [pin for row in rows if (pin := row.pin) is not None])
     end = tail.rindex("</svg>")
-    return head, tail[:end] + "\n".join(marks) + tail[end:]
+    return head, tail[:end] + marks + tail[end:]
 
 
 def report_entry(photograph: AlbumPhotographAnswer, name: str) -> dict[str, Any]:

@@ -182,6 +182,10 @@ def test_pins_as_geojson_csv_and_svg(client: httpx.Client, solved: str, plan_id:
     assert drawing.text.count('<g class="pin ') == 3
     assert "kitchen" in drawing.text
     assert "script" not in drawing.text
+    row = album_photographs.AlbumPhotographAnswer.model_validate_json(json.dumps(found[0]))
+    _, drawn = album_photographs.pins_svg("plan", (0.0, 0.0, 9.0, 9.0), [row, row])
+    # Those of one spot are drawn apart.
+    assert len({pin.partition(" fill")[0] for pin in drawn.split('class="pin ')[1:]}) == 2
     bare = create(client, upload(client, FLAT))
     assert client.get(f"/albums/{bare}/photographs", headers={"Accept": "text/csv"}).text.count("\n") == 1
 
