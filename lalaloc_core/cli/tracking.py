@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_file, write_picture
-from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.shown_text import probability_text
 
@@ -64,6 +64,7 @@ def _track(arguments: argparse.Namespace) -> None:
     answers = list(_followed(arguments, plan, photographs, trajectory, stated))
     found = [(time_s, answer) for time_s, answer, _ in answers if answer is not None]
     documents = [document for _, _, document in answers]
+    print_warnings((pose["photograph"], text) for pose in documents for text in pose.get("warnings", ()))
     if not found:
         raise InvalidPhotographError(f"none of {len(answers)} photographs can be used; see the errors above")
     if arguments.trajectory is not None:
@@ -134,8 +135,6 @@ def _followed(
             print(f"error: {error}", file=sys.stderr)
             yield time_s, None, {"photograph": str(path), "error": str(error)}
             continue
-        for warning in answer.warnings:
-            print(f"warning: {path}: {warning}", file=sys.stderr)
         before_s = time_s
         yield time_s, answer, {"photograph": str(path), **answer.document()}
 
