@@ -12,6 +12,7 @@ from lalaloc_core.cli.options import BUNDLE, TURN, add_options, check_sources
 from lalaloc_core.cli.plan_files import check_picture_name, write_file, write_picture
 from lalaloc_core.cli.printing import print_json, print_warnings
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.shown_text import printable
 
 if TYPE_CHECKING:
     from lalaloc_core.bundle import Manifest
@@ -99,7 +100,7 @@ def _encode_turn(
 
 def _write(out: Path, content: bytes) -> None:
     write_file(out, content)
-    print(f"{out}: {len(content)} bytes")
+    print(printable(f"{out}: {len(content)} bytes"))
 
 
 def _features(arguments: argparse.Namespace) -> None:

@@ -90,9 +90,9 @@ def write_picture(svg: str, out: Path) -> None:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file; the line ends of text stay as they are."""
+    """Write a file; the line ends of text stay as they are, and bytes of names that are no UTF-8 become `?`."""
     try:
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        path.write_bytes(content if isinstance(content, bytes) else content.encode(errors="replace"))
     except OSError as error:
         raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error
 

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from lalaloc_core.shown_text import printable
+
 # Decimals of printed poses: micrometres, and mm² of covariances.
 JSON_DECIMALS = 6
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
@@ -42,7 +44,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
             cell.ljust(width) if index == 0 else cell.rjust(width)
             for index, (cell, width) in enumerate(zip(row, widths, strict=True))
         )
-        print("  ".join([first, *others]).rstrip())
+        print(printable("  ".join([first, *others]).rstrip()))
 
 
 def print_warnings(warnings: Iterable[tuple[str, str]]) -> None:
@@ -52,4 +54,4 @@ def print_warnings(warnings: Iterable[tuple[str, str]]) -> None:
         causes.setdefault(_NUMBER.sub("#", text), []).append((name, text))
     for (name, text), *others in causes.values():
         more = len({other for other, _ in others} - {name})
-        print(f"warning: {name}{f' and {more} more' if more else ''}: {text}", file=sys.stderr)
+        print(printable(f"warning: {name}{f' and {more} more' if more else ''}: {text}"), file=sys.stderr)

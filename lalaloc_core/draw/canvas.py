@@ -16,6 +16,8 @@ import resvg_py
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from lalaloc_core.shown_text import printable
+
 INK, MUTED, RULE, PAPER = "#20242c", "#5a6472", "#d5dbe1", "#ffffff"
 # Predicted poses: vermilion of Okabe and Ito's palette, distinct for colour-blind readers.
 FOUND = "#d55e00"
@@ -92,8 +94,8 @@ def font_file(text: str) -> Path:
 
 
 def xml_text(text: str) -> str:
-    """Escape text for XML, and replace the two characters that plans allow and XML does not."""
-    return escape(text.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd"))
+    """Escape text for XML, and replace what XML does not allow."""
+    return escape(printable(text))
 
 
 def words(
