@@ -8,6 +8,8 @@ import os
 import re
 import runpy
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 
 from lalaloc_core import __version__
 from lalaloc_core.cli import encoding, localising, pinning, plans, tracking
@@ -23,6 +25,8 @@ _INTERRUPTED = 130
 
 # Commands whose options are those of the laboratory; making them takes as long as all the rest, so others do without.
 _WITH_LAB = ("bench", "lab", "completion")
+# Options that name files to write; all other paths are read.
+_WRITTEN = frozenset({"out", "csv", "geojson", "map", "debug", "picture", "trajectory"})
 # Commands of `lalaloc lab` that stood outside of it until 0.11.
 _MOVED = re.compile(
     "add-objects|calibrate|evaluate|export|export-again|photographs|report|reproduce|score|synth|train|worst"
@@ -41,6 +45,7 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     arguments = build_parser(with_lab=command in _WITH_LAB).parse_args(words)
     try:
+        _check_written(vars(arguments))
         arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -64,6 +69,15 @@ def main(argv: list[str] | None = None) -> int:
         print(f"error: {MissingExtraError(f'`lalaloc {command}`', extra)}", file=sys.stderr)
         return 1
     return 0
+
+
+def _check_written(values: Mapping[str, object]) -> None:
+    """Refuse to write over a file that is read."""
+    given = [(name, path) for name, value in values.items() for path in (value if isinstance(value, list) else [value])]
+    paths = [(name in _WRITTEN, path) for name, path in given if isinstance(path, Path) and os.path.isfile(path)]
+    for out in (path for is_written, path in paths if is_written):
+        if any(not is_written and out.samefile(path) for is_written, path in paths):
+            raise InvalidInputError(f"'{out}' is read and never changed; write another file")
 
 
 def build_parser(*, with_lab: bool = True) -> argparse.ArgumentParser:

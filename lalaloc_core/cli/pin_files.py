@@ -94,6 +94,8 @@ def _write_copies(
             continue
         plan = plans[entry["plan"]]
         copied, sidecar = placed_copy(source.read_bytes(), stated_place(entry, plan, plan.anchor))
+        # An earlier copy can be a link to the original.
+        (folder / source.name).unlink(missing_ok=True)
         (folder / source.name).write_bytes(copied)
         if sidecar is not None:
             name = sidecar_name(source.name, beside)

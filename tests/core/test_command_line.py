@@ -179,6 +179,8 @@ def test_warnings_are_told_once_by_cause(capsys: pytest.CaptureFixture[str]) -> 
         ([PLAN, KITCHEN, "--geojson", "out.geojson"], "give it an anchor"),
         ([PLAN, KITCHEN, "--map", "map.gif"], "it must end in .png or .svg (--map)"),
         ([PLAN, KITCHEN, "--csv", "/gone/out.csv"], "cannot be written"),
+        ([PLAN, KITCHEN, "--map", KITCHEN], "kitchen.jpg' is read and never changed"),
+        ([PLAN, KITCHEN, "--out", PLAN], "flat.json' is read and never changed"),
         (["gone.json", KITCHEN], "'gone.json' cannot be read"),
         ([PLAN, "gone.jpg"], "'gone.jpg' cannot be read"),
         ([PLAN, PLAN], "flat.json': the photograph is"),

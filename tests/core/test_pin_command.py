@@ -159,6 +159,15 @@ def test_no_file_is_overwritten_unasked(
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
+@pytest.mark.slow
+def test_copies_are_not_written_through_links(pinned: tuple[Path, Path]) -> None:
+    original, copy = (folder / "kitchen.jpg" for folder in (pinned[0], pinned[1] / "photographs"))
+    copy.unlink()
+    copy.hardlink_to(original)
+    assert main(["pin", f"{pinned[0].parent}/flat.json", str(pinned[0]), "--out", str(pinned[1]), "--replace"]) == 0
+    assert original.read_bytes() == (EXAMPLES / "kitchen.jpg").read_bytes() != copy.read_bytes()
+
+
 def test_shown_names_hold_no_formulas_or_control_characters() -> None:
     assert [no_formula(text) for text in ("=1", "-1", " ＝1", "a=1", "")] == ["'=1", "'-1", "' ＝1", "a=1", ""]
     name = printable("K\udcffche\x07\ufffe.jpg")
