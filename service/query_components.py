@@ -20,6 +20,7 @@ from service.grids import GridProvider
 from service.plan_files.converter import Converter
 from service.plan_files.rendition_cache import RenditionCache
 from service.query import Executor, Grounds, Localiser, LocalLocaliser, LpoPool, Optimiser, PhotographReader, QueryParts
+from service.query.album_search import AT_A_TIME
 from service.settings import Settings
 from service.storage import Store
 from service.storage.records import DEFAULT_TENANT
@@ -155,7 +156,7 @@ class QueryComponents:
             ),
             executor=executor,
         )
-        albums = Threads("albums", 1, self.telemetry.cpu_accounts)
+        albums = Threads("albums", AT_A_TIME, self.telemetry.cpu_accounts)
         return LocalLocaliser(parts, queries, albums, self.cores)
 
     def build_venue_plans(self) -> VenuePlans:

@@ -13,6 +13,7 @@ from lalaloc_core.errors import InvalidInputError
 from service import errors
 from service.capacity.threads import BoundedReads
 from service.query import AlbumProgress, AlbumQuery, Localiser
+from service.query.album_search import AT_A_TIME
 from service.query_context import QueryContext
 from service.schemas.albums import AlbumDocument
 from service.settings import Settings
@@ -20,8 +21,6 @@ from service.storage import PlanLookup, Store
 from service.storage.album_jobs import AlbumJob
 from service.telemetry import LOGGER_NAME, Telemetry
 
-# Albums solved at a time by a replica, one per tenant.
-_AT_A_TIME = 4
 # Renewals of the lease per its length.
 _HEARTBEATS = 8.0
 # Unfinished attempts, by any replicas, before an album counts as failed.
@@ -103,7 +102,7 @@ class AlbumSolver:
 
     async def _begin_due(self) -> None:
         """Start a task for each album that is due, of tenants without one."""
-        if (room := _AT_A_TIME - len(self._running)) <= 0:
+        if (room := AT_A_TIME - len(self._running)) <= 0:
             return
         find, sha256 = self._store.album_jobs.due, self._localiser.model.sha256
         for tenant, album_id in await self._reads.run(_SERVICE, find, sha256, list(self._running), room):

@@ -31,6 +31,8 @@ from service.schemas.albums import AlbumDocument, PhotographFacts
 from service.storage.album_jobs import AlbumPart
 from service.storage.records import PlanRecord, VenueRecord
 
+# Albums solved at a time by a replica, one per tenant, each on a thread: none waits for the end of another tenant's.
+AT_A_TIME = 4
 # Memory of what solves found about single photographs, all albums together.
 _MEMORY_BYTES = 256 * 2**20
 # Photographs that the plans of a large venue are chosen by.
@@ -42,7 +44,7 @@ class _Stopped(Exception):
 
 
 class AlbumSearch:
-    """Solver of albums, on a thread of its own: a solve can take longer than queries may wait."""
+    """Solver of albums, on threads of its own: a solve can take longer than queries may wait."""
 
     def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, cores: FairSemaphore) -> None:
         self._parts, self._queries, self._threads, self._cores = parts, queries, threads, cores
@@ -139,7 +141,7 @@ class AlbumSearch:
         return memory
 
     def close(self) -> None:
-        """Wait for the solve in progress."""
+        """Wait for the solves in progress."""
         self._threads.close()
 
 
