@@ -16,6 +16,7 @@ import dataclasses
 import json
 import logging
 import os
+import re
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -361,7 +362,9 @@ class _Tools:
             path = Path(os.path.expanduser(folder))
             if not path.is_dir():
                 raise ToolError(f"there is no folder '{folder}'; give the full path")
-            files = sorted(entry for entry in path.iterdir() if entry.suffix.lower() in _SUFFIXES)
+            found = [entry for entry in path.iterdir() if entry.suffix.lower() in _SUFFIXES and entry.name[0] != "."]
+            # As on the command line, whose numbers the photographs then have.
+            files = sorted(found, key=lambda entry: re.sub(r"\d+", lambda digits: digits[0].zfill(20), entry.name))
         if not 1 <= len(files) <= _MAX_PINNED:
             raise ToolError(f"{len(files)} photographs are given; an album has 1 to {_MAX_PINNED}")
         return [*files]

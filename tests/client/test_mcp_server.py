@@ -105,21 +105,22 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
 def test_folder_is_pinned(start_app: StartApp, flat: Path, tmp_path: Path, sphere: bytes) -> None:
     folder = tmp_path / "visit"
     folder.mkdir()
-    (folder / "a.jpg").write_bytes(sphere)
-    (folder / "b.png").write_bytes(encode_picture(256, 128, "PNG"))
+    (folder / "9.jpg").write_bytes(sphere)
+    (folder / "10.png").write_bytes(encode_picture(256, 128, "PNG"))
     (folder / "c.jpg").write_bytes(b"no photograph")
-    (folder / "notes.txt").write_text("left out")
+    for name in ("notes.txt", "._9.jpg"):
+        (folder / name).write_text("left out")
 
     async def talk(client: Any) -> None:
         plan = _said(await client.call_tool("import_plan", {"plan": str(flat)}))
         found = await client.call_tool("pin_folder", {"folder": str(folder), "floorplan_id": plan["id"]})
         told = _said(found)
-        assert [pin["photograph"] for pin in told["pins"]] == ["a.jpg", "b.png"]
+        assert [pin["photograph"] for pin in told["pins"]] == ["9.jpg", "10.png"]
         assert {pin["state"] for pin in told["pins"]} <= {"sure", "uncertain", "set_aside"}
         assert [refused["photograph"] for refused in told["refused"]] == ["c.jpg"]
         assert _texts(found)[1].startswith("<svg")
         listed = app.get(f"/albums/{told['album_id']}/photographs").json()["photographs"]
-        assert [row["name"] for row in listed] == ["a.jpg", "b.png"]
+        assert [row["name"] for row in listed] == ["9.jpg", "10.png"]
 
     # Albums need the fitted weights of the shipped model.
     with start_app(tmp_path / "data", bundle=default_bundle()) as app:
