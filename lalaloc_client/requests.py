@@ -216,7 +216,8 @@ def _form(name: str, files: Sequence[tuple[str, bytes]], values: Mapping[str, ob
         "http://service/",
         headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
         data=text_values(values),
-        files=[(name, (file_name, content, _FILE)) for file_name, content in files],
+        # Names of files can hold bytes that are no UTF-8.
+        files=[(name, (text.encode(errors="replace").decode(), content, _FILE)) for text, content in files],
     )
     return encoded.headers["content-type"], encoded.read()
 
