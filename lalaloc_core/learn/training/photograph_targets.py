@@ -266,7 +266,7 @@ def load_segmenter(path: Path) -> Segment:
         # Only in the extra 'trunk', so a type checker may not find it.
         from ai_edge_litert.interpreter import Interpreter  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ConfigError("--teacher needs the package ai-edge-litert; install the extra 'trunk'") from error
+        raise ConfigError("--teacher needs the package ai-edge-litert; run pip install 'lalaloc[trunk]'") from error
     try:
         interpreter = Interpreter(str(path), num_threads=1)
         interpreter.allocate_tensors()
