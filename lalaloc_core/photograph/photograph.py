@@ -358,7 +358,7 @@ def photograph_of_picture(
         lines = lines_of(segments, small := camera.scaled(columns, rows))
         attitude = estimate_attitude(lines)
     warnings = (*warnings, *bend_warnings(segments, small))
-    if purpose != "turn" and stated.pitch_deg is None and stated.roll_deg is None and not isinstance(camera, Around):
+    if stated.pitch_deg is None and stated.roll_deg is None and not isinstance(camera, Around):
         warnings = (*warnings, *side_warnings(lines, attitude))
     estimated = (
         Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")

@@ -16,13 +16,14 @@ from PIL import ExifTags
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig
-from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, open_photograph
+from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 from lalaloc_core.photograph.levelling import measure_bend
 from lalaloc_core.photograph.patches import UNSEEN, Patch, joined_patches, patch_azimuths
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
+from lalaloc_core.photograph.turned import open_turn
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, PHONE, jpeg, opened, sphere, take
 from tests.painted import picture_file
@@ -370,7 +371,10 @@ def test_photograph_on_its_side_is_said_to_be(quarter: int, exif: dict[Any, Any]
     upright = view_of(MAIN, heading_deg=120.0)
     assert not any("on its side" in text for text in opened(jpeg(upright, exif)).warnings)
     content = jpeg(np.rot90(upright, quarter).copy(), exif)
-    assert "turn it upright and send it again, or state pitch_deg" in opened(content).warnings[-1]
+    (text,) = (text for text in opened(content).warnings if "on its side" in text)
+    assert "turn it upright and send it again, or state pitch_deg" in text
+    turn, _ = open_turn([jpeg(upright, exif), content], StatedCamera(), sphere_size=(128, 256), patch_size=None)
+    assert [text in view.warnings for view in turn] == [False, True]
     # A camera that measures its tilt knows it.
     assert not any("on its side" in text for text in opened(content, pitch_deg=40.0).warnings)
 
