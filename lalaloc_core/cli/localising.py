@@ -84,7 +84,7 @@ def _localise(arguments: argparse.Namespace) -> None:
         if answer is None:
             print(f"error: {document['error']}", file=sys.stderr)
             continue
-        warnings += [(str(path), text) for text in document["warnings"]]
+        warnings += [(name, text) for text in document["warnings"] for name in _names(path, document, text)]
         drawn = drawn_answer(answer)
         rows.append(_row(document, drawn))
         places.append((path.stem, drawn.camera))
@@ -144,6 +144,12 @@ def _turn_answers(
         poses = zip(files, document["poses"], strict=True)
         document["poses"] = [{"photograph": file.name, **pose} for file, pose in poses]
     yield path, answer, document
+
+
+def _names(path: Path, document: dict[str, Any], warning: str) -> list[str]:
+    """Return the photographs of a turn that a warning is about; for others, the photograph or the turn itself."""
+    poses = [pose for pose in document.get("poses", ()) if warning in pose["view"]["warnings"]]
+    return [str(path / pose["photograph"]) for pose in poses if "photograph" in pose] or [str(path)]
 
 
 def _remarks(answer: Answer) -> list[str]:

@@ -39,6 +39,13 @@ def test_folder_of_photographs_is_one_turn(tmp_path: Path, capsys: pytest.Captur
     assert (tmp_path / "answer.svg").read_text().startswith("<svg")
 
 
+def test_warning_names_the_photographs_of_a_turn_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for index, frame in enumerate(turn()[:8:4]):
+        (tmp_path / f"{index}.jpg").write_bytes(jpeg(frame))
+    assert main(["localise", PLAN, "--turn", str(tmp_path)]) == 0
+    assert f"warning: {tmp_path / '0.jpg'} and 1 more: the field of view of" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @needs_ffmpeg
 def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
