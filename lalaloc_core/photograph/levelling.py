@@ -144,9 +144,7 @@ def lines_of(segments: Float[np.ndarray, "n 4"], camera: Camera) -> Lines:
 
 def estimate_attitude(lines: Lines) -> Attitude:
     """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
-    if not len(lines.length):
-        return Attitude(pitch=0.0, roll=0.0, pitch_sd=float(_PRIOR[0]), roll_sd=float(_PRIOR[1]))
-    return _attitude(_refined(lines, _starts(lines)))
+    return _attitude(_modes(lines, _REFINED))
 
 
 def side_warnings(lines: Lines, upright: Attitude) -> tuple[str, ...]:
@@ -189,8 +187,7 @@ def estimate_calibration(
     modes: list[_Mode] = []
     for focal in focals:
         camera = Perspective(width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
-        lines = lines_of(segments, camera)
-        modes += _refined(lines, _starts(lines)[:1]) if len(lines.length) else [(np.zeros(3), 0.0, np.eye(3))]
+        modes += _modes(lines_of(segments, camera), 1)
     log_focal = np.log(focals)
     usual = math.log(0.5 * max(width, height) / math.tan(0.5 * _USUAL_FOV))
     scores = np.array([score for _, score, _ in modes]) - 0.5 * ((log_focal - usual) / _FOV_SD) ** 2
@@ -200,6 +197,13 @@ def estimate_calibration(
     attitude = _attitude([(angles, score, cov) for (angles, _, cov), score in zip(modes, scores, strict=True)])
     focal_sd = math.sqrt(float(weights @ (log_focal - mean) ** 2) + _FOCAL_FLOOR**2)
     return 2.0 * math.atan(0.5 * width / math.exp(mean)), focal_sd, attitude
+
+
+def _modes(lines: Lines, most: int) -> list[_Mode]:
+    """Return the most probable attitudes; without lines a level one, of which nothing is known."""
+    if not len(lines.length):
+        return [(np.zeros(3), 0.0, np.diag([1.0, 1.0, np.inf]))]
+    return _refined(lines, _starts(lines)[:most])
 
 
 def _attitude(modes: Sequence[_Mode]) -> Attitude:

@@ -57,8 +57,8 @@ def test_direction_is_told_beside_a_stated_tilt() -> None:
 
 def test_blank_wall_tells_no_direction() -> None:
     content = jpeg(np.full((480, 640, 3), 180, np.uint8))
-    blank = open_photograph(content, sphere_size=(128, 256), stated=StatedCamera(hfov_deg=80.0))
-    assert blank.wall_direction is None
+    for stated in (StatedCamera(hfov_deg=80.0), StatedCamera()):
+        assert open_photograph(content, sphere_size=(128, 256), stated=stated).wall_direction is None
 
 
 def test_walls_of_a_room_count_by_length() -> None:
