@@ -71,6 +71,8 @@ def test_entry_is_small_and_read_as_it_was(photographs: list[AlbumPhotograph]) -
         np.testing.assert_array_equal(read.descriptors.bits, photograph.descriptors.bits)
         again, first = (present(row.photograph.features).outputs["log_profile"] for row in (read, photograph))
         np.testing.assert_allclose(again, first, rtol=1e-6)
+    strip = replace(photographs[-1], taken=Taken(width=100_000, height=400))
+    assert read_entry(strip.to_bytes(bundle()), bundle()).taken == strip.taken
     assert len(photographs[-1].descriptors) > 50
     assert not photographs[0].photograph.features or not photographs[0].photograph.features.outputs["ring"].any()
 

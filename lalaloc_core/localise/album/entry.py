@@ -24,7 +24,7 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, InvalidCorrectionError, InvalidEntryError
-from lalaloc_core.localise.encode.features import MAX_BYTES, read_features, write_features
+from lalaloc_core.localise.encode.features import MAX_BYTES, MAX_SIDE, read_features, write_features
 from lalaloc_core.photograph import Photograph
 from lalaloc_core.photograph.exif import MAX_NAME, Taken
 from lalaloc_core.photograph.overlap import Features
@@ -33,7 +33,7 @@ MAX_ENTRY_BYTES = 20_000
 _MAX_DESCRIPTORS, _DESCRIPTOR_BYTES = 256, 16
 _MAX_ID = 200
 _MAGIC, _VERSION, _PREFIX = b"LLAP", 1, struct.Struct("<4sHI")
-_MAX_HEADER_BYTES, _MAX_SIDE = 4096, 2**16
+_MAX_HEADER_BYTES = 4096
 # A descriptor with its place.
 _RECORD = np.dtype([("bits", "u1", _DESCRIPTOR_BYTES), ("place", "<u2", 2)])
 _WHOLE = 2**16 - 1
@@ -254,8 +254,8 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         "id": not 0 < len(header.id) <= _MAX_ID or not header.id.isprintable(),
         "make": len(header.make) > MAX_NAME or not header.make.isprintable(),
         "model": len(header.model) > MAX_NAME or not header.model.isprintable(),
-        "width": not 0 <= header.width <= _MAX_SIDE,
-        "height": not 0 <= header.height <= _MAX_SIDE,
+        "width": not 0 <= header.width <= MAX_SIDE,
+        "height": not 0 <= header.height <= MAX_SIDE,
         "features": not 0 < header.features <= len(body) - COLOURS,
     }
     for name, is_wrong in faults.items():

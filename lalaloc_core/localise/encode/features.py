@@ -36,12 +36,13 @@ from lalaloc_core.photograph.cameras import Camera, Fisheye, Perspective
 from lalaloc_core.photograph.projection import Source
 from lalaloc_core.photograph.stated_camera import Projection, camera_of_intrinsics, intrinsics_of
 
-MAX_BYTES = 2**18
+# Bytes of a file, and pixels of a side, that of the flattest pictures which are decoded.
+MAX_BYTES, MAX_SIDE = 2**18, 2**21
 # Files of a bundle that `FeatureEncoder` reads, those that it has.
 DEVICE_FILES = (MANIFEST_NAME, IMAGE_ONNX, VIEW_ONNX, OBJECTS_ONNX)
 _MAGIC, _VERSION, _PREFIX = b"LLFT", 2, struct.Struct("<4sHI")
 _VERSION_WITHOUT_OBJECTS = 1
-_MAX_HEADER_BYTES, _MAX_PATCHES, _MAX_SIDE = 2**14, 16, 2**16
+_MAX_HEADER_BYTES, _MAX_PATCHES = 2**14, 16
 _MAX_WARNINGS, _MAX_WARNING_CHARACTERS = 8, 300
 # Camera heights (m) of the rings. The ring is the only output that depends on the height other than by its log.
 RING_HEIGHTS_M = (0.5, 1.0, 1.5, 2.0, 3.0)
@@ -331,7 +332,7 @@ def _photograph_of(header: _Header, manifest: Manifest) -> Photograph:
         "warnings": len(header.warnings) > _MAX_WARNINGS
         or any(len(text) > _MAX_WARNING_CHARACTERS or not text.isprintable() for text in header.warnings),
         "camera": header.camera is not None
-        and not (0 < header.camera.width <= _MAX_SIDE and 0 < header.camera.height <= _MAX_SIDE),
+        and not (0 < header.camera.width <= MAX_SIDE and 0 < header.camera.height <= MAX_SIDE),
     }
     for name, is_wrong in faults.items():
         if is_wrong:
