@@ -20,7 +20,7 @@ from lalaloc_core.localise.album.entry import (
     read_correction,
     read_entry,
 )
-from lalaloc_core.localise.album.evidence import AlbumMemory
+from lalaloc_core.localise.album.evidence import AlbumMemory, shared_cameras
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.links import pair_odds
 from lalaloc_core.localise.album.pins import Pin, PinPose, RoomShare, moved_pins
@@ -30,7 +30,7 @@ from lalaloc_core.localise.album.solve import _pin as _pin_of
 from lalaloc_core.localise.album.states import States, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
-from lalaloc_core.photograph import open_photograph
+from lalaloc_core.photograph import Assumed, open_photograph
 from lalaloc_core.photograph.exif import Taken
 from tests.core.shipped import bundle, encoder
 from tests.core.taken import EXAMPLES
@@ -105,6 +105,13 @@ def test_all_photographs_are_pinned_to_their_rooms(ground: AlbumGround, photogra
     assert album.camera_height_m is not None
     assert 1.0 < album.camera_height_m < 2.0
     assert album.cameras[0].photographs == 1
+
+
+def test_field_of_view_of_a_strip_is_its_own(photographs: list[AlbumPhotograph]) -> None:
+    own = photographs[-1].photograph
+    strip = replace(own, projection="cylindrical", hfov=Assumed(value=math.radians(240.0), sd=0.1, source="gpano"))
+    cameras = [shared_cameras([replace(photographs[-1], photograph=view)])[0] for view in (own, strip)]
+    assert [camera.hfov for camera in cameras] == pytest.approx([own.hfov.value, math.radians(240.0)])
 
 
 @pytest.mark.slow

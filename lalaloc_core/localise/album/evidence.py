@@ -51,6 +51,8 @@ _DAMAGE = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, Recur
 # Standard deviation of the scale of a plan; of the log height from one photograph to the next; and of a median over
 # that of a mean. Errors of fields of view by lines are alike, so the error of many is not less than `_LINES_SD`.
 _SCALE_SD, _HAND_SD, _MEDIAN, _LINES_SD = 0.05, 0.05, 1.25, 0.03
+# Fields of view (radians) from which on pictures are not in perspective.
+_WIDEST = 3.0
 
 
 @dataclass(eq=False)
@@ -291,11 +293,14 @@ def shared_cameras(photographs: Sequence[AlbumPhotograph]) -> tuple[SharedCamera
     found = []
     for (make, model, width, height), members in groups.items():
         stated = [each for each in members if each.has_stated_field]
-        half = np.array([min(0.5 * each.photograph.hfov.value, 1.5) for each in stated or members])
-        log_tangent = np.log(np.tan(half))
-        spread = float(np.median(np.abs(log_tangent - np.median(log_tangent)))) * 1.48
-        hfov = 2.0 * math.atan(math.exp(float(np.median(log_tangent))))
-        sd = 0.0 if len(stated) == len(members) else math.hypot(_MEDIAN * spread / math.sqrt(len(half)), _LINES_SD)
+        fields = np.array([each.photograph.hfov.value for each in stated or members])
+        # Fisheye lenses and strips have no focal length in perspective, by which fields are compared.
+        is_flat = fields.max() < _WIDEST
+        log_size = np.log(np.tan(0.5 * fields) if is_flat else fields)
+        middle = float(np.median(log_size))
+        spread = float(np.median(np.abs(log_size - middle))) * 1.48
+        hfov = 2.0 * math.atan(math.exp(middle)) if is_flat else math.exp(middle)
+        sd = 0.0 if len(stated) == len(members) else math.hypot(_MEDIAN * spread / math.sqrt(len(fields)), _LINES_SD)
         found.append(
             SharedCamera(
                 make=make,
@@ -304,7 +309,7 @@ def shared_cameras(photographs: Sequence[AlbumPhotograph]) -> tuple[SharedCamera
                 height=height,
                 photographs=len(members),
                 hfov=hfov,
-                hfov_sd=sd * math.sin(hfov),
+                hfov_sd=sd * (math.sin(hfov) if is_flat else hfov),
             )
         )
     return tuple(found)
