@@ -105,11 +105,12 @@ def find_lens(
     is_full = projection == "equirectangular" and is_twice_as_wide(width, height) and stated.hfov_deg == 360.0
     if stated.hfov_deg is not None and not is_full:
         return known(camera_of_hfov(projection, width, height, math.radians(stated.hfov_deg)), "given")
+    kind = "sphere" if projection == "equirectangular" else "strip"
+    unused = () if stated.intrinsics is None else (f"intrinsics are not used: the photograph is a {kind}",)
     if projection == "equirectangular":
-        unused = () if stated.intrinsics is None else ("intrinsics are not used: the photograph is a sphere",)
         return replace(unknown, hfov_source=source, warnings=unused)
     if projection == "cylindrical" and sphere.cylinder is not None and (sphere.cylinder < TWO_PI or closes()):
-        return known(camera_of_hfov(projection, width, height, sphere.cylinder), "gpano")
+        return known(camera_of_hfov(projection, width, height, sphere.cylinder), "gpano", unused)
     if projection == "cylindrical":
         raise InvalidPhotographError(
             f"nothing tells which angle the strip of {width} x {height} shows{_UNCLOSED if sphere.cylinder else ''}; "

@@ -103,6 +103,8 @@ class TestProjection:
         view = opened(with_xmp(strip, part.format("cylindrical")))
         assert (view.projection, view.hfov.source) == ("cylindrical", "gpano")
         assert view.hfov.value == pytest.approx(math.pi)
+        view = opened(with_xmp(strip, part.format("cylindrical")), intrinsics=Intrinsics(fx=400.0, fy=400.0))
+        assert view.warnings == ("intrinsics are not used: the photograph is a strip",)
 
     def test_strip_asks_for_its_angle(self) -> None:
         strip = view_of(Around(width=1200, height=300, hfov=math.radians(240.0)))
