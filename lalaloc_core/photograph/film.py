@@ -182,6 +182,8 @@ def _turned(
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
+    if lens.is_sphere:
+        raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
     photographs = [photograph_of_picture(sample.picture, full_size, lens, stated, size, "turn") for sample in kept]
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
