@@ -121,16 +121,13 @@ def test_solve_does_not_depend_on_the_order_of_arrival(ground: AlbumGround, phot
 
 
 @pytest.mark.slow
-def test_memory_gives_the_same_pins_after_storage(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
+def test_memory_gives_the_same_pins(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     memory = AlbumMemory()
     album = solve_album(ground, encoder(), photographs, memory=memory)
-    stored = AlbumMemory.read(memory.to_bytes())
     seen: list[int] = []
-    again = solve_album(ground, encoder(), photographs, memory=stored, progress=seen.append)
+    again = solve_album(ground, encoder(), photographs, memory=memory, progress=seen.append)
     assert seen == []
     assert again.pins == album.pins
-    with pytest.raises(InvalidEntryError):
-        AlbumMemory.read(memory.to_bytes()[:200])
 
 
 @pytest.mark.slow

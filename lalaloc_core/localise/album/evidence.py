@@ -7,19 +7,14 @@ the scale of the plan are the same for many photographs.
 from __future__ import annotations
 
 import hashlib
-import io
-import json
 import math
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import Manifest, MatchingWeights
-from lalaloc_core.errors import InvalidEntryError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.comparison import BinnedGround, Comparison
 from lalaloc_core.localise.album.entry import AlbumPhotograph
@@ -41,13 +36,11 @@ _OFFSETS = np.linspace(-0.36, 0.36, 9)
 _USUAL_HEIGHT_M, _USUAL_LOG_SD, _USUAL_CEILING_M = 1.5, 0.15, 2.5
 # States that are kept: of every room, at least so many, and of all.
 _PER_ROOM, _MAX_STATES = 96, 8192
-# Every so many of the poses of other homes are compared; poses at a time; version of the evidence in stored memories.
-_EVERY, _PART, _VERSION = 4, 4096, 2
+# Every so many of the poses of other homes are compared; poses at a time.
+_EVERY, _PART = 4, 4096
 _CONFIG = MatchingConfig()
 # Arrays of one photograph by name.
 Arrays = dict[str, np.ndarray]
-_MAX_BYTES = 2**28
-_DAMAGE = (ValueError, KeyError, IndexError, TypeError, OSError, EOFError, RecursionError, zipfile.BadZipFile)
 # Standard deviation of the scale of a plan; of the log height from one photograph to the next; and of a median over
 # that of a mean. Errors of fields of view by lines are alike, so the error of many is not less than `_LINES_SD`.
 _SCALE_SD, _HAND_SD, _MEDIAN, _LINES_SD = 0.05, 0.05, 1.25, 0.03
@@ -75,7 +68,7 @@ class AlbumMemory:
         """Drop everything that is of another ground or model."""
         files = sorted(manifest.files.items())
         weights = manifest.evidence_for(view=False), manifest.evidence_for(view=True)
-        key = hashlib.sha256(f"{_VERSION} {ground.digest} {files} {weights}".encode()).hexdigest()
+        key = hashlib.sha256(f"{ground.digest} {files} {weights}".encode()).hexdigest()
         if key != self.key:
             # Links depend on the photographs alone.
             self.key, self.evidence = key, {}
@@ -84,43 +77,6 @@ class AlbumMemory:
         """Drop what is about photographs that are no longer in the album."""
         self.evidence = {id: arrays for id, arrays in self.evidence.items() if id in ids}
         self.links = {pair: link for pair, link in self.links.items() if ids.issuperset(pair)}
-
-    def to_bytes(self) -> bytes:
-        """Return the memory as a file: an archive of arrays, as numpy writes them."""
-        ids = sorted(self.evidence)
-        links = [[*pair, *(link or (0, 0.0))] for pair, link in sorted(self.links.items())]
-        head = {"key": self.key, "ids": ids, "links": links}
-        arrays: dict[str, Any] = {
-            f"{number}.{name}": values for number, id in enumerate(ids) for name, values in self.evidence[id].items()
-        }
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, head=np.frombuffer(json.dumps(head).encode(), np.uint8), **arrays)
-        return buffer.getvalue()
-
-    @classmethod
-    def read(cls, content: bytes) -> AlbumMemory:
-        """Read a memory that this service stored itself.
-
-        Raises:
-            InvalidEntryError: the file is damaged; go on with a new memory.
-        """
-        try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                if sum(entry.file_size for entry in archive.zip.infolist()) > _MAX_BYTES:
-                    raise InvalidEntryError(f"the memory of the album would be larger than {_MAX_BYTES} bytes")
-                head = json.loads(archive["head"].tobytes())
-                evidence: dict[str, Arrays] = {id: {} for id in head["ids"]}
-                for name in archive.files:
-                    number, _, kind = name.partition(".")
-                    if kind:
-                        evidence[head["ids"][int(number)]][kind] = archive[name]
-                links = {
-                    (str(first), str(second)): (int(matches), float(turn)) if matches else None
-                    for first, second, matches, turn in head["links"]
-                }
-                return cls(str(head["key"]), evidence, links)
-        except _DAMAGE as error:
-            raise InvalidEntryError(f"the memory of the album is damaged: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)
