@@ -46,7 +46,7 @@ _FISHEYES = tuple(
 )
 # Longer equivalent focal lengths of these cameras are those of linear and narrow modes.
 _MAX_FISHEYE_MM = 18.0
-# An attribute or element of the Camera Raw schema.
+# A crop that an editor states, as an attribute or element of the Camera Raw schema.
 _HAS_CROP = re.compile(rb"crs:HasCrop\s{0,9}(?:=\s{0,9}[\"']|>)\s{0,9}True", re.IGNORECASE)
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_RANGE_MM = (4.0, 250.0)
@@ -111,7 +111,7 @@ class Taken:
     height: int = 0
 
 
-def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes | str] = (), *, width: int, height: int) -> ExifLens:
+def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: int, height: int) -> ExifLens:
     """Read the focal length of a picture of `width` x `height` pixels, in either orientation.
 
     `packets` are its XMP packets, in which editors state that they cropped it.
@@ -123,7 +123,7 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes | str] = (), *, wid
     zoom = _in_range(tags, ExifTags.Base.DigitalZoomRatio, _ZOOM_RANGE, "", warnings) or 1.0
     film = _in_range(tags, ExifTags.Base.FocalLengthIn35mmFilm, _FILM_RANGE_MM, " mm", warnings)
     lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)
-    if _is_cropped(tags, width, height) or any(map(_states_crop, packets)):
+    if _is_cropped(tags, width, height) or any(map(_HAS_CROP.search, packets)):
         if film is not None or lens is not None:
             warnings.append("the photograph was cropped after it was taken, so its EXIF focal length is not used")
         return ExifLens(warnings=tuple(warnings))
@@ -183,11 +183,6 @@ def _is_cropped(tags: dict[int, object], width: int, height: int) -> bool:
         return False
     taken = max(sides[0], sides[1]) / min(sides[0], sides[1])
     return abs(taken * min(width, height) / max(width, height) - 1.0) > _CROPPED
-
-
-def _states_crop(packet: bytes | str) -> bool:
-    """Return whether an editor states a crop (Camera Raw schema, `crs:HasCrop`)."""
-    return bool(_HAS_CROP.search(packet.encode() if isinstance(packet, str) else packet))
 
 
 def _in_range(

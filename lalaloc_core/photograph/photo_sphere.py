@@ -89,7 +89,7 @@ class PhotoSphere:
         return self.pitch == 0.0 and self.roll == 0.0
 
 
-def read_photo_sphere(packets: Sequence[bytes | str], *, width: int, height: int) -> PhotoSphere:
+def read_photo_sphere(packets: Sequence[bytes], *, width: int, height: int) -> PhotoSphere:
     """Read the XMP packets of a picture of `width` x `height` pixels; unreadable packets count as missing."""
     values, conflicts = read_gpano(packets)
     projection = values.get("ProjectionType", "equirectangular")
@@ -180,7 +180,7 @@ def _part(values: dict[str, str], width: int, height: int) -> tuple[SpherePart |
     )
 
 
-def read_gpano(packets: Sequence[bytes | str]) -> tuple[dict[str, str], tuple[str, ...]]:
+def read_gpano(packets: Sequence[bytes]) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the GPano properties of all packets, and warnings; the first of each name counts."""
     found: dict[str, str] = {}
     warnings: list[str] = []
@@ -192,9 +192,8 @@ def read_gpano(packets: Sequence[bytes | str]) -> tuple[dict[str, str], tuple[st
     return found, tuple(dict.fromkeys(warnings))[:_MAX_WARNINGS]
 
 
-def _properties(packet: bytes | str) -> Iterator[tuple[str, str]]:
-    content = packet.encode(errors="replace") if isinstance(packet, str) else packet
-    content = content.strip(b"\0 \r\n\t")
+def _properties(packet: bytes) -> Iterator[tuple[str, str]]:
+    content = packet.strip(b"\0 \r\n\t")
     if b"GPano:" not in content and len(content) > _MAX_XML_BYTES:
         return
     try:

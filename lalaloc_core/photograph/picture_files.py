@@ -86,7 +86,7 @@ class PictureFile:
     kind: str | None
     size: tuple[int, int]
     exif: Image.Exif
-    packets: list[bytes | str]
+    packets: list[bytes]
     box: tuple[float, float, float, float] = _WHOLE
     is_upright: bool = False
     is_cut: bool = False
@@ -151,7 +151,7 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
         kind=image.format,
         size=size,
         exif=exif,
-        packets=[*packets] or [packet for packet in [image.info.get("xmp")] if packet],
+        packets=packets or [packet for packet in [image.info.get("xmp")] if packet],
         is_upright=was_turned,
         is_cut=is_cut,
         warnings=[text for text, applies in faults.items() if applies],

@@ -119,7 +119,7 @@ def _dms(degrees: float) -> tuple[float, float, float]:
     return float(math.floor(whole)), float(math.floor(minutes)), round(60.0 * (minutes % 1.0), 5)
 
 
-def _xmp(packet: bytes | str | None, place: Place) -> bytes:
+def _xmp(packet: bytes | None, place: Place) -> bytes:
     """Return an XMP packet with a place: the given one, if it can be read, with more properties."""
     room, level = printable(place.room), printable(place.level)
     for prefix, name in _NAMES.items():
@@ -152,11 +152,10 @@ def _xmp(packet: bytes | str | None, place: Place) -> bytes:
     return f'{begin}{body}\n<?xpacket end="w"?>'.encode()
 
 
-def _parsed(packet: bytes | str | None) -> Element:
+def _parsed(packet: bytes | None) -> Element:
     if packet is not None:
-        content = packet.encode() if isinstance(packet, str) else packet
         try:
-            return fromstring(content.strip(b"\0 \r\n\t"), forbid_dtd=True)
+            return fromstring(packet.strip(b"\0 \r\n\t"), forbid_dtd=True)
         except (ParseError, DefusedXmlException, ValueError, LookupError):
             pass
     return Element(f"{{{_NAMES['x']}}}xmpmeta")
