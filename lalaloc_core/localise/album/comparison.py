@@ -85,22 +85,9 @@ class BinnedGround:
         seen = (values[begin:end] for values in (self.row - rows.start, self.column, self.own, self.behind, self.odds))
         return BinnedGround(self.index[rows], *seen)
 
-    def chosen(self, rows: Int[np.ndarray, "m"]) -> BinnedGround:
-        """Return some poses, by their numbers in rising order."""
-        place = np.full(len(self), -1)
-        place[rows] = np.arange(len(rows))
-        kept = place[self.row] >= 0
-        seen = (values[kept] for values in (place[self.row], self.column, self.own, self.behind, self.odds))
-        return BinnedGround(self.index[rows], *seen)
-
 
 def _bins(log_m: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
     return np.clip(np.floor(log_m / _BIN).astype(np.intp) - _FIRST_BIN, 0, _BINS - 1)
-
-
-def _bin_centres() -> Float[np.ndarray, "b"]:
-    """Return the log distance (m) at the centre of each bin."""
-    return _BIN * (_FIRST_BIN + 0.5 + np.arange(_BINS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,17 +116,13 @@ class Comparison:
     ) -> Comparison:
         """Return the tables of a query with an unknown heading.
 
-        Args:
-            plan: the plan, whose drawn openings count.
-            query: the photograph.
-            reach_m: distance from the camera within which the best pose is.
-            weights: weights of the matching cost.
-            offsets: logs of true over stated camera height.
+        The best pose is within `reach_m` of the camera; `offsets` are logs of true over stated camera height.
         """
         assert query.profile is not None
         width = query.profile.log_m.shape[1]
         columns = np.flatnonzero(np.isfinite(query.profile.log_scale[0]))
-        centres = _bin_centres()[None, :, None] - offsets[None, None, :]
+        bins = _BIN * (_FIRST_BIN + 0.5 + np.arange(_BINS))
+        centres = bins[None, :, None] - offsets[None, None, :]
         likelihood = np.zeros((len(columns), _BINS, len(offsets)))
         for centre, log_scale, odds in _modes(query.profile, columns):
             precision = precisions(centre, log_scale, reach_m, weights.tail)
@@ -190,14 +173,10 @@ class Comparison:
         return total
 
 
-Mode = tuple[Float[np.ndarray, "s"], Float[np.ndarray, "s"], Float[np.ndarray, "s"]]
-
-
-def _modes(profile: PredictedProfile, columns: np.ndarray) -> list[Mode]:
+def _modes(profile: PredictedProfile, columns: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return centre, log scale and odds of each predicted mode at some columns."""
     modes = [(profile.log_m[0][columns], profile.log_scale[0][columns], np.ones(len(columns)))]
-    rival = profile.rival
-    if rival is not None:
+    if (rival := profile.rival) is not None:
         modes.append((rival.log_m[0][columns], rival.log_scale[0][columns], rival.odds[0][columns]))
     return modes
 
