@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -69,7 +69,8 @@ class Correction:
     def __post_init__(self) -> None:
         given = {name for name, value in asdict(self).items() if value is not None} - {"kind"}
         needed = _FIELDS[self.kind]
-        missing, foreign = needed - given, given - needed - _OPTIONAL[self.kind]
+        possible = needed | {"heading_deg"} if needed == _PLACE else needed
+        missing, foreign = needed - given, given - possible
         if missing:
             raise InvalidCorrectionError(f"the correction '{self.kind}' needs {', '.join(sorted(missing))}")
         if foreign:
@@ -92,10 +93,6 @@ _FIELDS: Mapping[str, frozenset[str]] = {
     "position": _PLACE,
     "elsewhere": frozenset(),
     "confirmed": _PLACE,
-}
-_OPTIONAL: Mapping[str, frozenset[str]] = dict.fromkeys(get_args(CorrectionKind), frozenset()) | {
-    "position": frozenset({"heading_deg"}),
-    "confirmed": frozenset({"heading_deg"}),
 }
 
 
