@@ -118,6 +118,11 @@ class Photograph:
         return self.sphere is not None or (self.features is not None and not self.features.azimuths)
 
     @property
+    def has_stated_field(self) -> bool:
+        """True if the field of view is stated or in the metadata, not estimated."""
+        return self.hfov.source not in ("estimated", "assumed")
+
+    @property
     def patch_azimuths(self) -> tuple[float, ...]:
         """Azimuths (radians) of the patches relative to the photograph's centre; none for a full sphere."""
         return tuple(patch.azimuth_rad for patch in self.patches) if self.features is None else self.features.azimuths

@@ -64,7 +64,7 @@ def turn_views(photographs: Sequence[Photograph]) -> list[TurnView]:
 
     An unknown field of view is that of the photographs that have one, else the mean of the estimates.
     """
-    known = [photograph for photograph in photographs if _has_lens(photograph)]
+    known = [photograph for photograph in photographs if photograph.has_stated_field]
     usual = known or [photograph for photograph in photographs if isinstance(photograph.camera, Perspective)]
     log_focal = float(np.mean([math.log(_long_focal(photograph)) for photograph in usual])) if usual else 0.0
     return [_turn_view(photograph, log_focal, is_known=bool(known)) for photograph in photographs]
@@ -74,7 +74,7 @@ def _turn_view(photograph: Photograph, log_focal: float, *, is_known: bool) -> T
     assert photograph.camera is not None
     assert photograph.overview is not None
     camera, focal_sd, overview = photograph.camera, 0.0, photograph.overview
-    if not _has_lens(photograph) and isinstance(camera, Perspective):
+    if not photograph.has_stated_field and isinstance(camera, Perspective):
         focal = math.exp(log_focal) * max(camera.width, camera.height)
         camera, overview = replace(camera, fx=focal, fy=focal), replace(overview, attitude=None)
         focal_sd = 0.0 if is_known else _LINES_FOCAL_SD
@@ -100,7 +100,7 @@ def _turned(photograph: Photograph, turn_view: TurnView, angles: TurnAngles, siz
     )
     pitch = photograph.pitch if photograph.pitch.source == "given" else pitch
     roll = photograph.roll if photograph.roll.source == "given" else roll
-    if not _has_lens(photograph) and isinstance(camera, Perspective):
+    if not photograph.has_stated_field and isinstance(camera, Perspective):
         focal = camera.fx * angles.focal_factor
         camera = replace(camera, fx=focal, fy=focal)
         focal_sd = max(angles.focal_sd, _LINES_FOCAL_SD)
@@ -133,11 +133,6 @@ def _is_possible(photograph: Photograph, camera: Camera, pitch: float, roll: flo
     low, high = HFOV_RANGE_DEG[photograph.projection]
     is_tilted = abs(math.degrees(pitch)) > MAX_PITCH_DEG or abs(math.degrees(roll)) > MAX_ROLL_DEG
     return not is_tilted and low <= math.degrees(camera.hfov) <= high
-
-
-def _has_lens(photograph: Photograph) -> bool:
-    """Return whether the field of view was stated, or is in the photograph's metadata."""
-    return photograph.hfov.source not in ("estimated", "assumed")
 
 
 def _long_focal(photograph: Photograph) -> float:

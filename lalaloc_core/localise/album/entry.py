@@ -159,11 +159,6 @@ class AlbumPhotograph:
         short, long = sorted((self.taken.width, self.taken.height))
         return self.taken.make, self.taken.model, long, short
 
-    @property
-    def has_stated_field(self) -> bool:
-        """True if the field of view is stated or in the metadata, not estimated."""
-        return self.photograph.hfov.source not in ("estimated", "assumed")
-
     def to_bytes(self, bundle: Bundle) -> bytes:
         """Return the entry as a file, without the correction."""
         assert self.photograph.features is not None

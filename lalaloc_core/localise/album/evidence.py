@@ -248,7 +248,7 @@ def shared_cameras(photographs: Sequence[AlbumPhotograph]) -> tuple[SharedCamera
             groups.setdefault(photograph.camera_key, []).append(photograph)
     found = []
     for (make, model, width, height), members in groups.items():
-        stated = [each for each in members if each.has_stated_field]
+        stated = [each for each in members if each.photograph.has_stated_field]
         fields = np.array([each.photograph.hfov.value for each in stated or members])
         # Fisheye lenses and strips have no focal length in perspective, by which fields are compared.
         is_flat = fields.max() < _WIDEST
