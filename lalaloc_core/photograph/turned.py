@@ -64,9 +64,13 @@ def turn_views(photographs: Sequence[Photograph]) -> list[TurnView]:
 
     An unknown field of view is that of the photographs that have one, else the mean of the estimates.
     """
-    known = [photograph for photograph in photographs if photograph.has_stated_field]
-    usual = known or [photograph for photograph in photographs if isinstance(photograph.camera, Perspective)]
-    log_focal = float(np.mean([math.log(_long_focal(photograph)) for photograph in usual])) if usual else 0.0
+    known, guessed = (
+        [each.camera for each in photographs if isinstance(each.camera, Perspective) and each.has_stated_field is given]
+        for given in (True, False)
+    )
+    # Focal lengths as a share of the longer side.
+    logs = [math.log(camera.fx / max(camera.width, camera.height)) for camera in known or guessed]
+    log_focal = float(np.mean(logs)) if logs else 0.0
     return [_turn_view(photograph, log_focal, is_known=bool(known)) for photograph in photographs]
 
 
@@ -133,9 +137,3 @@ def _is_possible(photograph: Photograph, camera: Camera, pitch: float, roll: flo
     low, high = HFOV_RANGE_DEG[photograph.projection]
     is_tilted = abs(math.degrees(pitch)) > MAX_PITCH_DEG or abs(math.degrees(roll)) > MAX_ROLL_DEG
     return not is_tilted and low <= math.degrees(camera.hfov) <= high
-
-
-def _long_focal(photograph: Photograph) -> float:
-    """Return the focal length as a share of the longer side."""
-    assert isinstance(photograph.camera, Perspective)
-    return photograph.camera.fx / max(photograph.camera.width, photograph.camera.height)

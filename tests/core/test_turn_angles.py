@@ -17,11 +17,11 @@ from lalaloc_core.localise.answers.turns import Turn
 from lalaloc_core.localise.query import CameraHeight
 from lalaloc_core.localise.query.query import UNKNOWN_HEADING
 from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
-from lalaloc_core.photograph.cameras import Perspective, level_axes
+from lalaloc_core.photograph.cameras import Fisheye, Perspective, level_axes
 from lalaloc_core.photograph.overlap import Features, Link, Step, agreeing_links, headings_in_order, usual_steps
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn
-from lalaloc_core.photograph.turned import turn_views, turned_photographs
+from lalaloc_core.photograph.turned import open_turn, turn_views, turned_photographs
 from tests.core.taken import jpeg, sphere, take
 
 PORTRAIT = Perspective.of_hfov(360, 480, math.radians(53.0))
@@ -131,6 +131,14 @@ def test_stated_tilt_and_field_are_kept() -> None:
     for found in turned_photographs(taken, views, angles_of_turn(views), PatchSize()):
         assert (found.hfov.source, found.pitch.source, found.roll.source) == ("given", "given", "given")
         assert (math.degrees(found.hfov.value), math.degrees(found.pitch.value)) == pytest.approx((53.0, 2.0))
+
+
+def test_photographs_of_a_fisheye_lens_are_a_turn() -> None:
+    lens = Fisheye.of_hfov(640, 480, math.radians(120.0))
+    contents = [jpeg(take(sphere("living_room"), lens, heading_deg=heading)) for heading in (0.0, 40.0)]
+    stated = StatedCamera(projection="fisheye", hfov_deg=120.0)
+    for view in open_turn(contents, stated, sphere_size=(128, 256), patch_size=None)[0]:
+        assert (view.hfov.source, len(view.patches)) == ("given", 2)
 
 
 def room_view(rng: np.random.Generator, arm_m: float, pose: Float[np.ndarray, "3"]) -> Overview:
