@@ -70,35 +70,20 @@ def count_scans(content: bytes, limit: int) -> int:
 
 
 def check_segments(content: bytes) -> None:
-    """Refuse a JPEG or PNG with too many segments or chunks; other files pass."""
+    """Refuse a JPEG or PNG with too many segments, before the first scan, or chunks; other files pass."""
+    kind, counts = "JPEG", list[tuple[int, int, str]]()
     if content.startswith(START):
-        _check_jpeg(content)
+        head = takewhile(lambda found: found[0] != START_OF_SCAN, markers(content))
+        segments = list(islice(head, _MAX_SEGMENTS + 1))
+        exif = sum(marker == APP1 and content.startswith(b"Exif\0\0", place + 2) for marker, place in segments)
+        counts = [(exif, _MAX_EXIF_SEGMENTS, "Exif segments"), (len(segments), _MAX_SEGMENTS, "segments")]
     elif content.startswith(_PNG):
-        _check_png(content)
-
-
-def _check_jpeg(content: bytes) -> None:
-    """Check the segments before the first scan, which are read when a JPEG is opened."""
-    exif = 0
-    for segments, (marker, position) in enumerate(markers(content), start=1):
-        if marker == START_OF_SCAN:
-            return
-        exif += marker == APP1 and content.startswith(b"Exif\0\0", position + 2)
-        if segments > _MAX_SEGMENTS:
+        kind, chunks = "PNG", sum(1 for _ in islice(png_chunks(content), _MAX_CHUNKS + 1))
+        counts = [(chunks, _MAX_CHUNKS, "chunks")]
+    for count, limit, parts in counts:
+        if count > limit:
             raise InvalidPhotographError(
-                f"the photograph is a JPEG with more than {_MAX_SEGMENTS} segments, the limit; save it again"
-            )
-        if exif > _MAX_EXIF_SEGMENTS:
-            raise InvalidPhotographError(
-                f"the photograph is a JPEG with more than {_MAX_EXIF_SEGMENTS} Exif segments, the limit; save it again"
-            )
-
-
-def _check_png(content: bytes) -> None:
-    for chunks, _ in enumerate(png_chunks(content), start=1):
-        if chunks > _MAX_CHUNKS:
-            raise InvalidPhotographError(
-                f"the photograph is a PNG with more than {_MAX_CHUNKS} chunks, the limit; save it again"
+                f"the photograph is a {kind} with more than {limit} {parts}, the limit; save it again"
             )
 
 
