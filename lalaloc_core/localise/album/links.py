@@ -45,23 +45,20 @@ def find_links(
     `pause` is called before each pair that is compared.
     """
     found: dict[tuple[int, int], Found] = {}
-    signs: dict[int, np.ndarray] = {}
-    rays: dict[int, np.ndarray] = {}
+    seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for first, second in _pairs(photographs):
-        ids = photographs[first].id, photographs[second].id
-        flipped = ids[0] > ids[1]
-        key = (ids[1], ids[0]) if flipped else ids
+        # The memory has pairs in the order of their ids.
+        one, other = sorted((first, second), key=lambda number: photographs[number].id)
+        key = photographs[one].id, photographs[other].id
         if key not in memory.links:
             pause()
-            for number in (first, second):
-                if number not in signs:
-                    signs[number] = _signs(photographs[number].descriptors)
-                    rays[number] = _level_rays(photographs[number])
-            one, other = (second, first) if flipped else (first, second)
-            memory.links[key] = _compared(signs[one], signs[other], rays[one], rays[other])
+            for number in (one, other):
+                if number not in seen:
+                    seen[number] = _signs(photographs[number].descriptors), _level_rays(photographs[number])
+            memory.links[key] = _compared(*seen[one], *seen[other])
         known = memory.links[key]
         if known is not None:
-            found[first, second] = known[0], -known[1] if flipped else known[1]
+            found[first, second] = known[0], known[1] if one == first else -known[1]
     return found
 
 
@@ -121,8 +118,8 @@ def _level_rays(photograph: AlbumPhotograph) -> Float[np.ndarray, "n 3"]:
 
 def _compared(
     one: Float[np.ndarray, "n 128"],
-    other: Float[np.ndarray, "m 128"],
     rays: Float[np.ndarray, "n 3"],
+    other: Float[np.ndarray, "m 128"],
     other_rays: Float[np.ndarray, "m 3"],
 ) -> Found | None:
     """Return the number of matches, and the turn if a rotation explains enough of them; None without matches."""
