@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -145,10 +146,11 @@ def find_links(
     """
     count = len(features)
     apart = max(min(_MAX_PAIRS // count, count // 2), 1)
-    pairs = {
-        (min(first, (first + step) % count), max(first, (first + step) % count))
-        for first in range(count)
-        for step in range(1, apart + 1)
+    # Steps between photographs, the shorter way around.
+    steps = {
+        (first, second): step
+        for first, second in combinations(range(count), 2)
+        if (step := min(second - first, count - second + first)) <= apart
     }
     rays = [
         camera.rays(found.place * (camera.width, camera.height))
@@ -172,7 +174,6 @@ def find_links(
     def overlap(first: int, second: int, turn: float) -> bool:
         return abs(turn) < 0.5 * (cameras[first].hfov + cameras[second].hfov)
 
-    steps = {pair: min(pair[1] - pair[0], count - pair[1] + pair[0]) for pair in sorted(pairs) if pair[0] != pair[1]}
     near = [link(pair, _MIN_MATCHES, _MIN_SHARE) for pair, step in steps.items() if step <= _NEAR_STEPS]
     links = [found for found in near if found is not None]
     placed = {member: headings for headings in grouped(count, links) for member in headings}
@@ -261,7 +262,9 @@ def usual_steps(count: int, links: Sequence[Link]) -> list[Step] | None:
 
     None if links do not tell that the photographs go once around in about equal steps.
     """
-    apart = np.array([_apart(link, count) for link in links])
+    apart = np.array([link.second - link.first for link in links])
+    # The shorter way around.
+    apart = np.where(2 * apart <= count, apart, apart - count)
     turn = np.array([link.turn for link in links])
     near = np.abs(apart) <= 2
     if near.sum() < _MIN_LINKS:
@@ -275,12 +278,6 @@ def usual_steps(count: int, links: Sequence[Link]) -> list[Step] | None:
     if abs(usual / whole - 1.0) > _MAX_OPEN:
         return None
     return [Step(whole, _STEP_SHARE * abs(whole))] * count
-
-
-def _apart(link: Link, count: int) -> int:
-    """Return the steps from the first photograph of a link to the second, the shorter way around."""
-    steps = link.second - link.first
-    return steps if 2 * steps <= count else steps - count
 
 
 def agreeing_links(links: Sequence[Link], count: int, steps: Sequence[Step]) -> list[Link]:
