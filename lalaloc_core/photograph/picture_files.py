@@ -61,13 +61,11 @@ class PhotographLimits:
     Attributes:
         max_scans: scans of a progressive JPEG; encoders write 3 to 12.
         min_height: pixels of the full sphere's height.
-        aspect_tolerance: relative deviation of a full sphere from twice as wide as high; stitchers round.
     """
 
     max_pixels: int = 100_000_000
     max_scans: int = 20
     min_height: int = 64
-    aspect_tolerance: float = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -32,8 +32,8 @@ Source = Literal["given", "gpano", "exif", "estimated", "assumed"]
 _WIDEST_LENS = math.radians(120.0)
 # Sides of photographs differ at most by this factor; longer ones are strips.
 _LONGEST = 2.25
-# Relative deviation of a sphere from twice as wide as high.
-_SPHERE_TOLERANCE = 0.01
+# Relative deviation of a sphere from twice as wide as high; stitchers round.
+SPHERE_TOLERANCE = 0.01
 # `is_sphere`: limits of the product of seam and poles, of the seam, of the more uniform pole, and of the contrast (grey
 # levels). Fitted on photographs and rendered spheres: all photographs pass, with a margin of two.
 _MAX_PRODUCT, _MAX_SEAM, _MAX_POLE, _MIN_CONTRAST = 0.2, 8.0, 0.5, 2.0
@@ -155,7 +155,7 @@ def is_closed(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
 
 def is_twice_as_wide(width: int, height: int) -> bool:
     """Return whether a picture has the sides of a full sphere."""
-    return abs(width / height - 2.0) <= 2.0 * _SPHERE_TOLERANCE
+    return abs(width / height - 2.0) <= 2.0 * SPHERE_TOLERANCE
 
 
 def _projection(

@@ -17,6 +17,7 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 from lalaloc_core.photograph.picture_files import NEUTRAL, PhotographLimits, PictureFile, opened_picture, scaled
+from lalaloc_core.photograph.projection import SPHERE_TOLERANCE, is_twice_as_wide
 
 # Oversampling of pictures that are placed or levelled, relative to the encoder's input.
 _FINER = 2
@@ -67,11 +68,11 @@ def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: Photograp
     full_height = height if sphere.part is None else round(height / sphere.part.height)
     if full_height < limits.min_height:
         raise InvalidPhotographError(f"the photograph is {full_height} pixels high; the minimum is {limits.min_height}")
-    if sphere.part is None and abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
+    if sphere.part is None and not is_twice_as_wide(width, height):
         fault = "" if sphere.fault is None else f"; its photo sphere metadata are invalid: {sphere.fault}"
         raise InvalidPhotographError(
             f"the photograph is {width} x {height}; a full 360° sphere is twice as wide as high, within "
-            f"{limits.aspect_tolerance:.0%}{fault}"
+            f"{SPHERE_TOLERANCE:.0%}{fault}"
         )
 
 
