@@ -136,9 +136,9 @@ def read_film(
         InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
     """
     stated, limits, size = stated or StatedCamera(), limits or FilmLimits(), patch_size or PatchSize()
-    stated.check()
     if stated.projection == "auto":
         stated = replace(stated, projection="perspective")
+    stated.check()
     if len(content) > limits.max_bytes:
         raise InvalidFilmError(
             f"the film has {len(content)} bytes; the limit is {limits.max_bytes} (LALALOC_MAX_FILM_BYTES)"

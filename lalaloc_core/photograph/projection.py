@@ -90,7 +90,6 @@ def find_lens(
     `looks_spherical` is `is_sphere` of the picture, called only if nothing else decides; `closes` is `is_closed` of it,
     called only for a strip whose metadata state 360°.
     """
-    stated.check()
     projection, source = _projection(width, height, stated, sphere, exif, looks_spherical)
     unknown = Lens(projection=projection, projection_source=source)
 
