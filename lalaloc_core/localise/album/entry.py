@@ -200,13 +200,9 @@ class _Header:
 
 
 def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None) -> AlbumPhotograph:
-    """Return the entry of a photograph that was encoded.
+    """Return the entry of a photograph with features (`PhotographEncoder.with_features`, or those that a client sent).
 
-    Args:
-        id: its name within the album.
-        photograph: the photograph with its features (`PhotographEncoder.with_features`, or features that a client
-            sent); its `overview` gives the descriptors.
-        taken: time and camera, if they are not those of the photograph.
+    Its `overview` gives the descriptors; `taken` replaces the time and camera that its file states.
     """
     assert photograph.features is not None
     outputs = dict(photograph.features.outputs)

@@ -81,12 +81,7 @@ class AlbumMemory:
 
 @dataclass(frozen=True, eq=False)
 class SearchedPlan:
-    """The plan of an album as photographs are compared with it.
-
-    Attributes:
-        poses: its poses.
-        reach_m: distance (m) from the camera within which the best pose is.
-    """
+    """The plan of an album as photographs are compared with it; the best pose is within `reach_m` of the camera."""
 
     plan: FloorPlan
     poses: PoseSet

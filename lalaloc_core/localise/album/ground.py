@@ -21,12 +21,7 @@ from lalaloc_core.localise.venue.merged_plans import MergedPlans
 
 @dataclass(frozen=True, eq=False)
 class AlbumGround:
-    """Places that the photographs of an album are compared with.
-
-    Attributes:
-        plan_ids: ids of the plans, as pins name them.
-        merged: the plans, side by side.
-    """
+    """Places that the photographs of an album are compared with: plans side by side, and the ids that pins name."""
 
     plan_ids: tuple[str, ...]
     merged: MergedPlans

@@ -59,7 +59,6 @@ class Pin:
     """The place of one photograph.
 
     Attributes:
-        photograph_id: the photograph.
         state: "sure": the room is probably right (`confidence` at least `solve.SURE`), and the album fits its plan;
             "uncertain": less so;
             "set_aside": of none of the rooms, or not usable, for `reason`; "corrected": a person stated it.
@@ -91,7 +90,6 @@ class SharedCamera:
 
     Attributes:
         make, model, width, height: as in its photographs; the width is the longer side, pixels.
-        photographs: number of its photographs.
         hfov: horizontal field of view, radians.
         hfov_sd: its standard deviation; 0 if every photograph states it.
     """

@@ -124,15 +124,10 @@ def turned_together(states: Sequence[States], turns: Mapping[tuple[int, int], fl
 def by_compass(
     states: Sequence[States], compass: Sequence[float | None], north: float | None
 ) -> tuple[list[States], float | None]:
-    """Return states with the evidence of compass headings, all of which have one unknown bias.
+    """Return states with the evidence of compass headings, and the azimuth of the compass's north in the plan.
 
-    Args:
-        states: those of every photograph.
-        compass: heading of each photograph clockwise from true north, radians; None without.
-        north: azimuth of true north in the plan, radians; None if unknown.
-
-    Returns:
-        The states, and the azimuth of the compass's north in the plan; None if too few photographs have a compass.
+    `compass` has the headings (radians) of the photographs clockwise from true north, all with one unknown bias, and
+    `north` is the azimuth of true north in the plan; None where unknown. The compass's is None if too few have one.
     """
     known = [number for number, heading in enumerate(compass) if heading is not None]
     if len(known) < (_MIN_COMPASSES if north is None else 1):

@@ -125,11 +125,6 @@ class FeatureEncoder:
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
-        """Load the networks, with `threads` intra-op threads each, 0 for one per core.
-
-        Raises:
-            BundleError: a file is missing or altered, or the model gives no features.
-        """
         if not gives_features(bundle.manifest):
             raise BundleError(
                 f"model '{bundle.manifest.name}' (architecture '{bundle.manifest.architecture}') gives no features; "

@@ -28,11 +28,6 @@ class LayoutEncoder:
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
-        """Create the onnxruntime session, with `threads` intra-op threads, 0 for one per core.
-
-        Raises:
-            BundleError: a file is missing or altered.
-        """
         self.manifest = bundle.manifest
         self.cohort = Cohort.of_bundle(bundle)
         self.helper: Callable[[], Executor | None] = lambda: None

@@ -36,13 +36,6 @@ class PhotographEncoder:
     """Networks of one bundle for photographs and for the layouts that they are compared with; safe to share."""
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
-        """Load the networks.
-
-        `threads` is the number of intra-op threads per session, 0 for one per core.
-
-        Raises:
-            BundleError: see `LayoutEncoder`, `SphereEncoder` and `ViewEncoder`.
-        """
         self.manifest = bundle.manifest
         self.layouts = LayoutEncoder(bundle, threads=threads)
         self.spheres = SphereEncoder(bundle, threads=threads)
@@ -63,15 +56,11 @@ class PhotographEncoder:
         heading_tolerance: float = 0.0,
         others: Sequence[tuple[Photograph, float]] = (),
     ) -> Query:
-        """Return the query of a photograph.
+        """Return the query of a photograph; see `SphereEncoder.query` for heading, camera height and tolerance.
 
-        Args:
-            photograph: decoded, its sphere or patches of the sizes of `sphere_size` and `patch_size`; or its features.
-            heading: azimuth of its centre (radians); None if unknown.
-            camera_height: as in `SphereEncoder.query`.
-            heading_tolerance: as in `SphereEncoder.query`.
-            others: further photographs from the same place, none of them a sphere, each with its heading minus that of
-                `photograph` (radians); all of them features if `photograph` is.
+        `photograph` is decoded, its sphere or patches of the sizes of `sphere_size` and `patch_size`, or its features.
+        `others` are further photographs from the same place, none of them a sphere, each with its heading minus that of
+        `photograph` (radians); all of them are features if `photograph` is.
 
         Raises:
             InvalidPhotographError: the photograph is no sphere, and the bundle has no encoder of views.

@@ -40,13 +40,7 @@ class SphereEncoder:
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0, outputs_only: bool = False) -> None:
-        """Create the onnxruntime sessions, with `threads` intra-op threads each, 0 for one per core.
-
-        With `outputs_only` there are no queries, and no other file of the bundle is read than the network.
-
-        Raises:
-            BundleError: a file is missing or altered, or the model has other opening classes or room types.
-        """
+        """Create the sessions; with `outputs_only` there are no queries, and no other file is read than the network."""
         self.helper: Callable[[], Executor | None] = lambda: None
         self._manifest = bundle.manifest
         image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self._manifest.files else None

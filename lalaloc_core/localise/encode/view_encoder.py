@@ -43,11 +43,6 @@ class ViewEncoder:
     """Encoder of views of one bundle, ready to run; safe to share between threads."""
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
-        """Create the onnxruntime session, with `threads` intra-op threads, 0 for one per core.
-
-        Raises:
-            BundleError: the bundle has no encoder of views, or its file is missing or altered.
-        """
         self._manifest = bundle.manifest
         if self._manifest.view is None:
             raise BundleError(f"model '{self._manifest.name}' has no encoder of views ({VIEW_ONNX}); it needs spheres")
@@ -144,11 +139,6 @@ class ObjectEncoder:
     """Classifier of objects of one bundle, ready to run; safe to share between threads."""
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
-        """Create the onnxruntime session, with `threads` intra-op threads, 0 for one per core.
-
-        Raises:
-            BundleError: the bundle has no classifier of objects, or its file is altered.
-        """
         self._session = open_session(bundle.read(OBJECTS_ONNX), threads)
 
     def outputs(self, photograph: Photograph) -> dict[str, Float[np.ndarray, "n"]]:
