@@ -82,7 +82,12 @@ def solve_album(
     if not photographs:
         return Album(pins=())
     ordered = sorted(photographs, key=lambda each: ((each.taken.at or datetime.max).replace(tzinfo=None), each.id))
-    _compare(ground, encoder, ordered, memory, progress, pause)
+    if new := [each for each in ordered if each.id not in memory.evidence]:
+        searched = SearchedPlan.of(ground.plan, ground.grid, encoder.manifest.profile_columns)
+        for each in new:
+            memory.evidence[each.id] = single_evidence(searched, encoder, each.photograph)
+            progress(len(memory.evidence))
+            pause()
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
@@ -164,24 +169,6 @@ def _check(ground: AlbumGround, photographs: Sequence[AlbumPhotograph]) -> None:
         )
     if len({photograph.id for photograph in photographs}) < len(photographs):
         raise InvalidInputError("two photographs of the album have the same id; every photograph is added once")
-
-
-def _compare(
-    ground: AlbumGround,
-    encoder: PhotographEncoder,
-    photographs: Sequence[AlbumPhotograph],
-    memory: AlbumMemory,
-    progress: Callable[[int], object],
-    pause: Callable[[], object],
-) -> None:
-    """Fill the memory with the evidence of photographs that it does not know."""
-    new = [each for each in photographs if each.id not in memory.evidence]
-    if new:
-        searched = SearchedPlan.of(ground.plan, ground.grid, encoder.manifest.profile_columns)
-        for each in new:
-            memory.evidence[each.id] = single_evidence(searched, encoder, each.photograph)
-            progress(len(memory.evidence))
-            pause()
 
 
 def _states(
