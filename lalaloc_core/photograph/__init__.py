@@ -6,8 +6,8 @@ photographs, `levelling.py` estimates tilt and field of view from straight lines
 models of `cameras.py`. `picture_files.py` opens files; `sphere_formats.py` tells pictures that hold a sphere otherwise
 than as they should.
 
-Photographs of one spot tell their angles to each other by `overlap.py` and `turn_angles.py`; `turned.py` says how to
-read them again. `film.py` chooses frames of a film of a turn, by the motion that `film_motion.py` follows.
+Photographs of one spot tell their angles to each other by `overlap.py` and `turn_angles.py`; `turned.py` cuts their
+patches by these. `film.py` chooses frames of a film of a turn, by the motion that `film_motion.py` follows.
 """
 
 from lalaloc_core.photograph.patches import Patch, PatchSize

@@ -350,18 +350,16 @@ def photograph_of_picture(
     """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
     segments = find_segments(picture)
-    warnings = lens.warnings
-    if lens.camera is None:
+    camera, focal_sd, attitude, warnings = lens.camera, lens.focal_sd, None, lens.warnings
+    if camera is None:
         estimated_hfov, focal_sd, attitude = estimate_calibration(segments, width=columns, height=rows)
-        camera: Camera = Perspective.of_hfov(*full_size, estimated_hfov)
-        lines = lines_of(segments, small := camera.scaled(columns, rows))
+        camera = Perspective.of_hfov(*full_size, estimated_hfov)
         if purpose != "turn":
             origin = "was estimated from straight lines" if len(segments) else "is only usual"
             warnings = (*warnings, field_warning(camera.hfov, _hfov_sd(camera, focal_sd), origin))
-    else:
-        camera, focal_sd = lens.camera, lens.focal_sd
-        lines = lines_of(segments, small := camera.scaled(columns, rows))
-        attitude = estimate_attitude(lines)
+    small = camera.scaled(columns, rows)
+    lines = lines_of(segments, small)
+    attitude = attitude or estimate_attitude(lines)
     warnings = (*warnings, *bend_warnings(segments, small))
     if stated.pitch_deg is None and stated.roll_deg is None and not isinstance(camera, Around):
         warnings = (*warnings, *side_warnings(lines, attitude))
