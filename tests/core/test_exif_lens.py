@@ -62,9 +62,7 @@ def test_sensor_by_resolution_or_model_replaces_the_equivalent() -> None:
     assert by_plane.focal == pytest.approx(by_model.focal, rel=1e-6)
     zoomed = read({Tag.FocalLength: 4.15, Tag.DigitalZoomRatio: 2.0}, model="iPhone 6")
     assert zoomed.focal == pytest.approx(2.0 * (by_model.focal or 0.0))
-
-
-def test_front_camera_has_another_sensor() -> None:
+    # The front camera has another sensor.
     assert read({Tag.FocalLength: 2.65}, model="iPhone 6").focal is None
 
 
@@ -112,9 +110,3 @@ def test_picture_cropped_later_has_no_focal_length() -> None:
     cropped = read(tags, size=(1800, 1512))
     assert cropped.focal is None
     assert "was cropped" in cropped.warnings[0]
-
-
-def test_sphere_mode_has_no_focal_length() -> None:
-    lens = read({Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26})
-    assert lens.strip
-    assert lens.focal is None

@@ -25,6 +25,8 @@ from tests.painted import png_chunk, png_file
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
 NEARLY = {"JPEG": {"quality": 95}, **LOSSLESS}
+# By Exif orientation, from 2 on.
+TURNS = ["FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE", "ROTATE_90", "TRANSVERSE", "ROTATE_270"]
 
 
 def picture(mode: str = "RGB", height: int = 128) -> Image.Image:
@@ -128,21 +130,9 @@ class TestAccepted:
         assert (pixels == pixels[..., :1]).all()
         assert pixels[24, 56].tolist() == [255, 255, 255]
 
-    @pytest.mark.parametrize(
-        ("orientation", "turned"),
-        [
-            (1, None),
-            (2, Image.Transpose.FLIP_LEFT_RIGHT),
-            (3, Image.Transpose.ROTATE_180),
-            (4, Image.Transpose.FLIP_TOP_BOTTOM),
-            (5, Image.Transpose.TRANSPOSE),
-            (6, Image.Transpose.ROTATE_90),
-            (7, Image.Transpose.TRANSVERSE),
-            (8, Image.Transpose.ROTATE_270),
-        ],
-    )
-    def test_exif_orientation_is_undone(self, orientation: int, turned: Image.Transpose | None) -> None:
-        stored = picture() if turned is None else picture().transpose(turned)
+    @pytest.mark.parametrize(("orientation", "turned"), [(1, None), *enumerate(TURNS, start=2)])
+    def test_exif_orientation_is_undone(self, orientation: int, turned: str | None) -> None:
+        stored = picture() if turned is None else picture().transpose(Image.Transpose[turned])
         exif = Image.Exif()
         exif[0x0112] = orientation
         np.testing.assert_array_equal(read(encoded(stored, exif=exif.tobytes())), read(encoded(picture())))
