@@ -154,10 +154,7 @@ def read_film(
     if not kept:
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
     if tracker.nodded > max(_MOST_NOD, _SIDEWAYS * tracker.turned):
-        raise InvalidFilmError(
-            f"the film lies on its side: in it the camera nods by {math.degrees(tracker.nodded):.0f}° and turns by "
-            f"{math.degrees(tracker.turned):.0f}°; rotate it by 90° in a viewer, save it and send that film"
-        )
+        raise InvalidFilmError(_on_side(tracker, "lies on its side"))
     photographs, angles = _turned(kept, samples.full_size, stated, size, tracker)
     joined = _likely(angles)
     first = angles[joined[0]].heading
@@ -184,7 +181,7 @@ def _turned(
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
     if lens.is_sphere:
         raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
-    photographs = [photograph_of_picture(sample.picture, full_size, lens, stated, size, "turn") for sample in kept]
+    photographs = [photograph_of_picture(sample.picture, full_size, lens, stated, size, "film") for sample in kept]
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
     numbers = [sample.number for sample in kept]
@@ -217,10 +214,19 @@ def _assumed(angles: Sequence[TurnAngles]) -> list[str]:
     ]
 
 
+def _on_side(tracker: FlowTracker, statement: str) -> str:
+    return (
+        f"the film {statement}: in it the camera nods by {math.degrees(tracker.nodded):.0f}° and turns by "
+        f"{math.degrees(tracker.turned):.0f}°; rotate it by 90° in a viewer, save it and send that film"
+    )
+
+
 def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
     warnings = []
     if (share := samples.bars_share) > 0.0:
         warnings.append(f"the film has black bars, {share:.0%} of its picture: they were cut off")
+    if tracker.nodded > max(_LEAST_TURN, _SIDEWAYS * tracker.turned):
+        warnings.append(_on_side(tracker, "may lie on its side"))
     if tracker.turned < _LEAST_TURN:
         warnings.append(
             f"the camera turns by {math.degrees(tracker.turned):.0f}° only: film one slow turn, once around on the spot"

@@ -41,10 +41,11 @@ from lalaloc_core.photograph.spheres import level_sphere
 from lalaloc_core.photograph.stated_camera import AUTO, Projection, StatedCamera
 from lalaloc_core.photograph.turn_angles import Overview
 
-# Use of a photograph: by itself, in an album, or in a turn, where `turned.py` finds its tilt and cuts its patches.
-Purpose = Literal["single", "album", "turn"]
+# Use of a photograph: by itself, in an album, or in a turn or a film of one, where `turned.py` finds its tilt and cuts
+# its patches.
+Purpose = Literal["single", "album", "turn", "film"]
 # Longer side (pixels) at which to find what other photographs show too: those of one spot differ little in scale.
-_OVERVIEW_SIDES = {"turn": 420, "album": 640}
+_OVERVIEW_SIDES = {"turn": 420, "film": 420, "album": 640}
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
@@ -349,19 +350,22 @@ def photograph_of_picture(
 ) -> Photograph:
     """Return the photograph of a decoded upright picture, whose full size (width, height) the lens is for."""
     rows, columns = picture.shape[:2]
+    is_of_turn = purpose in ("turn", "film")
     segments = find_segments(picture)
     camera, focal_sd, attitude, warnings = lens.camera, lens.focal_sd, None, lens.warnings
     if camera is None:
         estimated_hfov, focal_sd, attitude = estimate_calibration(segments, width=columns, height=rows)
         camera = Perspective.of_hfov(*full_size, estimated_hfov)
-        if purpose != "turn":
+        if not is_of_turn:
             origin = "was estimated from straight lines" if len(segments) else "is only usual"
             warnings = (*warnings, field_warning(camera.hfov, _hfov_sd(camera, focal_sd), origin))
     small = camera.scaled(columns, rows)
     lines = lines_of(segments, small)
     attitude = attitude or estimate_attitude(lines)
     warnings = (*warnings, *bend_warnings(segments, small))
-    if stated.pitch_deg is None and stated.roll_deg is None and not isinstance(camera, Around):
+    is_tilt_known = stated.pitch_deg is not None or stated.roll_deg is not None or isinstance(camera, Around)
+    # All frames of a film lie as it does, which its motion tells better.
+    if not is_tilt_known and purpose != "film":
         warnings = (*warnings, *side_warnings(lines, attitude))
     estimated = (
         Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
@@ -376,14 +380,14 @@ def photograph_of_picture(
     hfov = Assumed(value=camera.hfov, sd=_hfov_sd(camera, focal_sd), source=lens.hfov_source)
     walls = Assumed(value=attitude.yaw, sd=attitude.yaw_sd, source="estimated")
     # Strips are not turned by the tilt that others tell.
-    is_of_turn = purpose == "turn" and not isinstance(camera, Around)
+    is_levelled_later = is_of_turn and not isinstance(camera, Around)
     overlapping = None
     if purpose != "single":
         overlapping = Overview(
             find_features(picture, _OVERVIEW_SIDES[purpose]),
             segments / (columns, rows, columns, rows),
             attitude,
-            reduced(picture, small, size)[0] if is_of_turn else None,
+            reduced(picture, small, size)[0] if is_levelled_later else None,
         )
     return Photograph(
         projection=lens.projection,
@@ -393,7 +397,7 @@ def photograph_of_picture(
         roll=roll,
         azimuths=seen_azimuths(small, tilt, roll.value),
         wall_direction=walls if math.isfinite(walls.sd) else None,
-        patches=() if is_of_turn else cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
+        patches=() if is_levelled_later else cut_patches(picture, small, pitch=tilt, roll=roll.value, size=size),
         thumbnail=thumbnail_of(picture),
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),

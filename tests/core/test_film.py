@@ -147,10 +147,12 @@ def zoomed(index: int) -> np.ndarray:
     return cv2.resize(frame[top : top + height, left : left + width], frame.shape[1::-1])
 
 
-def test_camera_that_stands_still_or_walks_is_named(tmp_path: Path) -> None:
+def test_camera_that_stands_still_lies_on_its_side_or_walks_is_named(tmp_path: Path) -> None:
     still = read_film(encode([turn()[0]] * 20, tmp_path / "still.mp4"), stated=FIELD)
     assert len(still.photographs) == 1
     assert "the camera turns by 0° only" in still.warnings[0]
+    lying = read_film(encode([np.rot90(frame).copy() for frame in turn()[:16]], tmp_path / "side.mp4"), stated=FIELD)
+    assert "the film may lie on its side: in it the camera nods by" in lying.warnings[0]
     walk = read_film(encode([zoomed(index) for index in range(50)], tmp_path / "walk.mp4"), stated=FIELD)
     assert any("the camera walks" in warning for warning in walk.warnings)
 
