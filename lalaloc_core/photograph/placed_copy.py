@@ -7,6 +7,7 @@ file beside them, which photo managers read as well.
 from __future__ import annotations
 
 import math
+import struct
 import zlib
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
@@ -107,7 +108,11 @@ def _exif(exif: Image.Exif, place: Place) -> bytes | None:
     if place.direction_deg is not None:
         gps[names.GPSImgDirectionRef], gps[names.GPSImgDirection] = "T", round(place.direction_deg % 360.0, 2)
     exif[ExifTags.IFD.GPSInfo] = gps
-    found = exif.tobytes()
+    try:
+        found = exif.tobytes()
+    except (AttributeError, TypeError, ValueError, struct.error):
+        # Damaged tags can often be read, but not be written again.
+        return None
     # Larger ones do not fit into the segment of a JPEG.
     return found if len(found) <= _MAX_SEGMENT else None
 

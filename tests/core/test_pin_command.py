@@ -257,6 +257,15 @@ def test_copy_states_the_place_and_keeps_everything_else(kind: str) -> None:
     assert xmp["GPSLatitude"].endswith("S")
 
 
+def test_metadata_that_cannot_be_written_again_stay() -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "Model"
+    # A text that is said to be a fraction.
+    damaged = exif.tobytes().replace(b"\x01\x0f\0\2\0\0\0\6", b"\x01\x0f\0\5\0\0\0\1")
+    copy, sidecar = placed_copy(_picture("JPEG", exif=damaged), PLACE)
+    assert (damaged in copy, sidecar) == (True, None)
+
+
 @pytest.mark.parametrize("kind", ["WEBP", "HEIF"])
 def test_other_formats_get_a_file_beside_them(kind: str) -> None:
     content = (FOLDER / "phone.heic").read_bytes() if kind == "HEIF" else _picture(kind)
