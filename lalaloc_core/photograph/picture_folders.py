@@ -27,7 +27,7 @@ def turn_files(folder: Path) -> tuple[list[Path], list[str]]:
     times = {file: _taken_at(file) for file in used} if len(used) <= MAX_TURN_PHOTOGRAPHS else {}
     if times and None not in times.values() and len(set(times.values())) == len(used):
         used.sort(key=lambda file: times[file] or 0.0)
-    empty = [f"'{file.name}' is empty and was left out" for file in files if file not in used]
+    empty = [f"'{file.name}' is empty and was left out" for file in files if not file.stat().st_size]
     hidden = [file.name for file in folder.iterdir() if file.name.startswith(".") and file.suffix.lower() in PICTURES]
     return used, empty + ([f"{len(hidden)} hidden files, such as '{min(hidden)}', were left out"] if hidden else [])
 
