@@ -49,6 +49,8 @@ _OVERVIEW_SIDES = {"turn": 420, "film": 420, "album": 640}
 # Least longer side (pixels) of decoded photographs, for lines; JPEGs decode at an eighth of their size fastest.
 _LONG_SIDE = 480
 _JPEG_FACTORS = (8, 4, 2, 1)
+# Largest ratio of sides: at the size at which lines are found, flatter pictures have no row.
+_MAX_RATIO = 500
 # Ratios of sides of photographs, and their relative deviation.
 _USUAL_RATIOS, _USUAL_TOLERANCE = (4.0 / 3.0, 1.5, 16.0 / 9.0), 0.02
 # Standard deviation of a stated pitch or roll.
@@ -238,6 +240,10 @@ class _Opened:
         if min(width, height) < limits.min_height:
             raise InvalidPhotographError(
                 f"the photograph is {width} x {height}; the minimum is {limits.min_height} pixels on each side"
+            )
+        if max(width, height) > _MAX_RATIO * min(width, height):
+            raise InvalidPhotographError(
+                f"the photograph is {width} x {height}; one side can be {_MAX_RATIO} times as long as the other at most"
             )
         metadata = read_photo_sphere(file.packets, width=width, height=height)
         if stated.pitch_deg is not None:

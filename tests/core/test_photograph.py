@@ -112,6 +112,8 @@ class TestProjection:
             opened(jpeg(strip))
         with pytest.raises(InvalidPhotographError, match="which angle the strip of 1200 x 300 shows; send hfov_deg"):
             opened(jpeg(strip, {Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26}))
+        with pytest.raises(InvalidPhotographError, match="40000 x 64; one side can be 500 times as long as the other"):
+            opened(picture_file(np.zeros((64, 40_000, 3), np.uint8)), hfov_deg=360.0)
         view = opened(jpeg(strip), hfov_deg=240.0)
         assert (view.projection, view.projection_source) == ("cylindrical", "assumed")
         assert len(view.patches) > 1
