@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from xml.etree.ElementTree import ParseError
 
 from defusedxml.common import DefusedXmlException
@@ -53,11 +53,6 @@ class SpherePart:
     def azimuth(self) -> float:
         """Azimuth of the part's centre relative to that of the full sphere, radians clockwise."""
         return math.tau * (self.left + 0.5 * self.width - 0.5)
-
-    @property
-    def centred(self) -> SpherePart:
-        """The part in the middle of a sphere that is turned to its centre."""
-        return replace(self, left=0.5 - 0.5 * self.width)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ Three kinds of metadata are used: the EXIF orientation, the visible part of the 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -48,7 +49,8 @@ def level_sphere(
     height, width = size
     part, turn = sphere.part, 0.0 if sphere.part is None else sphere.part.azimuth
     if part is not None and sphere.level:
-        part, turn = part.centred, 0.0
+        # Moved to the middle, instead of turning the sphere.
+        part, turn = replace(part, left=0.5 - 0.5 * part.width), 0.0
     finer = 1 if part is None and sphere.level else _FINER
     canvas_size = (width * finer, height * finer)
     if part is None:
