@@ -105,11 +105,6 @@ class _Samples:
         rows, columns = self.inside or _WHOLE
         return len(range(self.stored_size[0])[columns]), len(range(self.stored_size[1])[rows])
 
-    @property
-    def bars_share(self) -> float:
-        """Share of frames that is bars."""
-        return 1.0 - math.prod(self.full_size) / max(math.prod(self.stored_size), 1)
-
     def add(self, sample: _Sample, step: float) -> None:
         """Keep a sample if it is the sharpest of its angle."""
         place = round(sample.heading / step)
@@ -223,8 +218,9 @@ def _on_side(tracker: FlowTracker, statement: str) -> str:
 
 def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
     warnings = []
-    if (share := samples.bars_share) > 0.0:
-        warnings.append(f"the film has black bars, {share:.0%} of its picture: they were cut off")
+    inside = math.prod(samples.full_size) / math.prod(samples.stored_size)
+    if inside < 1.0:
+        warnings.append(f"the film has black bars, {1.0 - inside:.0%} of its picture: they were cut off")
     if tracker.nodded > max(_LEAST_TURN, _SIDEWAYS * tracker.turned):
         warnings.append(_on_side(tracker, "may lie on its side"))
     if tracker.turned < _LEAST_TURN:

@@ -60,13 +60,9 @@ class ViewEncoder:
     ) -> Query:
         """Return the query of a photograph that shows a part of the horizon, by the outputs for its patches.
 
-        Args:
-            outputs: see `outputs`, for the given camera height.
-            placed: azimuth (radians) of each patch's centre relative to the photograph's, and standard deviation
-                (radians) of the error of levelling there; where patches overlap, the nearer centre counts.
-            heading: azimuth of the photograph's centre (radians); None if unknown, with one hypothesis per column.
-            camera_height: gives the picture its metric scale.
-            heading_tolerance: as in `SphereEncoder.query`.
+        `placed` has the azimuth (radians) of each patch's centre relative to the photograph's, and the standard
+        deviation (radians) of the error of levelling there; where patches overlap, the nearer centre counts. An unknown
+        heading has a hypothesis for each column; see `SphereEncoder.query` for the other arguments.
         """
         columns = self._manifest.profile_columns
         circle = self._on_circle(outputs, placed, camera_height.height_m)
