@@ -23,6 +23,7 @@ from tests.painted import picture_file as encoded
 from tests.painted import png_chunk, png_file
 
 HEIGHT, WIDTH = 32, 64
+NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8))
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
 NEARLY = {"JPEG": {"quality": 95}, **LOSSLESS}
 # By Exif orientation, from 2 on.
@@ -189,14 +190,13 @@ class TestScans:
     @pytest.mark.parametrize(("options", "scans"), [({}, 1), ({"progressive": True}, 10)])
     @pytest.mark.parametrize("restarts", [0, 1])
     def test_scans_match_the_encoder_script(self, options: dict[str, bool], scans: int, restarts: int) -> None:
-        noise = Image.fromarray(np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8))
-        content = encoded(noise, "JPEG", quality=95, restart_marker_rows=restarts, **options)
+        content = encoded(NOISE, "JPEG", quality=95, restart_marker_rows=restarts, **options)
         assert count_scans(content, 100) == scans
         assert count_scans(content, 4) == min(scans, 5)
         # Markers in metadata and after the end do not count.
         thumbnail = Image.Exif()
         thumbnail[0x010E] = "\xff\xda" * 50
-        assert count_scans(encoded(noise, "JPEG", exif=thumbnail, **options), 100) == scans
+        assert count_scans(encoded(NOISE, "JPEG", exif=thumbnail, **options), 100) == scans
         assert count_scans(content + content[2:], 100) == scans
 
     @pytest.mark.parametrize("added", [0, 1, 10])
@@ -231,10 +231,7 @@ class TestRefused:
             (b"", "empty; if it is still in a cloud"),
             (b"hello", "not a readable"),
             (b"\x89PNG\r\n\x1a\n", "not a readable|damaged"),
-            (
-                encoded(picture(), "GIF"),
-                "is a GIF picture, which is not supported; save or export it as JPEG, PNG or WEBP",
-            ),
+            (encoded(picture(), "GIF"), "is a GIF picture, which is not supported; save or export it as JPEG, PNG or"),
             (encoded(picture(), "BMP"), "is a BMP picture"),
             (encoded(picture(), "TIFF"), "is a TIFF picture"),
             (b"\0\0\0\x24ftypheic\0\0\0\0mif1heic", "is a HEIC picture"),
@@ -267,22 +264,19 @@ class TestRefused:
     @pytest.mark.parametrize("kind", NEARLY)
     @pytest.mark.parametrize("share", [0.02, 0.3, 0.35])
     def test_truncated_file_is_refused(self, kind: str, share: float) -> None:
-        noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8)
-        content = encoded(Image.fromarray(noise), kind, **NEARLY[kind])
+        content = encoded(NOISE, kind, **NEARLY[kind])
         with pytest.raises(InvalidPhotographError):
             read(content[: int(share * len(content))])
 
     @pytest.mark.parametrize("kind", ["PNG", "WEBP"])
     @pytest.mark.parametrize("share", [0.7, 0.95])
     def test_pixels_of_truncated_files_of_other_formats_are_not_used(self, kind: str, share: float) -> None:
-        noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8)
-        content = encoded(Image.fromarray(noise), kind, **NEARLY[kind])
+        content = encoded(NOISE, kind, **NEARLY[kind])
         with pytest.raises(InvalidPhotographError, match="that is damaged, or coded in a way"):
             read(content[: int(share * len(content))])
 
     def test_rows_before_the_end_of_a_truncated_jpeg_are_used(self) -> None:
-        noise = np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8)
-        content = encoded(Image.fromarray(noise), "JPEG", quality=95)
+        content = encoded(NOISE, "JPEG", quality=95)
         whole = read(content).astype(int)
         for cut in (content[:-1], content[:-2]):
             np.testing.assert_array_equal(read(cut), whole)
@@ -311,9 +305,7 @@ class TestRefused:
             b"VP8 ": bytes(3) + b"\x9d\x01\x2a" + side.to_bytes(2, "little") * 2,
         }
         content = b"RIFF" + struct.pack("<I", 100) + b"WEBP" + kind + struct.pack("<I", 88) + heads[kind] + bytes(78)
-        with pytest.raises(
-            InvalidPhotographError, match=r"16383 x 16383 = \d+ pixels; the limit is 1000 \(max_pixels\)"
-        ):
+        with pytest.raises(InvalidPhotographError, match=r"16383 x 16383 = \d+ pixels; the limit is 1000"):
             read(content, PhotographLimits(max_pixels=1000))
 
     def test_sideways_orientation_is_refused(self) -> None:
