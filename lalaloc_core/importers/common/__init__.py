@@ -4,3 +4,8 @@ Begin with `sketch.py`, which every importer fills in, then `assemble.py`, which
 `opening_placement.py` moves openings onto walls, `plausibility.py` finds likely mistakes, and `vocabulary.py` maps the
 names of layers and rooms to roles and types.
 """
+
+from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
+from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common.import_report import ReportBuilder

@@ -16,9 +16,8 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
+from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import check_network, check_overlaps, polygons_from_geometry, side_lengths
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
 from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.drawn_openings import cut_painted, drawn_panes

@@ -13,11 +13,9 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
+from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 

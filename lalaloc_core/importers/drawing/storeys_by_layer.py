@@ -12,10 +12,8 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan.room_types import keys_by_word, split_words
+from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
 from lalaloc_core.importers.drawing.storeys_beside import name_storeys

@@ -17,9 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.assemble import ImportedPlan
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
+from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions
 from lalaloc_core.importers.formats import dxf
 
 # Programs, in order of preference, with their arguments; {source} and {target} are folders.

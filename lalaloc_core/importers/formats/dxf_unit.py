@@ -11,10 +11,9 @@ from ezdxf.entities.dimension import Dimension as DimensionEntity
 from ezdxf.lldxf.const import DXFError
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import side_lengths
-from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.plausibility import UNIT_NAMES, unit_by_parts
 from lalaloc_core.importers.drawing.drawing_scale import Dimension, drawing_scale, scale_by_dimensions
 from lalaloc_core.importers.drawing.scale_guess import assume_scale

@@ -16,11 +16,9 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import check_coordinates, find_floor, join_faces, opening_line, report_floor
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import (
     ROOM_HEIGHT_M,
     Level,

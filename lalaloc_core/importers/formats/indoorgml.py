@@ -18,12 +18,11 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
+from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.geometry import Floor, check_coordinates, find_floor, opening_line, report_floor
-from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.opening_placement import WallLines
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, Level, Point, Sketch, SketchedOpening, SketchedRoom
 

@@ -15,11 +15,9 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number
-from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions
 from lalaloc_core.importers.common.bounded_files import read_xml
 from lalaloc_core.importers.common.geometry import check_network, polygons_from_geometry
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.tagged_features import Feature, import_features
 
 _Position = tuple[float, float]

@@ -12,10 +12,7 @@ from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import Tones
-from lalaloc_core.importers.common.assemble import ImportedPlan
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
 from lalaloc_core.importers.drawing.drawing_scale import (
     check_scale,
     drawing_scale,

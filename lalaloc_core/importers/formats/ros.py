@@ -18,12 +18,11 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.importers.common import ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.bounded_files import pack
 from lalaloc_core.importers.common.geometry import MapFrame
 from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget
-from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 
 if TYPE_CHECKING:
     from lalaloc_core.importers.picture.occupancy import OccupancyGrid

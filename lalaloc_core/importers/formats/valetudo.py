@@ -17,11 +17,9 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number, read_json
+from lalaloc_core.importers.common import Budget, ImportLimits, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.geometry import check_coordinates, check_overlaps, point_xy, polygons_from_geometry
-from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
-from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 
 _CELL_CM = (1.0, 20.0)

@@ -19,8 +19,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.drawing.enclosed_rooms import without_overlaps
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
 from lalaloc_core.importers.picture.ink import Ink, read_ink

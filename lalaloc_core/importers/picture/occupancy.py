@@ -11,9 +11,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, UInt8
 
+from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_from_geometry
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import explained_size
 from lalaloc_core.importers.picture.ink import find_skew, rotate_picture

@@ -12,9 +12,8 @@ import shapely
 from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
-from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.room_bounds import WallConfig
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
