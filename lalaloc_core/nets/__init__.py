@@ -6,10 +6,11 @@ around the horizon. `ring_image_encoder.py` is an image encoder without a trunk,
 the paper. `loading.py` rebuilds networks from a bundle. The exported networks run in `localise/encode/`, without torch.
 """
 
-from lalaloc_core.nets.layout_network import LayoutDecoder
+from lalaloc_core.nets.layout_network import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder, RingConfig, RingLayoutEncoder
 from lalaloc_core.nets.loading import LayoutNetwork, load_decoder, load_layout_encoder
-from lalaloc_core.nets.paper_encoders import PaperImageEncoder
+from lalaloc_core.nets.paper_encoders import PaperConfig, PaperImageEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
+from lalaloc_core.nets.sphere_network import TrunkEncoderConfig, TrunkImageEncoder
+from lalaloc_core.nets.view_network import ViewEncoderConfig, ViewNetwork
 
 ImageEncoder = RingImageEncoder | TrunkImageEncoder | PaperImageEncoder

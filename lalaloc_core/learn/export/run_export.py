@@ -27,8 +27,7 @@ from lalaloc_core.learn.training.warm_start import (
     trained_layout_encoder,
     training_totals,
 )
-from lalaloc_core.nets import ImageEncoder, load_layout_encoder
-from lalaloc_core.nets.view_network import ViewNetwork
+from lalaloc_core.nets import ImageEncoder, ViewNetwork, load_layout_encoder
 
 
 def export_run(

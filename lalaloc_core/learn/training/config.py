@@ -8,10 +8,7 @@ from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.nets.layout_network import DECODED_WIDTH, RingConfig
-from lalaloc_core.nets.paper_encoders import PaperConfig
-from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
-from lalaloc_core.nets.view_network import ViewEncoderConfig
+from lalaloc_core.nets import DECODED_WIDTH, PaperConfig, RingConfig, TrunkEncoderConfig, ViewEncoderConfig
 from lalaloc_core.render.sampling import TripletSampling
 
 Architecture = Literal["ring", "trunk", "paper"]

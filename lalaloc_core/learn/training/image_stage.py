@@ -26,10 +26,8 @@ from lalaloc_core.learn.training.stages import (
     sphere_batches,
     structure_losses,
 )
-from lalaloc_core.nets import LayoutNetwork
+from lalaloc_core.nets import LayoutNetwork, RingLayoutEncoder, TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, first_rows
-from lalaloc_core.nets.layout_network import RingLayoutEncoder
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 
 # Part of the horizon, in turns, that is seen in pictures with hidden sectors.
 _SEEN_TURNS = (0.15, 0.6)

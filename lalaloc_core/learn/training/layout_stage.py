@@ -22,8 +22,7 @@ from lalaloc_core.learn.training.stages import (
     build_layout_encoder,
     sphere_batches,
 )
-from lalaloc_core.nets import LayoutNetwork
-from lalaloc_core.nets.layout_network import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
+from lalaloc_core.nets import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder, LayoutNetwork
 from lalaloc_core.render.profile import back_project, layout_depth
 
 

@@ -26,10 +26,8 @@ from lalaloc_core.learn.training.warm_start import (
     load_warm_start,
     trained_layout_encoder,
 )
-from lalaloc_core.nets import LayoutNetwork
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
+from lalaloc_core.nets import LayoutNetwork, TrunkImageEncoder, ViewNetwork
 from lalaloc_core.nets.trunk import load_pretrained
-from lalaloc_core.nets.view_network import ViewNetwork
 
 StageName = Literal["layout", "image", "view", "end-to-end"]
 # Added to the seed of a run, so that its stages begin with different weights.

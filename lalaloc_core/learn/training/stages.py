@@ -17,11 +17,9 @@ from lalaloc_core.learn.training.batches import Batch, Photographs, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
-from lalaloc_core.nets import ImageEncoder, LayoutNetwork
+from lalaloc_core.nets import ImageEncoder, LayoutDecoder, LayoutNetwork, RingImageEncoder, RingLayoutEncoder
 from lalaloc_core.nets.image_features import StructureFeatures, WallModes
-from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
-from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import HorizonEncoder, TrunkImageEncoder
 from lalaloc_core.nets.trunk import StyleMixing, Trunk
 

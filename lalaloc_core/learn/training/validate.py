@@ -26,9 +26,8 @@ from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import seen_openings
 from lalaloc_core.learn.training.batches import Rotation, sample_rotation
 from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.nets import PaperImageEncoder, TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures
-from lalaloc_core.nets.paper_encoders import PaperImageEncoder
-from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 from lalaloc_core.render.sweep import profiles_at
 

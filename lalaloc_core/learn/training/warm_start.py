@@ -27,9 +27,7 @@ from lalaloc_core.errors import BundleError, CheckpointError
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.stages import build_layout_encoder
-from lalaloc_core.nets import LayoutNetwork
-from lalaloc_core.nets.layout_network import LayoutDecoder
-from lalaloc_core.nets.sphere_network import TrunkEncoderConfig
+from lalaloc_core.nets import LayoutDecoder, LayoutNetwork, TrunkEncoderConfig
 
 JOINT = "end-to-end"
 _MODULES = {

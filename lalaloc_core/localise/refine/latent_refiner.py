@@ -14,8 +14,7 @@ from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.localise.refine.descent_methods import descend, refine_walls
 from lalaloc_core.localise.refine.refinement_problem import LpoConfig, Norm, Problem, RefinementJob, RefinementResult
-from lalaloc_core.nets import LayoutNetwork, load_layout_encoder
-from lalaloc_core.nets.layout_network import RingLayoutEncoder
+from lalaloc_core.nets import LayoutNetwork, RingLayoutEncoder, load_layout_encoder
 from lalaloc_core.render.profile import ProfileJacobian, wall_profile
 
 # Function of wall profiles (k, columns), camera and ceiling heights (k,), compared with the targets (k, d).
