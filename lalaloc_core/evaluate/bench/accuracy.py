@@ -20,10 +20,8 @@ from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.evaluate.runs.score import StageScores, score
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Camera, Dataset, Scene
-from lalaloc_core.learn.data.folder import HeldoutScenes
+from lalaloc_core.learn.data import Camera, Dataset, HeldoutScenes, Scene, Stated, cut_view, encode_jpeg
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.views import Stated, cut_view, encode_jpeg
 from lalaloc_core.learn.dataset_names import HELDOUT_HOMES
 from lalaloc_core.learn.metrics import AzimuthMeasures, confusion_shares, measure_azimuths, summarise_azimuths
 from lalaloc_core.localise.belief import CONFIDENT

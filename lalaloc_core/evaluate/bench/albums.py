@@ -16,13 +16,10 @@ from lalaloc_core.evaluate.bench.measured import Found, Setting, best_pose, summ
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.albums import AlbumCase, album_entry
 from lalaloc_core.evaluate.runs.score import expected_calibration_error
-from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
-from lalaloc_core.learn.data.dataset import Split
+from lalaloc_core.learn.data import CAMERA_HEIGHT_M, AnnotatedPhotograph, AnnotatedPhotographs, Split, encode_jpeg
 from lalaloc_core.learn.data.drawn_rooms import plan_of_rooms
 from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated
 from lalaloc_core.learn.data.synthetic.albums import taken_album, two_views
-from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.evidence import AlbumMemory

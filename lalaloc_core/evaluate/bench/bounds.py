@@ -20,10 +20,8 @@ from lalaloc_core.evaluate.calibrate.measured_errors import photograph_of
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, layouts_of_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.dataset import Scene
+from lalaloc_core.learn.data import AnnotatedPhotographs, Scene, ViewScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.views import ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
 from lalaloc_core.localise.encode.photograph_encoder import patch_size
 from lalaloc_core.localise.local_model import LocalModel

@@ -22,11 +22,9 @@ from lalaloc_core.evaluate.calibrate.measured_errors import Spot
 from lalaloc_core.evaluate.runs.albums import RoomAlbum, RoomKey, album_entry
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.folder import HeldoutScenes
+from lalaloc_core.learn.data import AnnotatedPhotographs, HeldoutScenes, ViewScenes, encode_jpeg
 from lalaloc_core.learn.data.posed_spheres import VIEWS_FILE, PosedSpheres
 from lalaloc_core.learn.data.synthetic.albums import two_views
-from lalaloc_core.learn.data.views import ViewScenes, encode_jpeg
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.evidence import AlbumMemory
 from lalaloc_core.localise.album.ground import AlbumGround

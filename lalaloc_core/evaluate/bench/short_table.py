@@ -14,8 +14,7 @@ from pathlib import Path
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.evaluate.runs.photograph_reading import read_photographs, read_views
-from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.annotations import AnnotatedPhotograph
+from lalaloc_core.learn.data import AnnotatedPhotograph, AnnotatedPhotographs
 from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated
 from lalaloc_core.learn.export.run_export import export_into
 from lalaloc_core.learn.metrics import AzimuthSummary, summarise_azimuths

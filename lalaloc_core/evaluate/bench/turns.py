@@ -19,8 +19,7 @@ from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, score_galleries
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data import CAMERA_HEIGHT_M, AnnotatedPhotograph, AnnotatedPhotographs, encode_jpeg
 from lalaloc_core.learn.data.dataset import Camera, DatasetPhotograph, Scene
 from lalaloc_core.learn.data.synthetic.turned import (
     Frame,
@@ -32,7 +31,6 @@ from lalaloc_core.learn.data.synthetic.turned import (
     photographs_of_turn,
     turn_by_hand,
 )
-from lalaloc_core.learn.data.views import encode_jpeg
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.localise.answers.documents import Ground
 from lalaloc_core.localise.answers.turns import Turn

@@ -22,9 +22,8 @@ from lalaloc_core.conditions import CONDITIONS
 from lalaloc_core.conventions import OPENING_CLASSES, wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Camera, Split
+from lalaloc_core.learn.data import Camera, Split, ViewPhotograph, ViewScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.views import ViewPhotograph, ViewScenes
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.local_model import GRID_STEP_M, LocalModel

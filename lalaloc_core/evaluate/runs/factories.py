@@ -17,13 +17,10 @@ from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight, local_r
 from lalaloc_core.evaluate.methods.method import Method
 from lalaloc_core.evaluate.methods.similarity import LayoutMetric, PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.runs.predictions import RunInfo
-from lalaloc_core.learn.data.dataset import Appearance, Dataset
-from lalaloc_core.learn.data.dataset_detection import open_dataset
-from lalaloc_core.learn.data.folder import HeldoutScenes
+from lalaloc_core.learn.data import Appearance, Dataset, HeldoutScenes, ViewScenes, open_dataset
 from lalaloc_core.learn.data.synthetic.altered_photographs import DisturbedScenes, MismatchedScenes
 from lalaloc_core.learn.data.synthetic.altered_plans import CopiedScenes, ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.views import ViewScenes
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.query import DEFAULT_STD_M

@@ -11,9 +11,8 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading_errors_deg, position_errors_m
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data import CAMERA_HEIGHT_M, AnnotatedPhotograph, HeldoutScenes
 from lalaloc_core.learn.data.annotated import GalleryKey
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
-from lalaloc_core.learn.data.folder import HeldoutScenes
 from lalaloc_core.learn.data.synthetic.altered_plans import office_plan, without_openings
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight

@@ -11,9 +11,8 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data import CAMERA_HEIGHT_M, AnnotatedPhotograph, CachedSphere, ViewPhotograph
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom
-from lalaloc_core.learn.data.views import CachedSphere, ViewPhotograph
 from lalaloc_core.learn.metrics import AzimuthMeasures, AzimuthSummary, measure_azimuths, summarise_azimuths
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.query import CameraHeight, Query

@@ -6,4 +6,9 @@ opens its reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own data, 
 data sets are in `synthetic/`.
 """
 
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
+from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, Split
 from lalaloc_core.learn.data.dataset_detection import open_dataset
+from lalaloc_core.learn.data.folder import HeldoutScenes
+from lalaloc_core.learn.data.views import CachedSphere, Stated, ViewPhotograph, ViewScenes, cut_view, encode_jpeg
