@@ -43,18 +43,6 @@ _SEAM_M = 1e-4
 _UNEVEN_M, _MIN_HIGHER = 0.1, 0.02
 
 
-def _check_outline(shape: BaseGeometry) -> None:
-    """Check the crossings of an outline that is about to be repaired."""
-    segments = _segments([shape])
-    limit = min(_PER_OUTLINE + len(segments), _MAX_PER_OUTLINE)
-    if _has_more_crossings(segments, limit):
-        x, y = segments[0][:2]
-        raise InvalidFloorPlanError(
-            f"an outline of {len(segments)} points that begins at ({x:.6g}, {y:.6g}) crosses itself more than {limit} "
-            "times, the limit for as many points; draw the outline once around its area"
-        )
-
-
 def check_network(lines: Sequence[BaseGeometry]) -> None:
     """Check the crossings of lines that are about to be joined."""
     segments = _segments(lines)
@@ -164,7 +152,14 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     valid = geometry
     if not geometry.is_valid:
         check_coordinates(shapely.get_coordinates(geometry), "an outline")
-        _check_outline(geometry)
+        segments = _segments([geometry])
+        limit = min(_PER_OUTLINE + len(segments), _MAX_PER_OUTLINE)
+        if _has_more_crossings(segments, limit):
+            x, y = segments[0][:2]
+            raise InvalidFloorPlanError(
+                f"an outline of {len(segments)} points that begins at ({x:.6g}, {y:.6g}) crosses itself more than "
+                f"{limit} times, the limit for as many points; draw the outline once around its area"
+            )
         valid = shapely.make_valid(geometry)
     parts: Iterable[BaseGeometry] = shapely.get_parts(valid)
     found: list[shapely.Polygon] = []

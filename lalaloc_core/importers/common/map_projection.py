@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -42,7 +42,8 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
     low, high = points.min(axis=0), points.max(axis=0)
     if options.units is not None:
         factor = METRES_PER_UNIT[options.units]
-        return Projection(_scaling(factor, options), None, factor, "option units")
+        factors = np.array([factor, -factor if options.y_axis == "down" else factor])
+        return Projection(lambda shape: shapely.transform(shape, lambda xy: factors * xy), None, factor, "option units")
 
     def convert(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         converted = points if crs is None else to_wgs84(crs, points)
@@ -121,8 +122,3 @@ def _middle(lon_lat: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
     directions = [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
     x, y, z = (float(direction.mean()) for direction in directions)
     return math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
-
-
-def _scaling(factor: float, options: ImportOptions) -> Any:
-    y_factor = -factor if options.y_axis == "down" else factor
-    return lambda shape: shapely.transform(shape, lambda points: points * np.array([factor, y_factor]))

@@ -71,7 +71,8 @@ def drawn_panes(
         area = _box(ends[index], ends[beside])
         if area is not None and _is_in_wall(area, walls):
             is_used[beside] = True
-            found.append((area, _middle(area)))
+            a, b, c, d = np.asarray(area.exterior.coords)[:4]
+            found.append((area, shapely.LineString([0.5 * (a + d), 0.5 * (b + c)])))
     return found
 
 
@@ -97,11 +98,6 @@ def _box(line: Float[np.ndarray, "2 2"], lines: Float[np.ndarray, "n 2 2"]) -> s
         return None
     low, high = offsets.min() * across, offsets.max() * across
     return shapely.Polygon([a + low, b + low, b + high, a + high])
-
-
-def _middle(area: shapely.Polygon) -> shapely.LineString:
-    a, b, c, d = np.asarray(area.exterior.coords)[:4]
-    return shapely.LineString([0.5 * (a + d), 0.5 * (b + c)])
 
 
 def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:

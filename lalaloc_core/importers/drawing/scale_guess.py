@@ -140,7 +140,11 @@ def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, bud
         if guess is None or abs(math.log(guess.metres_per_unit / scale)) <= _CONVERGED or budget.elapsed_s > end_s:
             break
         scale = guess.metres_per_unit
-    return guess if guess is not None and _is_certain(guess) else None
+    if guess is None:
+        return None
+    # Walls alone have many thicknesses.
+    parts = sum(clue.count for clue in guess.clues if clue.is_used and clue.kind != "wall")
+    return guess if guess.std <= _MAX_STD and parts >= _MIN_PARTS else None
 
 
 def combine(measures: Measures, around: float) -> ScaleGuess | None:
@@ -186,12 +190,6 @@ def measures_of(
 def first_scale(extent: float, leaves: Sequence[float] = ()) -> float:
     """Return a scale to begin with, by the median of arcs that can be leaves of doors, else by the extent."""
     return _USUAL_LEAF_M / float(np.median(leaves)) if len(leaves) else 1.2 * _EXTENT[0] / extent
-
-
-def _is_certain(guess: ScaleGuess) -> bool:
-    """Return whether enough parts agree; walls alone have many thicknesses."""
-    parts = sum(clue.count for clue in guess.clues if clue.is_used and clue.kind != "wall")
-    return guess.std <= _MAX_STD and parts >= _MIN_PARTS
 
 
 def _agreeing(measures: Measures, scale: float) -> dict[str, int]:

@@ -110,7 +110,13 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
                 f"the areas and pictures of the page cover it more than {_MAX_PAINTED} times, the limit; remove areas "
                 "that lie over one another"
             )
-    found.drawing.letterings = _letterings(page)
+    text = page.get_textpage()
+    for index in range(min(text.count_rects(), _MAX_TEXTS)):
+        left, bottom, right, top = text.get_rect(index)
+        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_MAX_LENGTH]
+        if words:
+            found.drawing.letterings.append(Lettering(words, (0.5 * (left + right), 0.5 * (bottom + top))))
+    text.close()
     return found
 
 
@@ -237,15 +243,3 @@ def _fill(item: Any) -> tuple[float, float, float, float] | None:
     if not is_opaque:
         return None
     return float(red.value), float(green.value), float(blue.value), float(alpha.value)
-
-
-def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:
-    text = page.get_textpage()
-    found = []
-    for index in range(min(text.count_rects(), _MAX_TEXTS)):
-        left, bottom, right, top = text.get_rect(index)
-        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_MAX_LENGTH]
-        if words:
-            found.append(Lettering(words, (0.5 * (left + right), 0.5 * (bottom + top))))
-    text.close()
-    return found

@@ -98,9 +98,14 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
     pictures = sum(local_name(element) == "image" for element in root.iter())
-    _drop_ignored(root)
+    for parent in root.iter():
+        parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
     check_work(root, budget)
-    _name_by_titles(root)
+    # The title of a shape is its name, unless it has one; the title of the drawing names nothing.
+    for element in root.iter():
+        title = next((child.text for child in element if local_name(child) == "title"), None)
+        if element is not root and title and title.strip():
+            element.attrib.setdefault("data-name", title.strip())
     with _naming_pictures(pictures):
         return _read_plan(root, pictures, options, budget)
 
@@ -180,19 +185,6 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
         attributes = {"class": opening["kind"].capitalize(), "fill": "none", "points": points(opening["line"])}
         ElementTree.SubElement(root, "polyline", attributes)
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-
-
-def _drop_ignored(root: Element) -> None:
-    for parent in root.iter():
-        parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
-
-
-def _name_by_titles(root: Element) -> None:
-    """Set the title of a shape as its name, unless it has one; the title of the drawing names nothing."""
-    for element in root.iter():
-        title = next((child.text for child in element if local_name(child) == "title"), None)
-        if element is not root and title and title.strip():
-            element.attrib.setdefault("data-name", title.strip())
 
 
 def _size_on_paper(root: Element) -> float | None:

@@ -109,9 +109,12 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
     walls = shapely.union_all(bodies)
     drawn: list[tuple[shapely.Polygon, str | None]] = []
     for room in storey.rooms:
-        outline = _points(room, budget)
+        corners = [(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"]
+        budget.spend(len(corners))
+        outline = _CM * np.array(corners, dtype=float).reshape(-1, 2)
         name = str(room.get("name") or "") or None
-        parts = polygons_from_geometry(shapely.Polygon(outline)) if len(outline) >= 3 else []
+        has_area = len(outline) >= 3 and np.isfinite(outline).all()
+        parts = polygons_from_geometry(shapely.Polygon(outline)) if has_area else []
         builder.use("room", "rooms" if parts else "ignored (no area)")
         drawn += [(part, name) for part in parts]
     height_m = storey.height_m if ROOM_HEIGHT_M[0] <= storey.height_m <= ROOM_HEIGHT_M[1] else None
@@ -201,13 +204,6 @@ def _box(piece: Element) -> shapely.Polygon | None:
     across = 0.5 * depth_m * np.array([-math.sin(angle), math.cos(angle)])
     corners = [centre - along - across, centre + along - across, centre + along + across, centre - along + across]
     return shapely.Polygon(corners)
-
-
-def _points(room: Element, budget: Budget) -> Float[np.ndarray, "n 2"]:
-    points = [(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"]
-    budget.spend(len(points))
-    found = _CM * np.array(points, dtype=float).reshape(-1, 2)
-    return found if np.isfinite(found).all() else found[:0]
 
 
 def _number(element: Element, key: str, default: float = math.nan) -> float:
