@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Question, plan_key
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, Question
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.search.pipeline import StageClock
 
@@ -70,7 +70,7 @@ class Icp:
         self.config = IcpConfig()
         self._trees: LRUCache[Any, KDTree] = LRUCache(GRIDS_CACHED)
 
-    @cachedmethod(attrgetter("_trees"), key=plan_key)
+    @cachedmethod(attrgetter("_trees"), key=lambda _, question: question.plan)
     def _tree(self, question: Question) -> KDTree:
         return KDTree(wall_cloud(question.plan, self.config))
 

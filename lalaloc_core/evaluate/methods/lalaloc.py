@@ -10,11 +10,10 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-import torch
 from cachetools import LRUCache, cachedmethod
 from jaxtyping import UInt8
 
-from lalaloc_core.bundle import Bundle, MatchingWeights
+from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Pose, PredictedCandidate, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
@@ -23,8 +22,6 @@ from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder, patch_size
 from lalaloc_core.localise.match import Layouts, MatchingConfig, MatchingCost, PoseGrid, layouts_at
 from lalaloc_core.localise.query import DEFAULT_STD_M, CameraHeight, Candidate, PredictedProfile, Query
-from lalaloc_core.localise.refine import LpoConfig
-from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine, Refiner, StageClock, localise
 from lalaloc_core.render.sampling import PoseSet
 
@@ -132,12 +129,6 @@ class LaLaLoc:
         height_m, poses = self._stated.of(question).height_m, question.grid
         latents, profile_m = self.encoders.layouts.poses(question.plan, poses, np.zeros(len(poses)), height_m)
         return PoseGrid(poses, latents, profile_m, question.grid_step_m, height_m)
-
-
-def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
-    """Return LPO in this process. Sets torch to one thread, because its tensors are too small to share."""
-    torch.set_num_threads(1)
-    return PoseRefiner.from_bundle(bundle, config).refine
 
 
 def read_image(encoders: PhotographEncoder, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:

@@ -146,8 +146,3 @@ GRIDS_CACHED = 4
 def grid_key(_: object, question: Question) -> tuple[FloorPlan, float, float]:
     """Return the cache key of a grid. Plans compare by identity; the key keeps them alive."""
     return question.plan, question.camera.camera_height_m, question.grid_step_m
-
-
-def plan_key(_: object, question: Question) -> FloorPlan:
-    """Return the cache key of a plan."""
-    return question.plan

@@ -13,7 +13,7 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.explicit import ExplicitLayout, VdrDecode
 from lalaloc_core.evaluate.methods.icp import Icp
-from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight, local_refiner
+from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight
 from lalaloc_core.evaluate.methods.method import Method
 from lalaloc_core.evaluate.methods.similarity import LayoutMetric, PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.runs.predictions import RunInfo
@@ -25,6 +25,7 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.query import DEFAULT_STD_M
 from lalaloc_core.localise.refine import LpoConfig
+from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import LocaliseConfig, Refine
 from lalaloc_core.nets import load_decoder
 
@@ -131,7 +132,7 @@ def build_method(info: RunInfo) -> Method:
 def _lalaloc(bundle: Bundle, encoders: PhotographEncoder, settings: LaLaLocSettings) -> LaLaLoc:
     refiner = None
     if settings.refine == "lpo":
-        refiner = local_refiner(bundle, LpoConfig(method=settings.optimiser))
+        refiner = PoseRefiner.from_bundle(bundle, LpoConfig(method=settings.optimiser)).refine
     config = LocaliseConfig(
         vdr_samples=settings.vdr_samples,
         vdr_candidates=settings.vdr_candidates,

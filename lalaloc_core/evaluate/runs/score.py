@@ -326,15 +326,8 @@ def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Predicti
     return [predictions[index] for index in order[:count]]
 
 
-def symmetric_positions(room: shapely.Polygon, x_m: float, y_m: float) -> list[tuple[float, float]]:
-    """Return a position mirrored along either axis of its room's bounding box, and turned by 180°."""
-    left, bottom, right, top = room.bounds
-    across, along = left + right - x_m, bottom + top - y_m
-    return [(across, y_m), (x_m, along), (across, along)]
-
-
 def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
-    """Return whether a misaligned pose in the right room fits the mirrored room, near one of `symmetric_positions`."""
+    """Return whether a misaligned pose in the right room fits the mirrored room, see `_symmetric_area`."""
     pose = prediction.final_pose
     if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
         return False
@@ -350,8 +343,11 @@ def symmetric_by_chance(plan: FloorPlan, prediction: Prediction) -> float:
 
 
 def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry:
+    """Return the surroundings of the true position mirrored along either axis of its room's box, and turned by 180°."""
     truth = prediction.truth
-    places = symmetric_positions(plan.rooms[truth.room_index].shape, truth.x_m, truth.y_m)
+    left, bottom, right, top = plan.rooms[truth.room_index].shape.bounds
+    across, along = left + right - truth.x_m, bottom + top - truth.y_m
+    places = [(across, truth.y_m), (truth.x_m, along), (across, along)]
     return shapely.union_all(shapely.points(places)).buffer(ALIGNMENT_LIMIT_M)
 
 

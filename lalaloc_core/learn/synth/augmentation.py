@@ -215,8 +215,14 @@ def stretched_images(images: UInt8[Tensor, "n h w 3"], factors: Float[Tensor, "n
     height, width = images.shape[1:3]
     column, reach = _seen_at(width, factors)
     tangent = torch.tan((0.5 - (torch.arange(height) + 0.5) / height) * math.pi)
-    elevation = torch.atan(tangent[:, None] / reach[:, None, :])
-    return _sampled(images, (0.5 - elevation / math.pi) * height - 0.5, column)
+    row = (0.5 - torch.atan(tangent[:, None] / reach[:, None, :]) / math.pi) * height - 0.5
+    around = torch.cat([images[:, :, -1:], images, images[:, :, :1]], dim=2).permute(0, 3, 1, 2).float()
+    # The first column of `around` is the last of the picture, and -1 to 1 reach from the edges of its edge pixels.
+    x = (2.0 * (column % width) + 3.0) / (width + 2) - 1.0
+    y = (2.0 * row + 1.0) / height - 1.0
+    grid = torch.stack([x[:, None, :].expand_as(y), y], dim=3)
+    seen = functional.grid_sample(around, grid, padding_mode="border", align_corners=False)
+    return seen.permute(0, 2, 3, 1).round().to(torch.uint8)
 
 
 def _seen_at(width: int, factors: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n w"], Float[Tensor, "n w"]]:
@@ -227,16 +233,3 @@ def _seen_at(width: int, factors: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "
     azimuth = ((torch.arange(width) + 0.5) / width - 0.5) * TWO_PI
     across, along = torch.sin(azimuth) / factors[:, :1], torch.cos(azimuth) / factors[:, 1:]
     return (torch.atan2(across, along) / TWO_PI + 0.5) * width - 0.5, torch.hypot(across, along)
-
-
-def _sampled(
-    images: UInt8[Tensor, "n h w 3"], row: Float[Tensor, "n h w"], column: Float[Tensor, "n w"]
-) -> UInt8[Tensor, "n h w 3"]:
-    height, width = images.shape[1:3]
-    around = torch.cat([images[:, :, -1:], images, images[:, :, :1]], dim=2).permute(0, 3, 1, 2).float()
-    # The first column of `around` is the last of the picture, and -1 to 1 reach from the edges of its edge pixels.
-    x = (2.0 * (column % width) + 3.0) / (width + 2) - 1.0
-    y = (2.0 * row + 1.0) / height - 1.0
-    grid = torch.stack([x[:, None, :].expand_as(y), y], dim=3)
-    seen = functional.grid_sample(around, grid, padding_mode="border", align_corners=False)
-    return seen.permute(0, 2, 3, 1).round().to(torch.uint8)

@@ -84,7 +84,8 @@ class _Trainer:
         self.stage = stage
         self.device = device
         self.settings = stage.settings
-        self._mixed_precision = device.type == "cuda" or _multiplies_bfloat16()
+        # A processor needs matrices of bfloat16: without them, autocast is slower.
+        self._mixed_precision = device.type == "cuda" or bool(torch.cpu.get_capabilities().get("amx_bf16", False))
         for module in stage.modules.values():
             module.to(device).train()
         if stage.teacher is not None:
@@ -181,11 +182,6 @@ def _progress_bar(trainer: _Trainer) -> tqdm[Any]:
         bar_format=_MINUTES_BAR if timed else None,
         mininterval=10.0,
     )
-
-
-def _multiplies_bfloat16() -> bool:
-    """Return True if the processor multiplies bfloat16 matrices natively; without that, autocast is slower."""
-    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
 def _states(modules: dict[str, nn.Module]) -> dict[str, dict[str, Tensor]]:

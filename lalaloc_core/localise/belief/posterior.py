@@ -215,7 +215,10 @@ def weighted_places(
     cost, pose, hypothesis = grid.total[pair].astype(np.float64), grid.pose[pair], grid.hypothesis[pair]
     position = grid.poses.position_m[pose]
     heading = query.roll[hypothesis] + query.frame_heading
-    mode = _modes(position, heading, starts, query, separation_m)
+    # The first candidate near each pair and at about its heading; -1 for none.
+    mode, places = np.full(len(pair), -1), _SortedPlaces(position, heading, query)
+    for index, start in reversed(list(enumerate(starts))):
+        mode[places.near(start, separation_m)] = index
     # The last row is for pairs of no mode.
     gain = np.array([*gains, usual])[mode]
     shifts = [(*(end.position_m - start.position_m), end.frame_heading - start.frame_heading) for start, end in moves]
@@ -232,20 +235,6 @@ def weighted_places(
     weight /= weight.sum()
     support = Support(pose, position, heading, weight)
     return WeightedPlaces(query, support, len(grid.poses), _SortedPlaces(*counted, query))
-
-
-def _modes(
-    position: Float[np.ndarray, "m 2"],
-    heading: Float[np.ndarray, "m"],
-    starts: Sequence[Candidate],
-    query: Query,
-    separation_m: float,
-) -> Int[np.ndarray, "m"]:
-    """Return the first candidate near each pair and at about its heading; -1 for none."""
-    mode, places = np.full(len(position), -1), _SortedPlaces(position, heading, query)
-    for index, start in reversed(list(enumerate(starts))):
-        mode[places.near(start, separation_m)] = index
-    return mode
 
 
 def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int[np.ndarray, "r"]:

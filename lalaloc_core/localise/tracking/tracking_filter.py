@@ -19,7 +19,7 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import TWO_PI, wrap_angle
@@ -129,7 +129,8 @@ def track_steps(
         fit = photograph.fit(best, posterior, stage, grid_cost)
     in_plan = _in_plan(state.in_plan, fit)
     probability = in_plan * posterior.position
-    mode, own_plan = _mode(in_plan, probability), plans.merged.plan_of(best.room_index)
+    mode: Mode = "lost" if in_plan < _LOST_BELOW else "tracking" if probability >= _TRACKING_FROM else "searching"
+    own_plan = plans.merged.plan_of(best.room_index)
     sure = everything.share_alone(best) >= _SURE
     # Plans have frames of their own, which odometry does not join.
     before = state.pose if state.pose is not None and state.pose.plan == own_plan else None
@@ -234,7 +235,12 @@ class _Photograph:
             cost, offset = np.append(cost[left], more), np.append(offset[left], more_offset)
         pose, sector = np.divmod(number, sectors)
         value = np.exp(-weights.temperature * (cost - cost.min()))
-        outlier, elsewhere = _elsewhere(plans, prediction, pose, prediction.prior.ravel()[number] * value)
+        by_pose = np.bincount(pose, prediction.prior.ravel()[number] * value, minlength=len(grid.poses))
+        share, covered = plans.share(by_pose), 1.0 if plans.left_out is None else plans.left_out.area_share
+        mean = covered * float(by_pose.sum()) / share
+        # The likelihood of an outlier, and the weight of the plans that are left out.
+        outlier = _OUTLIER * mean
+        elsewhere = prediction.anywhere * ((1.0 - share) * mean + (1.0 - covered) * outlier)
         weight = flat[number] * (value + outlier)
         rest = max(float(flat.sum() - flat[number].sum()), 0.0) * outlier + elsewhere
         total = float(weight.sum()) + rest
@@ -281,20 +287,6 @@ class _Photograph:
         return None if confidence is None else confidence.fit
 
 
-def _elsewhere(
-    plans: TrackedPlans, prediction: _Prediction, pose: Int[np.ndarray, "m"], evidence: Float[np.ndarray, "m"]
-) -> tuple[float, float]:
-    """Return the likelihood of an outlier, and the weight of the plans that are left out.
-
-    `evidence` is prior times likelihood of some states.
-    """
-    by_pose = np.bincount(pose, evidence, minlength=len(plans.grid.poses))
-    share, covered = plans.share(by_pose), 1.0 if plans.left_out is None else plans.left_out.area_share
-    mean = covered * float(by_pose.sum()) / share
-    outlier = _OUTLIER * mean
-    return outlier, prediction.anywhere * ((1.0 - share) * mean + (1.0 - covered) * outlier)
-
-
 def _in_plan(before: float, fit: float | None) -> float:
     """Return the probability of being in the plan after a photograph that fits it with some probability."""
     before = before + _LEAVING * (1.0 - 2.0 * before)
@@ -302,12 +294,6 @@ def _in_plan(before: float, fit: float | None) -> float:
         return before
     odds = min(max(fit / max(1.0 - fit, 1e-9), 1.0 / _MAX_ODDS), _MAX_ODDS)
     return before * odds / (before * odds + 1.0 - before)
-
-
-def _mode(in_plan: float, probability: float) -> Mode:
-    if in_plan < _LOST_BELOW:
-        return "lost"
-    return "tracking" if probability >= _TRACKING_FROM else "searching"
 
 
 def _follow(

@@ -60,7 +60,10 @@ class MergedPlans:
         A single row would be so long that coordinates lose precision in single precision. All grids have the same step
         and are for the same model; the camera height (m) is the query's.
         """
-        shift_m = _shifts(plans, gap_m)
+        bounds = np.array([plan.bounds_m for plan in plans])
+        cell_m = (bounds[:, 2:] - bounds[:, :2]).max(axis=0) + gap_m
+        columns, index = int(np.ceil(np.sqrt(len(plans)))), np.arange(len(plans))
+        shift_m = np.stack([index % columns, index // columns], axis=1) * cell_m - bounds[:, :2]
         placed = list(zip(plans, shift_m, strict=True))
         plan = FloorPlan(
             name="",
@@ -107,15 +110,6 @@ def translated(pose: PoseT, shift_m: Float[np.ndarray, "2"], rooms: int) -> Pose
 
 def _starts(counts: Sequence[int] | Int[np.ndarray, "p"]) -> Int[np.ndarray, "p"]:
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
-
-
-def _shifts(plans: Sequence[FloorPlan], gap_m: float) -> Float[np.ndarray, "p 2"]:
-    """Return the translation (m) of each plan into its cell of a square of equal cells."""
-    bounds = np.array([plan.bounds_m for plan in plans])
-    cell_m = (bounds[:, 2:] - bounds[:, :2]).max(axis=0) + gap_m
-    columns = int(np.ceil(np.sqrt(len(plans))))
-    index = np.arange(len(plans))
-    return np.stack([index % columns, index // columns], axis=1) * cell_m - bounds[:, :2]
 
 
 def _moved(room: Room, shift_m: Float[np.ndarray, "2"]) -> Room:

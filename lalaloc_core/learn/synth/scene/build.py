@@ -65,7 +65,7 @@ class _Builder:
         streams.begin(ScenePart.MOOD)
         lighting = Lighting(rng, neutral=streams.is_staged, bright=self._is_bright)
         if self._shot.is_night:
-            lighting.fall_dark()
+            lighting.daylight, lighting.lamps_on = 0.0, True
         self._add_room(0, self._shot.room_index, lighting)
         in_room = list(tables.prisms)
         for slot, room_index in enumerate(self._slot_rooms[1:], start=1):

@@ -62,10 +62,6 @@ class Lighting:
             self.daylight, self.lamps_on = float(rng.uniform(1.2, 4.0)), bool(rng.random() < 0.4)
             self.ambient = math.exp(rng.uniform(math.log(0.4), math.log(1.1)))
 
-    def fall_dark(self) -> None:
-        """Make it night: only lamps give light."""
-        self.daylight, self.lamps_on = 0.0, True
-
     def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> dict[str, Float[np.ndarray, "3"]]:
         """Return the columns of `VisibleRooms` about the one lamp of a neighbouring room, and its ambient light."""
         rng = self.rng

@@ -218,10 +218,6 @@ class MaterialLibrary:
             source = photographs[int(rng.integers(len(photographs)))]
         return int(source[rng.integers(len(source))])
 
-    def sample_plain(self, rng: np.random.Generator) -> int:
-        """Return the index of a random picture with little structure."""
-        return int(self.plain[rng.integers(len(self.plain))])
-
 
 def _read(path: Path) -> Float[np.ndarray, "128 128 3"]:
     with Image.open(path) as picture:

@@ -65,7 +65,8 @@ class SurfaceTable:
 
     def add_plain(self, colour: Colour, *, gloss: float = 0.0, glow: float = 0.0) -> int:
         """Add a surface of one colour; see `add`."""
-        picture = self._materials.sample_plain(self._rng)
+        plain = self._materials.plain
+        picture = int(plain[self._rng.integers(len(plain))])
         tint = colour / self._materials.mean_colours[picture]
         return self._append(picture, tint, 0.0, scale=0.5, gloss=gloss, glow=glow)
 
