@@ -20,7 +20,7 @@ import safetensors.torch
 import torch
 
 from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle, write_manifest
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.nets.layout_network import LayoutDecoder
 
 COMMITTED = Path(__file__).parent / "tiny.zip"

@@ -183,7 +183,7 @@ def _check_train_options(arguments: Train) -> None:
 
 def _train_config(arguments: Train) -> TrainConfig:
     """Return the preset with the settings, schedule and seed of the options."""
-    from lalaloc_core.learn.training.presets import PRESETS
+    from lalaloc_core.learn.training.config import PRESETS
 
     config = PRESETS[arguments.preset].with_settings(arguments.set_)
     # End-to-end training takes its schedule from the image stage.

@@ -18,10 +18,9 @@ from lalaloc_core.learn.synth.augmentation import jittered
 from lalaloc_core.learn.training.batch_streams import ReplayBuffer, SphereBatches
 from lalaloc_core.learn.training.batches import Batch, Rotation, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.config import PRESETS, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer, rotate_images
 from lalaloc_core.learn.training.image_stage import ImageStage
-from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_layout_encoder, sphere_batches
 from tests.strategies import seeds

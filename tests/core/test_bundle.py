@@ -37,8 +37,7 @@ from lalaloc_core.learn.export import bundle_export as export
 from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
 from lalaloc_core.learn.export.run_export import reexport_bundle
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS, TrainConfig
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight

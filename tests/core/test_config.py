@@ -10,9 +10,8 @@ import pytest
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
+from lalaloc_core.learn.training.config import PRESETS, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.loop import learning_rate
-from lalaloc_core.learn.training.presets import PRESETS
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -10,7 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.layout_network import RingConfig, RingLayoutEncoder, pad_around
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperImageEncoder, PaperLayoutEncoder, ResNet

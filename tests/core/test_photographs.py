@@ -14,13 +14,13 @@ from PIL import Image
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.synth.augmentation import _blurred, _vignetting, optics, stretched
 from lalaloc_core.learn.training.batches import Photographs
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.learn.training.photograph_targets import (
     _class_map,
     load_photographs,
     read_by_encoder,
     read_walls_and_openings,
 )
-from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from tests.painted import painted_surfaces, wall_distance_m

@@ -30,11 +30,10 @@ from lalaloc_core.learn.training import layout_stage as layout_stage_module
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, SphereBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches, sample_rotation
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import ImageStageConfig, OptimiserConfig, TrainConfig, Turns
+from lalaloc_core.learn.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig, Turns
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.layout_stage import EndToEndStage, LayoutStage
 from lalaloc_core.learn.training.loop import run_stage
-from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encoder

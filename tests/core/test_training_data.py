@@ -23,7 +23,7 @@ from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, SphereBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import SceneSource
 from lalaloc_core.learn.training.training_data import TrainingData

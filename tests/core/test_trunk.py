@@ -18,7 +18,7 @@ from lalaloc_core.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.learn.export.bundle_export import export_bundle
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, rolled

@@ -24,11 +24,10 @@ from lalaloc_core.learn.training import losses, run
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, SphereBatches, seen_openings
 from lalaloc_core.learn.training.batches import Photographs
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
+from lalaloc_core.learn.training.config import PRESETS, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.layout_stage import EndToEndStage
 from lalaloc_core.learn.training.loop import run_stage
-from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser

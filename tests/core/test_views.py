@@ -25,7 +25,7 @@ from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.learn.training.run import train_stage
 from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.learn.training.view_stage import middle

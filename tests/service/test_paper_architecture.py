@@ -11,7 +11,7 @@ import pytest
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.export.bundle_export import export_bundle
-from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from tests.service.conftest import FLAT, localise, localise_turn, upload, wait_for

@@ -1,9 +1,12 @@
-"""Training configuration: frozen, typed, strict about unknown keys; stored in every checkpoint."""
+"""Training configuration: frozen, typed, strict about unknown keys; stored in every checkpoint. With its presets."""
 
 from __future__ import annotations
 
 import dataclasses
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
@@ -299,3 +302,22 @@ def _check(name: str, value: Any, is_valid: bool, limit: str) -> None:
     if not is_valid:
         shown = f"{value:g}" if isinstance(value, float) else value
         raise ConfigError(f"config.{name} is {shown}; {limit}")
+
+
+def _presets() -> dict[str, TrainConfig]:
+    presets: dict[str, TrainConfig] = {}
+    for name, values in tomllib.loads(Path(__file__).with_name("presets.toml").read_text(encoding="utf-8")).items():
+        base = presets[values.pop("base")].to_dict() if "base" in values else {}
+        presets[name] = TrainConfig.from_dict(_changed(base, values) | {"name": name})
+    return presets
+
+
+def _changed(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested values with others in their place."""
+    return {**base} | {
+        key: _changed(base.get(key, {}), value) if isinstance(value, dict) else value for key, value in values.items()
+    }
+
+
+# Presets of `lalaloc lab train --preset`.
+PRESETS = _presets()
