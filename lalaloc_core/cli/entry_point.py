@@ -95,22 +95,18 @@ def build_parser(*, with_lab: bool = True) -> argparse.ArgumentParser:
         "lab", help="train, measure and export models, by configuration files and options (docs/how-to/train.md)"
     )
     if with_lab:
-        _add_lab(bench, laboratory)
+        from lalaloc_core.cli import evaluation, lab, measuring, training
+
+        lab.add_options(bench, measuring.COMMANDS["bench"])
+        actions = laboratory.add_subparsers(required=True, metavar="COMMAND")
+        for name, command in (training.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS).items():
+            lab.add_options(actions.add_parser(name, help=lab.summary(command)), command)
     completion = commands.add_parser(
         "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'
     )
     completion.add_argument("shell", choices=("bash", "zsh", "fish"), help="shell")
     completion.set_defaults(run=lambda arguments: _complete(parser, arguments.shell))
     return parser
-
-
-def _add_lab(bench: argparse.ArgumentParser, laboratory: argparse.ArgumentParser) -> None:
-    from lalaloc_core.cli import evaluation, lab, measuring, training
-
-    lab.add_options(bench, measuring.COMMANDS["bench"])
-    actions = laboratory.add_subparsers(required=True, metavar="COMMAND")
-    for name, command in (training.COMMANDS | evaluation.COMMANDS | measuring.COMMANDS).items():
-        lab.add_options(actions.add_parser(name, help=lab.summary(command)), command)
 
 
 def _serve_assistants(arguments: argparse.Namespace) -> None:

@@ -245,17 +245,16 @@ def _calibrate(arguments: Calibrate) -> None:
         sphere, view = calibrate_errors(arguments.bundle, arguments.homes)
         print_json({"sphere_spread": sphere.spread, "view_spread": view.spread})
         return
-    if arguments.turns:
-        from lalaloc_core.evaluate.calibrate.turn_confidence import TurnSettings, calibrate_turns
-
-        settings = TurnSettings(homes=arguments.homes, seed=arguments.seed, textures=arguments.textures)
-        metrics = calibrate_turns(arguments.bundle, settings).manifest.metrics
-        print_json({name: value for name, value in metrics.items() if name.startswith("turn_")})
-        return
     from lalaloc_core.evaluate.calibrate.calibration import CalibrationConfig, calibrate
 
     names = [field.name for field in dataclasses.fields(CalibrationConfig)]
     config = CalibrationConfig(**{name: getattr(arguments, name) for name in names})
+    if arguments.turns:
+        from lalaloc_core.evaluate.calibrate.turn_confidence import calibrate_turns
+
+        metrics = calibrate_turns(arguments.bundle, config).manifest.metrics
+        print_json({name: value for name, value in metrics.items() if name.startswith("turn_")})
+        return
     manifest = calibrate(arguments.bundle, config).manifest
     print_json(dataclasses.asdict(manifest.evidence_for(view=arguments.views)))
     print_json(manifest.metrics)

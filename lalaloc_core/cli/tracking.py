@@ -79,7 +79,13 @@ def _track(arguments: argparse.Namespace) -> None:
         ]
         write_file(arguments.trajectory, "\n".join(lines) + "\n")
     if arguments.out is not None:
-        write_picture(_picture(plan, [answer for _, answer in found]), arguments.out)
+        import numpy as np
+
+        from lalaloc_core.draw.plan_overlays import draw_path
+
+        position_m = [(answer.position.x_m, answer.position.y_m) for _, answer in found]
+        is_sure = [answer.mode == "tracking" for _, answer in found]
+        write_picture(draw_path(plan, np.array(position_m), is_sure, found[-1][1].heading_deg), arguments.out)
     if arguments.json:
         print_json(documents, JSON_DECIMALS)
     else:
@@ -137,16 +143,6 @@ def _followed(
             continue
         before_s = time_s
         yield time_s, answer, {"photograph": str(path), **answer.document()}
-
-
-def _picture(plan: FloorPlan, found: list[TrackedAnswer]) -> str:
-    import numpy as np
-
-    from lalaloc_core.draw.plan_overlays import draw_path
-
-    position_m = np.array([[answer.position.x_m, answer.position.y_m] for answer in found])
-    is_sure = [answer.mode == "tracking" for answer in found]
-    return draw_path(plan, position_m, is_sure, found[-1].heading_deg)
 
 
 def _text(path: Path) -> str:

@@ -15,7 +15,8 @@ from lalaloc_core.bundle import Bundle, Manifest, default_bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.calibrate.turn_confidence import TurnSettings, calibrate_turns
+from lalaloc_core.evaluate.calibrate.calibration import CalibrationConfig
+from lalaloc_core.evaluate.calibrate.turn_confidence import calibrate_turns
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.data.synthetic.turned import (
     FILM_S,
@@ -130,7 +131,7 @@ def test_calibration_of_turns_changes_their_confidence_alone(
     shutil.copytree(default_bundle(), folder)
     (folder / "manifest.json").write_text(spheres.to_json())
     with pytest.raises(InvalidInputError, match="has no encoder of views; leave out --turns"):
-        calibrate_turns(folder, TurnSettings(homes=1))
+        calibrate_turns(folder, CalibrationConfig(homes=1))
 
 
 def test_turn_is_told_from_a_single_view() -> None:

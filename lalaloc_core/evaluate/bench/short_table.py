@@ -14,7 +14,7 @@ from pathlib import Path
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.evaluate.runs.photograph_reading import read_photographs, read_views
-from lalaloc_core.learn.data import AnnotatedPhotograph, AnnotatedPhotographs
+from lalaloc_core.learn.data import AnnotatedPhotographs
 from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated
 from lalaloc_core.learn.export.run_export import export_into
 from lalaloc_core.learn.metrics import AzimuthSummary, summarise_azimuths
@@ -42,23 +42,12 @@ def short_table(bundle: Bundle, real: Path, rooms: Path) -> dict[str, float]:
         ("house", annotated(PosedSpheres(real / _HOUSE), "validation"), _FIELD_DEG, _FEWER_VIEWS),
         ("rooms", annotated(PosedSpheres(rooms), "validation"), _FIELD_DEG, _FEWER_VIEWS),
     ):
-        figures |= _figures(encoders, name, photographs, fields_deg, views)
-    return figures
-
-
-def _figures(
-    encoders: PhotographEncoder,
-    name: str,
-    photographs: Sequence[AnnotatedPhotograph],
-    fields_deg: Sequence[float],
-    views: int,
-) -> dict[str, float]:
-    read = read_photographs(encoders, photographs)
-    spheres = summarise_azimuths([item.measures for item in read], OPENING_CLASSES)
-    figures = _rows(f"{name} spheres", spheres)
-    for field_deg in fields_deg:
-        seen, row = read_views(encoders, read, field_deg, views), f"{name} view {field_deg:g}"
-        figures |= _rows(row, seen.by_reader["view"]) | {f"{row}: {kind}": value for kind, value in seen.types.items()}
+        read = read_photographs(encoders, photographs)
+        figures |= _rows(f"{name} spheres", summarise_azimuths([item.measures for item in read], OPENING_CLASSES))
+        for field_deg in fields_deg:
+            seen, row = read_views(encoders, read, field_deg, views), f"{name} view {field_deg:g}"
+            figures |= _rows(row, seen.by_reader["view"])
+            figures |= {f"{row}: {kind}": value for kind, value in seen.types.items()}
     return figures
 
 

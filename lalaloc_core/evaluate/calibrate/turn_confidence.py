@@ -13,7 +13,7 @@ import dataclasses
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -25,6 +25,7 @@ from tqdm import tqdm
 from lalaloc_core.bundle import Bundle, write_manifest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.calibrate.calibration import CalibrationConfig
 from lalaloc_core.evaluate.calibrate.parameter_fits import Answers, fit_confidence, validation_figures
 from lalaloc_core.evaluate.methods.lalaloc import found_pose
 from lalaloc_core.evaluate.methods.method import Pose
@@ -60,15 +61,6 @@ _LENGTH_ERROR = 0.05
 _CONFIG = LocaliseConfig(vdr_candidates=0, every_stage=True)
 
 
-@dataclass(frozen=True, kw_only=True)
-class TurnSettings:
-    """Settings of the calibration of turns."""
-
-    homes: int = 100
-    seed: int = 0
-    textures: Path | None = None
-
-
 class _Taken(NamedTuple):
     """Pictures of a turn with their headings (radians) minus that of the shot, and the field of view in use."""
 
@@ -78,10 +70,11 @@ class _Taken(NamedTuple):
     hfov_deg: float
 
 
-def calibrate_turns(folder: Path, settings: TurnSettings) -> Bundle:
+def calibrate_turns(folder: Path, settings: CalibrationConfig) -> Bundle:
     """Fit the confidence of turns, and store it in the bundle's manifest with its validation figures.
 
-    Turns are localised in their own plans, disturbed, and in plans of other buildings.
+    Turns are localised in their own plans, disturbed, and in plans of other buildings. Of the settings, those of the
+    homes count.
     """
     bundle = Bundle.open(folder)
     manifest, view = bundle.manifest, bundle.manifest.view
@@ -105,7 +98,7 @@ def calibrate_turns(folder: Path, settings: TurnSettings) -> Bundle:
 
 
 def _predictions(
-    model: LocalModel, settings: TurnSettings, index: int
+    model: LocalModel, settings: CalibrationConfig, index: int
 ) -> Iterator[tuple[bool, Literal["own", "disturbed", "mismatched"], Prediction]]:
     """Yield the predictions for the turns of a home: whether the heading is known, and the list that they belong to."""
     scene, other = f"home-{index:05d}", _other_plan(settings, index)
@@ -121,7 +114,7 @@ def _predictions(
             yield known, "mismatched", own.located(other, scene, number, known=known)
 
 
-def _other_plan(settings: TurnSettings, index: int) -> FloorPlan:
+def _other_plan(settings: CalibrationConfig, index: int) -> FloorPlan:
     """Return the plan of another building: a home, a home without openings, or an office."""
     rng = np.random.default_rng([settings.seed, index])
     if index % 3 == 2:
@@ -130,7 +123,7 @@ def _other_plan(settings: TurnSettings, index: int) -> FloorPlan:
     return without_openings(plan) if index % 3 == 1 else plan
 
 
-def _turns_of_home(settings: TurnSettings, index: int) -> Iterator[_Taken]:
+def _turns_of_home(settings: CalibrationConfig, index: int) -> Iterator[_Taken]:
     """Yield turns of a home: once around, and a part of one, each of a phone held upright or on its side."""
     home, rng = home_of(_SPLIT, settings.seed, index)
     renderers = split_renderer_cache(_SPLIT, settings.seed, settings.textures)
