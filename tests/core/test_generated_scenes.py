@@ -11,16 +11,18 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.learn.data.synthetic import altered_photographs
-from lalaloc_core.learn.data.synthetic.altered_photographs import (
+from lalaloc_core.learn.data.synthetic import altered_homes
+from lalaloc_core.learn.data.synthetic.altered_homes import (
+    CopiedScenes,
     Cropped,
     DisturbedPhotograph,
     DisturbedScenes,
+    ForeignScenes,
     MismatchedScenes,
     OutdoorPhotograph,
+    UnopenedScenes,
     UpsideDown,
 )
-from lalaloc_core.learn.data.synthetic.altered_plans import CopiedScenes, ForeignScenes, UnopenedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.render.sweep import sweep_layouts
 
@@ -164,7 +166,7 @@ def test_disturbance_depends_on_the_photograph_only() -> None:
 
 def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
     """The direction at 45 degrees gives the ratio of the factors of width and depth."""
-    monkeypatch.setattr(altered_photographs, "_STRENGTH", 0.0)
+    monkeypatch.setattr(altered_homes, "_STRENGTH", 0.0)
     width, ratios = 256, []
     plain = _Shaded().image(1, width)[0, :, 0].astype(float)
     right = slice(width // 2, width)

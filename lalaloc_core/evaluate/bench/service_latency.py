@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 
 from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.synthetic.altered_plans import without_openings
+from lalaloc_core.learn.data.synthetic.altered_homes import without_openings
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.data.views import cut_view, encode_jpeg
 from lalaloc_core.learn.synth.homes.plans import TEST, home_of

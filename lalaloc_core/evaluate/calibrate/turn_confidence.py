@@ -31,7 +31,7 @@ from lalaloc_core.evaluate.methods.lalaloc import found_pose
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.synthetic.altered_plans import office_plan, without_openings
+from lalaloc_core.learn.data.synthetic.altered_homes import office_plan, without_openings
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.data.synthetic.turned import Phone, photographs_of_turn
 from lalaloc_core.learn.data.views import encode_jpeg

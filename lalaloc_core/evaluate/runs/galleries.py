@@ -13,7 +13,7 @@ from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data import CAMERA_HEIGHT_M, AnnotatedPhotograph, HeldoutScenes
 from lalaloc_core.learn.data.annotated import GalleryKey
-from lalaloc_core.learn.data.synthetic.altered_plans import office_plan, without_openings
+from lalaloc_core.learn.data.synthetic.altered_homes import office_plan, without_openings
 from lalaloc_core.localise.local_model import LocalModel
 from lalaloc_core.localise.query import CameraHeight
 
