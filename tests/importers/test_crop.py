@@ -12,7 +12,7 @@ from lalaloc_core.importers import ImportOptions, import_plan, import_plans
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import Sketch, SketchedRoom
-from lalaloc_core.importers.drawing.storeys_beside import assemble_storeys, title_of
+from lalaloc_core.importers.drawing.storeys import assemble_storeys, title_of
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from tests.importers.conftest import dxf_file, shapes
 from tests.painted import picture_file

@@ -29,7 +29,7 @@ from lalaloc_core.importers.drawing.scale_guess import (
     measures_of,
 )
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
-from lalaloc_core.importers.drawing.storeys_beside import Box, assemble_storeys
+from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
 from lalaloc_core.importers.picture.ink import blank_outside

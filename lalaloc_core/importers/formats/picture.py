@@ -22,7 +22,7 @@ from lalaloc_core.importers.drawing.drawing_scale import (
 )
 from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
-from lalaloc_core.importers.drawing.storeys_beside import Box, assemble_storeys
+from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
 from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts

@@ -30,7 +30,7 @@ from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
-from lalaloc_core.importers.drawing.storeys_by_layer import by_storey
+from lalaloc_core.importers.drawing.storeys import by_storey
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     Area,

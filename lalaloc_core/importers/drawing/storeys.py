@@ -1,12 +1,17 @@
-"""Storeys that are drawn beside each other in a picture, on a page or in a drawing, and their titles."""
+"""Storeys of one drawing: beside each other, with their titles, or over each other, on layers that differ by name.
+
+A picture, a page or a drawing has storeys side by side. Layers of storeys are named such as "EG-Wand" and "OG-Wand".
+"""
 
 from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -17,7 +22,8 @@ from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
-from lalaloc_core.importers.drawing.vector_drawing import Lettering
+from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
+from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
 
 Box = tuple[float, float, float, float]
 # Rooms farther apart (m) are of different storeys; in pictures, also those that no wall joins within the second.
@@ -26,9 +32,12 @@ _APART_M, _JOINED_M = 1.0, 0.2
 _SHARE, _MIN_M2 = 0.3, 12.0
 # Margin (m) around the rooms of a storey, for its walls; most storeys that a warning names.
 _MARGIN_M, _MAX_NAMED = 0.5, 6
-_NUMBERS = keys_by_word("storeys") | keys_by_word("storeys_in_titles")
+_STOREYS = keys_by_word("storeys")
+_NUMBERS = _STOREYS | keys_by_word("storeys_in_titles")
 _BESIDE = frozenset(PLAN_WORDS["levels"]["beside"].split())
 _WORDS = re.compile(r"[^\W_]+")
+# Parts of the names of layers, and the share of the smaller storey's box that one over it covers.
+_PARTS, _OVER = re.compile(r"[^\w+]+|_"), 0.5
 
 
 def assemble_storeys(
@@ -63,20 +72,6 @@ def assemble_storeys(
 
     parts = zip(levels, _parts(sketch, builder.no_room, storeys), strict=True)
     return assemble_levels({level.name: (level, part) for level, part in parts}, options, budget, make)
-
-
-def name_storeys(sketch: Sketch, builder: ReportBuilder, *, flip_y: bool) -> Sketch:
-    """Warn of storeys that are drawn side by side in a vector drawing, which can also be buildings of one site."""
-    unit = builder.metres_per_unit
-
-    def in_units(box: Box) -> Box:
-        x0, y0, x1, y1 = (number / unit for number in box)
-        return (x0, -y1, x1, -y0) if flip_y else (x0, y0, x1, y1)
-
-    storeys = storeys_beside(sketch)
-    if len(storeys) > 1:
-        builder.warnings.append(f"{_in_words(storeys, in_units)}; they were read as one: set crop to read one")
-    return sketch
 
 
 def storeys_beside(sketch: Sketch) -> list[BaseGeometry]:
@@ -186,3 +181,72 @@ def _in_words(storeys: Sequence[BaseGeometry], in_file: Callable[[Box], Box], le
         for index, storey in enumerate(storeys[:_MAX_NAMED])
     )
     return f"{len(storeys)} storeys seem to be drawn side by side, {listed}"
+
+
+def by_storey(
+    drawing: Drawing, builder: ReportBuilder, options: ImportOptions, budget: Budget, *, flip_y: bool
+) -> tuple[ImportedPlan, ...]:
+    """Return the plans of the storeys of a vector drawing in its own units; most drawings have one."""
+    unit = builder.metres_per_unit
+    drawing = drawing.scaled(unit, flip_y=flip_y)
+
+    def in_units(box: Box) -> Box:
+        x0, y0, x1, y1 = (number / unit for number in box)
+        return (x0, -y1, x1, -y0) if flip_y else (x0, y0, x1, y1)
+
+    def make(part: Drawing, report: ReportBuilder, level: Level | None) -> ImportedPlan:
+        sketch = sketch_drawing(part, report, budget)
+        # They can also be buildings of one site.
+        if len(beside := storeys_beside(sketch)) > 1:
+            report.warnings.append(f"{_in_words(beside, in_units)}; they were read as one: set crop to read one")
+        return assemble(replace(sketch, level=level), report, options, budget.limits.plan)
+
+    def make_level(level: Level, part: Drawing) -> ImportedPlan:
+        report = deepcopy(builder)
+        report.notes.append(f"storey '{level.name}' by the names of layers; layers without a storey belong to all")
+        return make(part, report, level)
+
+    storeys = storeys_of(drawing)
+    return assemble_levels(storeys, options, budget, make_level) if storeys else (make(drawing, builder, None),)
+
+
+def storeys_of(drawing: Drawing) -> dict[str, tuple[Level, Drawing]]:
+    """Return the parts of a drawing by storey; empty if its walls are of one."""
+    walls: defaultdict[float, list[BaseGeometry]] = defaultdict(list)
+    others: set[float] = set()
+    names: dict[float, str] = {}
+    for item in (*drawing.strokes, *drawing.areas):
+        storey = _storey(item.layer)
+        if storey is not None and item.role == "wall":
+            if names.get(storey[1], "0").isdecimal():
+                names[storey[1]] = storey[0]
+            walls[storey[1]].append(item.line if isinstance(item, Stroke) else item.shape)
+        elif storey is not None:
+            others.add(storey[1])
+    others |= {storey[1] for text in drawing.letterings if (storey := _storey(text.layer)) is not None}
+    # Numbers count walls as well as storeys, unless other layers have the same ones.
+    named = {number for number in walls if not names[number].isdecimal() or number in others}
+    boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in named}
+    if len(boxes) < 2 or not all(_is_over(first, second) for first in boxes.values() for second in boxes.values()):
+        return {}
+
+    def part(number: float) -> Drawing:
+        return drawing.on_layers(lambda layer: (storey := _storey(layer)) is None or storey[1] == number)
+
+    return {names[number]: (Level(names[number], number), part(number)) for number in boxes}
+
+
+def _is_over(first: shapely.Polygon, second: shapely.Polygon) -> bool:
+    return first.intersection(second).area >= _OVER * min(first.area, second.area)
+
+
+@lru_cache(maxsize=1024)
+def _storey(layer: str) -> tuple[str, float] | None:
+    """Return the name and number of the storey that the name of a layer has; None without one."""
+    parts = list(filter(None, _PARTS.split(layer)))
+    for part in parts:
+        word = "".join(split_words(part)) if part.isalpha() else part.casefold()
+        if word in _STOREYS:
+            return part, float(_STOREYS[word])
+    numbers = (part for part in parts if part.isdecimal() and len(part) <= 2 and part != layer)
+    return next(((part, float(part)) for part in numbers), None)
