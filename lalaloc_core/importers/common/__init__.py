@@ -9,3 +9,4 @@ from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedRoom

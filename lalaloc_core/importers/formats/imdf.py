@@ -13,9 +13,8 @@ import numpy as np
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_values import read_json
-from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions
+from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, Level
 from lalaloc_core.importers.common.bounded_files import pack
-from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.common.tagged_features import import_features, in_english
 from lalaloc_core.importers.formats.geojson import file_rings, parse_features, plan_features
 

@@ -11,11 +11,10 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_values import is_number
-from lalaloc_core.importers.common import Budget, ReportBuilder
+from lalaloc_core.importers.common import Budget, Level, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble_levels, clean_name
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions, check_units, check_y_axis
 from lalaloc_core.importers.common.plausibility import USUAL_CEILING_M, check_document, likely_unit
-from lalaloc_core.importers.common.sketch import Level
 
 # JSON allows numbers of any size; larger ones are left for the validation to refuse.
 _MAX_NUMBER = 1e12

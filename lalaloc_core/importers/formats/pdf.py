@@ -17,8 +17,7 @@ from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
-from lalaloc_core.importers.common.sketch import Sketch
+from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder, Sketch
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
 from lalaloc_core.importers.drawing.scale_guess import (
     Measures,
