@@ -294,8 +294,6 @@ def refinement_result(job: RefinementJob, *, position_m: np.ndarray, cost: np.nd
         cost=cost,
         latent_distance=np.full(count, 0.5),
         information=np.tile(np.eye(2), (count, 1, 1)),
-        converged=np.ones(count, dtype=bool),
-        evaluations=np.ones(count, dtype=int),
     )
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from array_api_compat import array_namespace, device
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from lalaloc_core.conventions import Array
 from lalaloc_core.localise.refine.refinement_problem import (
@@ -26,18 +25,13 @@ from lalaloc_core.localise.refine.refinement_problem import (
 )
 
 
-class DescentResult(NamedTuple):
-    """Refined poses, their evaluation, whether they converged, and the number of evaluations."""
-
-    pose: Float[Array, "k p"]
-    evaluation: Evaluation
-    converged: Bool[Array, "k"]
-    evaluations: int
+# Refined poses and their evaluation; None if they are not wanted any more.
+_Descent = tuple[Float[Array, "k p"], Evaluation] | None
 
 
 def descend(problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = lambda: True) -> RefinementResult | None:
     """Run the optimiser of the settings; None if the result is not `wanted` any more, asked before each iteration."""
-    method = adam if config.method == "adam" else _levenberg_marquardt
+    method = _adam if config.method == "adam" else _levenberg_marquardt
     found = method(problem, config, wanted)
     return None if found is None else problem.result(*found)
 
@@ -61,9 +55,7 @@ def refine_walls(
     return None if result is None else replace(result, latent_distance=None)
 
 
-def _levenberg_marquardt(
-    problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = lambda: True
-) -> DescentResult | None:
+def _levenberg_marquardt(problem: Problem, config: LpoConfig, wanted: Callable[[], bool]) -> _Descent:
     """Damped Gauss-Newton with Marquardt's scaling; each pose has its own damping and stops on its own."""
     xp = array_namespace(problem.start)
     pose = xp.asarray(problem.start, copy=True)
@@ -102,7 +94,7 @@ def _levenberg_marquardt(
         here.take_over(rows[chosen], there.rows(chosen))
         factor = xp.where(better, xp.full_like(damping[rows], 0.2), xp.full_like(damping[rows], 6.0))
         damping[rows] = clipped(damping[rows] * factor, 1e-6, 1e8)
-    return DescentResult(pose, here, converged, evaluations)
+    return pose, here
 
 
 def _step(here: Evaluation, damping: Float[Array, "k"]) -> Float[Array, "k p"]:
@@ -118,7 +110,7 @@ def _worth_going_on(problem: Problem, here: Evaluation, config: LpoConfig) -> Ar
     return nearest + config.prune_margin if problem.norm == "cauchy" else config.prune_ratio * nearest
 
 
-def adam(problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = lambda: True) -> DescentResult | None:
+def _adam(problem: Problem, config: LpoConfig, wanted: Callable[[], bool]) -> _Descent:
     """Adam, its rate halved on plateaus, stopped when the cost no longer falls (paper, section A.3)."""
     pose = problem.start
     xp = array_namespace(pose)
@@ -152,4 +144,4 @@ def adam(problem: Problem, config: LpoConfig, wanted: Callable[[], bool] = lambd
         second = 0.999 * second + 0.001 * xp.square(gradient)
         direction = first / (1.0 - 0.9**step_number) / (xp.sqrt(second / (1.0 - 0.999**step_number)) + 1e-8)
         pose = pose + problem.stay_inside(pose, -rate[:, None] * direction, config)
-    return DescentResult(best_pose, problem.evaluate(best_pose), stop_age >= config.adam_stop_patience, step_number)
+    return best_pose, problem.evaluate(best_pose)

@@ -24,7 +24,7 @@ from typing import Literal
 
 import numpy as np
 from array_api_compat import array_namespace, device, to_device
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import Array
 from lalaloc_core.render.profile import ProfileJacobian, free_travel_m, log_profile_gradient
@@ -87,8 +87,6 @@ class RefinementResult:
     cost: Float[np.ndarray, "k"]
     latent_distance: Float[np.ndarray, "k"] | None
     information: Float[np.ndarray, "k p p"]
-    converged: Bool[np.ndarray, "k"]
-    evaluations: Int[np.ndarray, "k"]
     height_offset: Float[np.ndarray, "k"] | None = None
 
 
@@ -271,9 +269,7 @@ class Problem:
         raised = clipped(height + step[:, self._moving :], low, high) - height
         return xp.concat([step[:, :2] * scale[:, None], turn, raised], axis=1)
 
-    def result(
-        self, pose: Float[Array, "k p"], found: Evaluation, converged: Array, evaluations: int
-    ) -> RefinementResult:
+    def result(self, pose: Float[Array, "k p"], found: Evaluation) -> RefinementResult:
         """Return the result of a descent that ended at these poses; both of its costs are the distance D."""
         position, heading, height_offset = self.unpack(pose)
         information = found.information if height_offset is None else _without_last(found.information)
@@ -284,8 +280,6 @@ class Problem:
             cost=distance,
             latent_distance=distance,
             information=_numpy(information),
-            converged=_numpy(converged),
-            evaluations=np.full(len(distance), evaluations),
             height_offset=None if height_offset is None else _numpy(height_offset).astype(np.float64),
         )
 
