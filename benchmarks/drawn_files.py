@@ -72,7 +72,6 @@ def draw_file(format: FileFormat, drawing: HomeDrawing) -> tuple[bytes, dict[str
 
 
 def draw_home(model: Model, style: FileStyle, language: str, rng: np.random.Generator) -> HomeDrawing:
-    """Return the drawing of a home."""
     drawing = HomeDrawing(model.size_m, language)
     words: dict[str, str] = dict(zip(_KINDS, _WORDS[language]["rooms"].split(","), strict=True))
     for room, name in zip(model.rooms, model.names, strict=True):

@@ -25,7 +25,6 @@ _PERCENTS = (50, 95, 99)
 
 
 def main() -> None:
-    """Measure and print the table."""
     parser = harness.argument_parser(__doc__)
     parser.add_argument("--writes", type=int, default=500, help="plans and leases of each mode")
     parser.add_argument("--folder", default=".", help="folder on the disk to measure")

@@ -86,7 +86,6 @@ def example_service(settings: Mapping[str, str] | None = None, checkout: Path = 
 
 
 def wait_until(is_true: Callable[[], bool], condition: str, timeout_s: float, pause_s: float = 0.05) -> None:
-    """Wait until a condition holds."""
     deadline = time.monotonic() + timeout_s
     while not is_true():
         if time.monotonic() > deadline:
@@ -120,7 +119,6 @@ class Answer:
 
     @property
     def etag(self) -> str:
-        """Entity tag of the content."""
         return self.headers.get("ETag", "")
 
     def json(self) -> Any:

@@ -104,7 +104,6 @@ def home(number: int) -> dict[str, Any]:
 
 
 def created_id(answer: Answer) -> str:
-    """Return the id in an answer."""
     if answer.status != 201:
         raise RuntimeError(f"status {answer.status}: {answer.content[:300]!r}; the benchmark needs 201")
     return answer.json()["id"]

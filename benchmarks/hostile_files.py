@@ -32,7 +32,6 @@ class HostilePlan:
 
 
 def plan(format: str, title: str, make: Callable[[int], bytes], options: ImportOptions = NONE) -> HostilePlan:
-    """Return a kind of hostile files."""
     return HostilePlan(format, title, make, options)
 
 

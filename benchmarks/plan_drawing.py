@@ -42,7 +42,6 @@ class OpeningSymbol:
 
 
 def encoded(picture: UInt8[np.ndarray, "h w 3"], format: str, **options: Any) -> bytes:
-    """Return the file of a picture."""
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, format, **options)
     return stream.getvalue()
@@ -73,11 +72,9 @@ class DrawnPlan:
         return replace(self, picture=np.clip(np.round(picture), 0, 255).astype(np.uint8))
 
     def png(self) -> bytes:
-        """Return the picture as PNG."""
         return encoded(self.picture, "PNG")
 
     def jpeg(self) -> bytes:
-        """Return the picture as JPEG."""
         return encoded(self.picture, "JPEG", quality=60)
 
 

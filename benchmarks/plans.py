@@ -89,7 +89,6 @@ class Plan:
         return cls(shapes, 1, drawn.metres_per_pixel)
 
     def of_kind(self, kind: str) -> list[BaseGeometry]:
-        """Return the shapes of a kind."""
         return [shape for name, shape in self.shapes if name == kind]
 
 
@@ -161,7 +160,6 @@ TABLE: Measures = {"room": partial(_overlapping, least=0.8), "door": _near, "win
 
 
 def count_found(truth: Plan, found: Plan, measures: Measures) -> dict[str, Count]:
-    """Return the counts of kinds of shapes."""
     pairs = {kind: (truth.of_kind(kind), found.of_kind(kind)) for kind in measures}
     return {kind: Count(len(true), len(read), measures[kind](true, read)) for kind, (true, read) in pairs.items()}
 
@@ -286,7 +284,6 @@ def _agent_case(truth: Path) -> tuple[str, bytes, Plan]:
 
 
 def main() -> None:
-    """Measure and print the tables."""
     parser = argument_parser(__doc__)
     parser.add_argument("--plans", type=int, default=40, help="plans per style; half as many per row of --data")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first plan")

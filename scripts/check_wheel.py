@@ -21,7 +21,6 @@ _SEARCHED = "kitchen"
 
 
 def main() -> int:
-    """Check the wheel that is named on the command line."""
     if sys.argv[1] == "--ask":
         return ask(sys.argv[2])
     (wheel,) = sys.argv[1:]

@@ -43,7 +43,6 @@ def main() -> None:
 
 
 def generated_files() -> dict[Path, str]:
-    """Return the content of each generated file."""
     with TemporaryDirectory() as folder:
         source = Path(folder) / "asynchronous"
         shutil.copytree(PACKAGE / "asynchronous", source)

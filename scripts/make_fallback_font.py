@@ -45,7 +45,6 @@ def write_subset(source: str, codes: set[int], target: Path) -> None:
 
 
 def main() -> None:
-    """Read the whole fonts and write the subsets."""
     full, korean = sys.argv[1:]
     write_subset(full, set.union(*map(characters, _CODECS)), FONT)
     write_subset(korean, syllables(), KOREAN_FONT)

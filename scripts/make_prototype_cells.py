@@ -64,7 +64,6 @@ def centres(feature: Float[np.ndarray, "n f"], count: int, rounds: int, rng: np.
 
 
 def main() -> None:
-    """Compute the cells and write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--homes", type=int, default=500)
     parser.add_argument("--cells", type=int, default=4096)

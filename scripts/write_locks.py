@@ -32,7 +32,6 @@ _HEAD = "# Written by `make lock` from pyproject.toml and constraints.txt; do no
 
 
 def extras_of(lock: str) -> list[str]:
-    """Return the extras that a lock is for."""
     file, pattern = LOCKS[lock]
     (extras,) = re.findall(pattern, (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE)
     return extras.split(",")

@@ -55,7 +55,6 @@ def licence_of(name: str) -> str | None:
 
 
 def notice_text() -> str:
-    """Return NOTICE as it should be."""
     text = NOTICE.read_text(encoding="utf-8")
     before, _, rest = text.partition(_BEGIN)
     listed, _, after = rest.partition(_END)

@@ -93,7 +93,6 @@ class ObjectsManifest:
     floor: float = 0.01
 
     def __post_init__(self) -> None:
-        """Check the shape of `shares`."""
         if len(self.shares) != len(self.names) or any(len(row) != len(ROOM_TYPES) for row in self.shares):
             raise ConfigError(
                 f"objects.shares must have a row for each of {len(self.names)} names and {len(ROOM_TYPES)} columns"

@@ -72,7 +72,6 @@ class MatchingWeights:
     usual_gain: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the shape and the sums of `appearance`."""
         if self.appearance is None:
             return
         classes = len(OPENING_CLASSES)
@@ -104,7 +103,6 @@ class AlbumWeights:
     confidence: tuple[float, float, float] = (1.017, 0.737, -5.441)
 
     def __post_init__(self) -> None:
-        """Check the range of `misread`."""
         if not 0.0 < self.misread < 1.0:
             raise ConfigError(f"album.misread is {self.misread:g}; it must be between 0 and 1")
 
@@ -156,7 +154,6 @@ class PredictionErrors:
     spread: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the lengths."""
         for name in ("error_quantiles", "scale_quantiles"):
             if len(getattr(self, name)) != len(LEVELS):
                 raise ConfigError(f"{name} has {len(getattr(self, name))} values; it must have {len(LEVELS)}")

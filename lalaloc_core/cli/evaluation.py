@@ -158,7 +158,6 @@ def _evaluate(arguments: Evaluate) -> None:
 
 
 def _check_options(arguments: Evaluate) -> None:
-    """Check that the options of `evaluate` belong together."""
     method, kind = arguments.method, arguments.kind
     photographs = kind == "photograph" and method == "lalaloc"
     if arguments.data is None and arguments.dataset is not None:

@@ -163,7 +163,6 @@ def _train(arguments: Train) -> None:
 
 
 def _check_train_options(arguments: Train) -> None:
-    """Check that the options of `train` belong together."""
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
     if arguments.data is None and arguments.skip_bad:

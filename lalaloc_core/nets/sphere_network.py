@@ -53,7 +53,6 @@ class TrunkEncoderConfig:
     modes: int = 1
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         for name in ("image_height", "image_width"):
             if getattr(self, name) % TAP_STRIDES[-1] or getattr(self, name) < TAP_STRIDES[-1]:
                 raise ConfigError(f"trunk.{name} is {getattr(self, name)}; it must be a multiple of {TAP_STRIDES[-1]}")

@@ -46,7 +46,6 @@ class TrunkConfig:
     frozen_stages: int = 3
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         for name in ("widths", "repeats"):
             if len(getattr(self, name)) != len(_KERNELS):
                 raise ConfigError(f"trunk.{name} has {len(getattr(self, name))} values; it must have {len(_KERNELS)}")

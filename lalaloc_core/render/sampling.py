@@ -69,7 +69,6 @@ def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = l
 def _lattice_inside(
     floor: BaseGeometry, xs: Float[np.ndarray, "c"], ys: Float[np.ndarray, "r"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the lattice points that lie on a floor."""
     lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
     return lattice[shapely.contains_xy(floor, lattice[:, 0], lattice[:, 1])]
 

@@ -328,7 +328,6 @@ def _layer(properties: Mapping[str, Any]) -> str:
 
 
 def _name(properties: Mapping[str, Any]) -> str | None:
-    """Return the name of a feature."""
     for key in ("name", "alt_name", "label", "ref", "title"):
         value = in_english(properties.get(key))
         if isinstance(value, str) and value.strip():

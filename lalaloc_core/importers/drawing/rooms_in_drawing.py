@@ -124,7 +124,6 @@ def _is_better(reading: Reading, best: Reading) -> bool:
 
 
 def _count_doors_and_names(reading: Reading, drawing: Drawing, leaves: Sequence[Swing]) -> Reading:
-    """Return a reading with its doors and names counted."""
     finder = GapFinder(reading.gaps, reading.bounds)
     closed = {index for leaf in leaves if (index := finder.closed_by(leaf)) is not None}
     names = [t.position for t in drawing.letterings if room_types_from_name(t.text)]

@@ -98,7 +98,6 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
 
 
 def _count_numbers(value: Any, where: str) -> int:
-    """Count the numbers in nested lists."""
     pending, count = [value], 0
     while pending:
         item = pending.pop()

@@ -298,7 +298,6 @@ def _shape(element: Any, meshes: _Meshes) -> tuple[Float[np.ndarray, "n 3"], Any
 def _opening(
     element: Any, kind: OpeningKind, vertices: Float[np.ndarray, "n 3"], floor_m: float
 ) -> SketchedOpening | None:
-    """Return a door or window with this shape."""
     ends = opening_line(shapely.MultiPoint(vertices[:, :2]).convex_hull)
     if ends is None:
         return None

@@ -61,7 +61,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
 
 
 def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read the plan on a page."""
     builder = ReportBuilder("pdf", is_draft=True)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")

@@ -201,7 +201,6 @@ class TrainConfig:
     image: ImageStageConfig = field(default_factory=ImageStageConfig)
 
     def __post_init__(self) -> None:
-        """Check the values that types cannot."""
         for name, wanted in (("layout.cloud_columns", self.layout.cloud_columns), ("the decoder", DECODED_WIDTH)):
             if self.profile_columns % min(wanted, self.profile_columns):
                 raise ConfigError(

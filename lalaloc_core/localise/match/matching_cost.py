@@ -281,7 +281,6 @@ class MatchingCost:
         return np.add.reduce([mode.likelihood(log_m, place) for mode in self._modes])
 
     def _gathered(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Gathered:
-        """Gather the layouts of some poses."""
         opening, room = None, layouts.room_index[pose]
         if layouts.kind is not None:
             opening = layouts.kind[pose] + np.arange(layouts.kind.shape[1]) * len(OPENING_CLASSES)

@@ -228,7 +228,6 @@ class BinnedLayouts:
 
 
 def _sectors(azimuths: int) -> list[slice]:
-    """Return the sectors of a number of azimuths."""
     size = azimuths if azimuths <= SPHERE_AZIMUTHS else _SECTOR_AZIMUTHS
     return [slice(first, min(first + size, azimuths)) for first in range(0, azimuths, size)]
 

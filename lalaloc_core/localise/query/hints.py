@@ -170,7 +170,6 @@ class Hints:
         return found
 
     def _room_hints(self) -> dict[HintName, frozenset[int]]:
-        """Return the hints that are sets of rooms."""
         given: dict[HintName, frozenset[int] | None] = {"rooms": self.rooms, "level": self.level}
         return {name: rooms for name, rooms in given.items() if rooms is not None}
 

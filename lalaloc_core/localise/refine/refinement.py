@@ -124,7 +124,6 @@ def refined_candidates(
 
 
 def _put_back(starts: list[Candidate], result: RefinementResult, excluded: Bool[np.ndarray, "k"]) -> RefinementResult:
-    """Return the result with excluded poses put back to their starts."""
     if not excluded.any():
         return result
     own = {

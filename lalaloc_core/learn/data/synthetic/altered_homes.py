@@ -209,7 +209,6 @@ class CopiedScenes(DerivedScenes):
 
 
 def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
-    """Return the indices of the doors that a camera sees."""
     kinds = _visible_kinds(plan, camera)
     document = plan.to_dict()
     openings = document.get("openings", [])
