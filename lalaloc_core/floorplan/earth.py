@@ -49,13 +49,16 @@ class Anchor:
 
     def to_earth(self, position_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert positions (m) in the plan frame to longitudes and latitudes (degrees)."""
-        return LocalFrame(self.longitude, self.latitude).to_earth(self._turned(position_m))
+        north = math.radians(self.north_deg)
+        # North lies `north_deg` clockwise from the plan's +y.
+        turn = np.array([[math.cos(north), math.sin(north)], [-math.sin(north), math.cos(north)]])
+        return LocalFrame(self.longitude, self.latitude).to_earth(position_m @ turn)
 
     def to_plan(self, lon_lat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert longitudes and latitudes (degrees) to positions (m) in the plan frame."""
         east_north = LocalFrame(self.longitude, self.latitude).to_local(lon_lat)
         north = math.radians(self.north_deg)
-        # The transpose of the rotation in `_turned`.
+        # The transpose of the rotation in `to_earth`.
         return east_north @ np.array([[math.cos(north), -math.sin(north)], [math.sin(north), math.cos(north)]])
 
     def true_azimuth_deg(self, position_m: tuple[float, float], azimuth_deg: float) -> float:
@@ -79,11 +82,6 @@ class Anchor:
         convergence_deg = LocalFrame(self.longitude, self.latitude).convergence_deg(np.array([longitude, latitude]))
         north_deg = (self.north_deg - convergence_deg) % 360.0
         return Anchor(float(latitude), float(longitude), self.altitude_m, north_deg)
-
-    def _turned(self, position_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Rotate positions to metres east and north: north lies `north_deg` clockwise from the plan's +y."""
-        north = math.radians(self.north_deg)
-        return position_m @ np.array([[math.cos(north), math.sin(north)], [-math.sin(north), math.cos(north)]])
 
 
 @dataclass(frozen=True)

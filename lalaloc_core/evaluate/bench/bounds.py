@@ -7,7 +7,7 @@ encoder can find: other evidence must.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,7 +68,7 @@ def bench_bounds(setting: Setting) -> dict[str, Any]:
     for kind, (count, field_deg) in {"sphere": (None, _FIELDS_DEG[0]), **views, "turn": _TURN}.items():
         scenes = ViewScenes(homes, field_deg, count or 1)
         loaded = (scenes.load(name) for name in scenes.scenes("test"))
-        figures[kind] = _shares(_outcomes(model, (asked for scene in loaded for asked in _asked(model, scene, count))))
+        figures[kind] = _shares(model, (asked for scene in loaded for asked in _asked(model, scene, count)))
     if setting.annotated is not None:
         figures |= {f"annotated_{field:g}": _of_annotated(model, setting.annotated, field) for field in _ANNOTATED_DEG}
     return figures
@@ -78,10 +78,10 @@ def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str
     photographs = AnnotatedPhotographs(folder)
     scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
     galleries = [scenes.load(key.scene) for key in photographs.keys(galleries=1) if not key.outline]
-    return _shares(_outcomes(model, (asked for scene in galleries for asked in _asked(model, scene, 1))))
+    return _shares(model, (asked for scene in galleries for asked in _asked(model, scene, 1)))
 
 
-def _outcomes(model: LocalModel, every: Iterable[Asked]) -> dict[str, Counter[str]]:
+def _shares(model: LocalModel, every: Iterable[Asked]) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     outcomes: dict[str, Counter[str]] = {name: Counter() for name in _ROWS}
     for asked in every:
@@ -89,10 +89,6 @@ def _outcomes(model: LocalModel, every: Iterable[Asked]) -> dict[str, Counter[st
         for name, (noise, opened) in _ROWS.items():
             query = with_truth(asked, noise=noise, openings=opened, rng=rng)
             outcomes[name][_outcome(model, asked, grid, query)] += 1
-    return outcomes
-
-
-def _shares(outcomes: Mapping[str, Counter[str]]) -> dict[str, Any]:
     return {
         name: {"n": found.total(), **{cause: count / found.total() for cause, count in sorted(found.items())}}
         for name, found in outcomes.items()

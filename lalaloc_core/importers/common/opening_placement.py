@@ -142,25 +142,19 @@ def _free_part(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> Ske
     start, end = np.array(opening.start), np.array(opening.end)
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
+    # Parts of the line that kept openings in its wall take, as distances from its start.
+    ends = np.array([(*taken.start, *taken.end) for taken in kept]).reshape(-1, 2, 2) - start
+    apart = np.abs(along[0] * ends[..., 1] - along[1] * ends[..., 0]).max(axis=1, initial=0.0)
+    places = np.sort(ends @ along, axis=1)
+    overlaps = (apart <= 0.5 * _MAX_WALL_THICKNESS_M) & (places[:, 0] < length) & (places[:, 1] > 0.0)
     free = [(0.0, length)]
-    for low, high in _taken(start, along, length, kept):
+    for low, high in places[overlaps].tolist():
         free = [piece for lo, hi in free for piece in ((lo, min(hi, low)), (max(lo, high), hi)) if piece[1] > piece[0]]
     longest = max(free, key=lambda piece: piece[1] - piece[0], default=(0.0, 0.0))
     if longest[1] - longest[0] < max(_MIN_LENGTH_M, 0.5 * length):
         return None
     low, high = longest
     return replace(opening, start=point_xy(start + low * along), end=point_xy(start + high * along))
-
-
-def _taken(
-    start: Float[np.ndarray, "2"], along: Float[np.ndarray, "2"], length: float, kept: Sequence[SketchedOpening]
-) -> list[tuple[float, float]]:
-    """Return the parts of a line that kept openings in its wall take, as distances from its start."""
-    ends = np.array([(*taken.start, *taken.end) for taken in kept]).reshape(-1, 2, 2) - start
-    apart = np.abs(along[0] * ends[..., 1] - along[1] * ends[..., 0]).max(axis=1, initial=0.0)
-    places = np.sort(ends @ along, axis=1)
-    overlaps = (apart <= 0.5 * _MAX_WALL_THICKNESS_M) & (places[:, 0] < length) & (places[:, 1] > 0.0)
-    return [(float(low), float(high)) for low, high in places[overlaps]]
 
 
 def _stack_window(opening: SketchedOpening, kept: list[SketchedOpening]) -> None:

@@ -223,12 +223,9 @@ def _is_tray(shape: Shape) -> bool:
     return _fits(shape, _SHOWER_M) and shape.long_m <= _SQUARE * shape.short_m
 
 
-def _is_drain(part: Shape) -> bool:
-    return part.is_circle and _SHOWER_DRAIN_M[0] <= part.long_m <= _SHOWER_DRAIN_M[1]
-
-
 def _is_shower(shape: Shape, parts: Sequence[Shape]) -> bool:
-    drains = _outermost([part for part in parts if _is_drain(part)])
+    least_m, most_m = _SHOWER_DRAIN_M
+    drains = _outermost([part for part in parts if part.is_circle and least_m <= part.long_m <= most_m])
     if not _is_tray(shape) or len(drains) != 1:
         return False
     (drain,) = drains
