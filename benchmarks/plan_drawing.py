@@ -80,14 +80,13 @@ class DrawnPlan:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Home to draw, in metres from the lower left corner of the sheet, which lies at `origin_m` in the home's plan."""
+    """Home to draw, in metres from the lower left corner of the sheet."""
 
     rooms: list[shapely.Polygon]
     names: list[str]
     openings: list[OpeningSymbol]
     walls: BaseGeometry
     size_m: tuple[float, float]
-    origin_m: tuple[float, float]
 
 
 def draw_plan(
@@ -139,7 +138,7 @@ def model_of(home: Home, thickness: float) -> Model:
     walls = shapely.unary_union([room.buffer(thickness, join_style="mitre") for room in rooms]).difference(inside)
     walls = walls.difference(shapely.unary_union([o.cut.buffer(1e-4, join_style="mitre") for o in openings]))
     names, width, height = [room.name for room in home.plan.rooms], *map(float, size)
-    return Model(rooms, names, openings, walls, (width, height), (float(origin[0]), float(origin[1])))
+    return Model(rooms, names, openings, walls, (width, height))
 
 
 def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeometry) -> list[OpeningSymbol]:

@@ -309,9 +309,6 @@ class TestAlign:
             alone = align(scan, tree, starts[index : index + 1], config)
             np.testing.assert_allclose(alone.shift_m[0], together.shift_m[index], atol=1e-9)
             np.testing.assert_allclose(alone.rms_m[0], together.rms_m[index], atol=1e-9)
-            assert alone.iterations[0] == together.iterations[index]
-        assert together.iterations.max() <= config.max_iterations
-        assert together.iterations.min() < config.max_iterations
 
     def test_reported_distance_is_to_nearest_points(self) -> None:
         config, cloud = IcpConfig(max_iterations=3), np.random.default_rng(0).normal(size=(40, 2))

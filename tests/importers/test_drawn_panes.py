@@ -101,7 +101,7 @@ def _model() -> Model:
     walls = around.difference(inside).difference(
         shapely.union_all([o.cut.buffer(1e-4, join_style="mitre") for o in openings])
     )
-    return Model(rooms, ["kitchen", "bedroom"], openings, walls, (12.5, 7.2), (0.0, 0.0))
+    return Model(rooms, ["kitchen", "bedroom"], openings, walls, (12.5, 7.2))
 
 
 @pytest.mark.parametrize(("format", "style"), itertools.product(FILE_FORMATS, FILE_STYLES))

@@ -60,7 +60,6 @@ class Alignment:
     turn: Float[np.ndarray, "k"]
     shift_m: Float[np.ndarray, "k 2"]
     rms_m: Float[np.ndarray, "k"]
-    iterations: Float[np.ndarray, "k"]
 
 
 class Icp:
@@ -145,20 +144,18 @@ def align(
     """
     turn, shift = np.zeros(len(starts_m)), starts_m.astype(float)
     still = np.zeros(len(starts_m), dtype=int)
-    iterations = np.zeros(len(starts_m))
     active = np.arange(len(starts_m))
     for _ in range(config.max_iterations):
         _, nearest = tree.query(_moved(scan_m, turn[active], shift[active]))
         turn[active], moved = best_motion(scan_m, tree.data[nearest])
         step = np.linalg.norm(moved - shift[active], axis=1)
         shift[active] = moved
-        iterations[active] += 1
         still[active] = np.where(step < config.still_m, still[active] + 1, 0)
         active = active[still[active] < config.still_iterations]
         if len(active) == 0:
             break
     distance, _ = tree.query(_moved(scan_m, turn, shift))
-    return Alignment(turn, shift, np.sqrt(np.square(distance).mean(axis=1)), iterations)
+    return Alignment(turn, shift, np.sqrt(np.square(distance).mean(axis=1)))
 
 
 def best_motion(
