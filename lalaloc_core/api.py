@@ -43,8 +43,8 @@ from lalaloc_core.localise.answers.pinned import PinnedAlbum, PinnedPhotograph
 from lalaloc_core.localise.answers.turns import Turn, compose_turn
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.localise.local_model import LocalModel
-from lalaloc_core.localise.query import CameraHeight, known_heading, stated_height
-from lalaloc_core.localise.query.query import UNKNOWN_HEADING, check_height_m
+from lalaloc_core.localise.query import CameraHeight, stated_height
+from lalaloc_core.localise.query.query import UNKNOWN_HEADING, check_height_m, known_heading
 from lalaloc_core.localise.search.pipeline import run_steps
 from lalaloc_core.localise.tracking import Odometry, TrackState
 from lalaloc_core.localise.tracking.tracked_plans import TrackedPlans

@@ -5,10 +5,8 @@ rooms, `openings.py` places openings on walls, `rooms.py` checks all rooms toget
 the layout renderer, and `earth.py` relates a plan to latitude and longitude.
 """
 
-from lalaloc_core.floorplan.earth import MAX_FROM_ORIGIN_M, anchor_document
-from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.floorplan.json_values import DEFAULT_LIMITS, PlanLimits
-from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, Opening, OpeningFace
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, OpeningFace
 from lalaloc_core.floorplan.plan import FloorPlan
 from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_STD_M, FixturePlaces
 from lalaloc_core.floorplan.room_types import room_type_from_label

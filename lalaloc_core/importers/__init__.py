@@ -16,13 +16,12 @@ from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, ImportLimits, ImportStep, OnStep
 from lalaloc_core.importers.common.import_options import ImportOptions, KnownDistance
-from lalaloc_core.importers.common.import_report import ImportReport, LayerUse, Trace
+from lalaloc_core.importers.common.import_report import Trace
 from lalaloc_core.importers.common.sketch import Level
 from lalaloc_core.importers.importing import (
     EXPORT_FORMATS,
     FORMATS,
     ExportFormat,
-    Format,
     begins_with_plans,
     building_name,
     detect_format,

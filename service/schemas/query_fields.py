@@ -11,7 +11,8 @@ from pydantic_core import PydanticCustomError
 from lalaloc_core.answer_numbers import HEADING_MEANING
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
-from lalaloc_core.localise.query import DEFAULT_STD_M, RADIUS_RANGE_M, UNKNOWN_RANGE_M
+from lalaloc_core.localise.query import DEFAULT_STD_M, UNKNOWN_RANGE_M
+from lalaloc_core.localise.query.hints import RADIUS_RANGE_M
 from service.schemas.fields import Finite, needs, parse_json, reject_underscores
 from service.schemas.photographs import PhotographFields
 

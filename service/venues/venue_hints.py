@@ -14,7 +14,8 @@ from sqlalchemy import Row
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame
-from lalaloc_core.localise.query import HintName, Hints, NearInEach, log_factor, rooms_named
+from lalaloc_core.localise.query import HintName, Hints, rooms_named
+from lalaloc_core.localise.query.hints import NearInEach, log_factor
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from service.schemas import SessionDocument
 from service.schemas.query_fields import EarthPoint, HintFields

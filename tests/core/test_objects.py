@@ -16,7 +16,8 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.errors import InvalidFeaturesError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import Confidence, is_outside, reason_for
+from lalaloc_core.localise.belief import Confidence
+from lalaloc_core.localise.belief.confidence import is_outside, reason_for
 from lalaloc_core.localise.encode.features import FeatureEncoder, read_features
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.view_encoder import OBJECT_OUTPUTS, objects_of_views, outside_odds

@@ -17,17 +17,15 @@ from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.localise.belief import (
     GridCosts,
-    PoseUncertainty,
     Posterior,
-    Signals,
     Support,
     area_shares,
-    marginal_information,
     pose_uncertainty,
     probability_map,
     signals_of,
-    weighted_places,
 )
+from lalaloc_core.localise.belief.confidence import PoseUncertainty, Signals, marginal_information
+from lalaloc_core.localise.belief.posterior import weighted_places
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid

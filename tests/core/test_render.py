@@ -19,7 +19,8 @@ from lalaloc_core.conventions import (
     row_elevations,
     wrap_angle,
 )
-from lalaloc_core.floorplan import FloorPlan, pad_walls
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.render.profile import back_project, cast_rays, layout_depth, wall_profile
 from lalaloc_core.render.reference import reference_depth, room_mesh
 from tests.strategies import Scene, plan_of, plans, present, rectangle, scenes

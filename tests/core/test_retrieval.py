@@ -19,18 +19,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.plans import VALIDATION
 from lalaloc_core.localise.belief import suppress
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.match import (
-    Layouts,
-    LowestCosts,
-    MatchingConfig,
-    MatchingCost,
-    PlaceCost,
-    PoseGrid,
-    coarse_costs,
-    layouts_at,
-    likeliest,
-)
-from lalaloc_core.localise.match.coarse_pass import CoarseTable
+from lalaloc_core.localise.match import Layouts, MatchingConfig, MatchingCost, PlaceCost, PoseGrid, layouts_at
+from lalaloc_core.localise.match.coarse_pass import CoarseTable, LowestCosts, coarse_costs, likeliest
 from lalaloc_core.localise.match.cost_terms import latent_distances, precisions
 from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedOpenings, PredictedProfile, Query, rolled

@@ -31,7 +31,8 @@ from lalaloc_core.learn.training.training_data import TrainingData
 from lalaloc_core.learn.training.view_stage import middle
 from lalaloc_core.localise.encode.view_encoder import ViewEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, layouts_at
-from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query, RivalWall
+from lalaloc_core.localise.query import CameraHeight, PredictedProfile, Query
+from lalaloc_core.localise.query.query import RivalWall
 from lalaloc_core.nets.image_features import WallModes
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.view_network import ViewNetwork

@@ -24,7 +24,8 @@ from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.learn.metrics import Accuracy
-from lalaloc_core.localise.belief import HEADING_SEPARATION, RIGHT_WITHIN_M, marginal_information
+from lalaloc_core.localise.belief import HEADING_SEPARATION, RIGHT_WITHIN_M
+from lalaloc_core.localise.belief.confidence import marginal_information
 
 # Weight of unknown places in the fit, chosen on annotated photographs among 0.25, 0.4, 0.5 and 0.6: the lowest with
 # which at most 2 % of them have a confidence above 0.5 in plans of other buildings.

@@ -14,8 +14,8 @@ from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
-from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits
+from lalaloc_core.floorplan.earth import Anchor, anchor_document
 from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
 from lalaloc_core.floorplan.room_types import room_types_from_name, type_fields
 from lalaloc_core.importers.common.fixtures_by_name import place_fixtures, type_rooms

@@ -22,15 +22,8 @@ from lalaloc_core.localise.answers.documents import (
     TrackedAnswer,
 )
 from lalaloc_core.localise.answers.views import AssumedAngle, SeenObjectAnswer, ViewAnswer
-from lalaloc_core.localise.belief import (
-    Confidence,
-    advice_for,
-    information_bits,
-    is_outside,
-    photograph_heading,
-    pose_uncertainty,
-    reason_for,
-)
+from lalaloc_core.localise.belief import Confidence, photograph_heading, pose_uncertainty
+from lalaloc_core.localise.belief.confidence import advice_for, information_bits, is_outside, reason_for
 from lalaloc_core.localise.localisability.reports import known_of, step_after
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import KnownHeading

@@ -13,7 +13,7 @@ from lalaloc_core.answer_numbers import Cost, Degrees, Heading, LatentDistance, 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.answers.views import AssumedAngle, CameraAnswer, Document, ReadView, SeenArc, ViewAnswer
-from lalaloc_core.localise.belief import union_of_arcs
+from lalaloc_core.localise.belief.confidence import union_of_arcs
 from lalaloc_core.localise.match import PoseGrid
 from lalaloc_core.localise.query import Candidate
 from lalaloc_core.localise.query.query import HeadingSource

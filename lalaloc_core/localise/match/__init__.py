@@ -6,8 +6,7 @@ has the poses of a plan and what it shows there, and `coarse_pass.py` selects th
 to tell a good cost from chance.
 """
 
-from lalaloc_core.localise.match.coarse_pass import LowestCosts, coarse_costs, likeliest
 from lalaloc_core.localise.match.fit_by_chance import Cohort, cohort_of, cost_by_chance, log_cost_to_chance
 from lalaloc_core.localise.match.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.match.place_cost import OTHER_LINES, PlaceCost
-from lalaloc_core.localise.match.pose_grid import BinnedLayouts, Layouts, PoseGrid, grid_candidate, layouts_at
+from lalaloc_core.localise.match.pose_grid import Layouts, PoseGrid, grid_candidate, layouts_at

@@ -3,16 +3,7 @@
 Begin with `query.py`; `hints.py` has priors of the place.
 """
 
-from lalaloc_core.localise.query.hints import (
-    NO_HINTS,
-    RADIUS_RANGE_M,
-    HintName,
-    Hints,
-    Near,
-    NearInEach,
-    log_factor,
-    rooms_named,
-)
+from lalaloc_core.localise.query.hints import NO_HINTS, HintName, Hints, Near, rooms_named
 from lalaloc_core.localise.query.query import (
     DEFAULT_STD_M,
     UNKNOWN_RANGE_M,
@@ -24,11 +15,9 @@ from lalaloc_core.localise.query.query import (
     PredictedProfile,
     PredictedRoomType,
     Query,
-    RivalWall,
     SeenObject,
     SeenObjects,
     WallDirection,
-    known_heading,
     rolled,
     stated_height,
 )

@@ -19,18 +19,10 @@ from typing import Literal, TypeVar
 
 from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import (
-    Confidence,
-    Posterior,
-    Signals,
-    WeightedPlaces,
-    area_shares,
-    confidence_of,
-    distinct,
-    ranked,
-    signals_of,
-    weighted_places,
-)
+from lalaloc_core.localise.belief import Confidence, Posterior, area_shares, confidence_of, distinct, signals_of
+from lalaloc_core.localise.belief.confidence import Signals
+from lalaloc_core.localise.belief.posterior import WeightedPlaces, weighted_places
+from lalaloc_core.localise.belief.ranking import ranked
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid, cost_by_chance
 from lalaloc_core.localise.query import NO_HINTS, Candidate, HintName, Hints, Query

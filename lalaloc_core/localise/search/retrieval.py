@@ -16,17 +16,11 @@ from lalaloc_core.bundle import MatchingWeights
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import NEGLIGIBLE, GridCosts, suppress
+from lalaloc_core.localise.belief import GridCosts, suppress
+from lalaloc_core.localise.belief.posterior import NEGLIGIBLE
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
-from lalaloc_core.localise.match import (
-    MatchingConfig,
-    MatchingCost,
-    PlaceCost,
-    PoseGrid,
-    grid_candidate,
-    layouts_at,
-    likeliest,
-)
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, PoseGrid, grid_candidate, layouts_at
+from lalaloc_core.localise.match.coarse_pass import likeliest
 from lalaloc_core.localise.match.cost_terms import latent_distances
 from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS
 from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, HintName, Hints, Query

@@ -18,12 +18,12 @@ from lalaloc_core.localise.belief import (
     HEADING_SEPARATION,
     Posterior,
     Support,
-    WeightedPlaces,
     distinct,
     photograph_heading,
     pose_uncertainty,
     suppress,
 )
+from lalaloc_core.localise.belief.posterior import WeightedPlaces
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import PoseGrid, grid_candidate
 from lalaloc_core.localise.query import Candidate, Query
