@@ -23,16 +23,9 @@ import numpy as np
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
-from lalaloc_core.learn.data.dataset import (
-    Appearance,
-    Camera,
-    DatasetPhotograph,
-    FilePhotograph,
-    Scene,
-    Split,
-    collect_error,
-)
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, FilePhotograph, Scene, collect_error
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
+from lalaloc_core.learn.dataset_names import Split
 
 # Scene numbers of the official splits.
 OFFICIAL: dict[Split, range] = {"train": range(3000), "validation": range(3000, 3250), "test": range(3250, 3500)}

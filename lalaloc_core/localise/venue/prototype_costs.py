@@ -33,15 +33,10 @@ from lalaloc_core.localise.match.cost_terms import (
     smoothed,
 )
 from lalaloc_core.localise.query import PredictedCeiling, Query
-from lalaloc_core.localise.venue.prototypes import (
-    AZIMUTHS,
-    PER_BYTE,
-    STEPS,
-    azimuths,
-    trust_of_claims,
-    unpacked_openings,
-)
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, azimuths, trust_of_claims, unpacked_openings
 
+# Distance of neighbouring prototypes in grid steps: the diagonal of a chessboard square.
+_GRID_STEPS = math.sqrt(2.0)
 # Spacing of the tried logs of the camera height; prototypes' distances are too coarse for smaller differences.
 _OFFSET_SPACING = 0.2
 # Weight of openings relative to the matching cost's.
@@ -80,7 +75,7 @@ class PrototypeCosts:
         self._columns = azimuths(query.profile.log_m.shape[1])
         # Hypotheses closer than two azimuths of the prototypes cannot be distinguished.
         self._every = max(1, len(query.roll) // AZIMUTHS)
-        self.reach_m = config.grid_reach * STEPS * step_m
+        self.reach_m = config.grid_reach * _GRID_STEPS * step_m
         self.centre = query.profile.log_m[:: self._every, self._columns].astype(np.float32)
         self.precision = self.precisions(self.reach_m)
         self.offsets = _offsets(query)

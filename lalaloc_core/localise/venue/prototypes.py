@@ -13,7 +13,6 @@ gives every plan a mass, its unnormalised probability:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -25,8 +24,6 @@ from lalaloc_core.localise.match import PoseGrid, layouts_at
 from lalaloc_core.render.sampling import PoseSet
 
 AZIMUTHS = 32
-# Distance of neighbouring prototypes in grid steps: the diagonal of a chessboard square.
-STEPS = math.sqrt(2.0)
 # Number of opening classes packed into a byte, two bits each, the first azimuth lowest.
 PER_BYTE = 4
 # Record of a prototype, in memory, files and the database. `log_profile` is in log metres, `log_area` in log square
