@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lalaloc_core.cli import main
 from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluate.methods.method import Pose
-from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, summarise, write_worst
+from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, is_symmetric, summarise, symmetric_by_chance, write_worst
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, SCORES_FILE, Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import (
@@ -22,13 +22,11 @@ from lalaloc_core.evaluate.runs.score import (
     choose_worst,
     expected_calibration_error,
     heading_errors_deg,
-    is_symmetric,
     outcomes,
     position_errors_m,
     reliability_bins,
     score,
     score_run,
-    symmetric_by_chance,
 )
 from tests.core.questions import prediction_of, run_info
 from tests.strategies import plan_of, present, rectangle

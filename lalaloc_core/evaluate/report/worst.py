@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from lalaloc_core.errors import BundleError, DatasetError, LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, encode, read_image
@@ -17,15 +18,9 @@ from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.evaluation import question_of
 from lalaloc_core.evaluate.runs.factories import build_dataset, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import (
-    Outcome,
-    choose_worst,
-    is_symmetric,
-    outcomes,
-    position_errors_m,
-    symmetric_by_chance,
-)
+from lalaloc_core.evaluate.runs.score import ALIGNMENT_LIMIT_M, Outcome, choose_worst, outcomes, position_errors_m
 from lalaloc_core.files import atomic_write
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import Query
@@ -43,7 +38,7 @@ class WorstQuery:
 
     Attributes:
         first_error_m: position error after the first stage.
-        symmetric: whether the pose fits the mirrored room; see `score.is_symmetric`.
+        symmetric: whether the pose fits the mirrored room; see `is_symmetric`.
         symmetric_by_chance: probability of that for a random wrong position in the room.
         true_cost, found_cost: matching cost of the true and of the found pose; None if the model predicts no wall
             profile. The search missed a true pose with a lower cost; no search finds one with a higher cost.
@@ -185,6 +180,31 @@ class _ReopenedRun:
                 scene=scene.name,
             )
         return scene, camera
+
+
+def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
+    """Return whether a misaligned pose in the right room fits the mirrored room, see `_symmetric_area`."""
+    pose = prediction.final_pose
+    if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
+        return False
+    return shapely.Point(pose.x_m, pose.y_m).within(_symmetric_area(plan, prediction))
+
+
+def symmetric_by_chance(plan: FloorPlan, prediction: Prediction) -> float:
+    """Return the share of the wrong positions in the true room for which `is_symmetric` holds."""
+    truth = prediction.truth
+    room = plan.rooms[truth.room_index].shape
+    wrong = room.difference(shapely.Point(truth.x_m, truth.y_m).buffer(ALIGNMENT_LIMIT_M))
+    return wrong.intersection(_symmetric_area(plan, prediction)).area / wrong.area if wrong.area > 0.0 else 0.0
+
+
+def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry:
+    """Return the surroundings of the true position mirrored along either axis of its room's box, and turned by 180°."""
+    truth = prediction.truth
+    left, bottom, right, top = plan.rooms[truth.room_index].shape.bounds
+    across, along = left + right - truth.x_m, bottom + top - truth.y_m
+    places = [(across, truth.y_m), (truth.x_m, along), (across, along)]
+    return shapely.union_all(shapely.points(places)).buffer(ALIGNMENT_LIMIT_M)
 
 
 def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:

@@ -15,7 +15,6 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-import shapely
 from jaxtyping import Bool, Float, Int
 from scipy.stats import binomtest
 
@@ -24,7 +23,6 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.predictions import SCORES_FILE, Prediction, RunFolder, without_infinity
 from lalaloc_core.files import atomic_write
-from lalaloc_core.floorplan import FloorPlan
 
 _RESAMPLES = 1000
 _COVERAGE = 0.95
@@ -324,31 +322,6 @@ def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Predicti
     errors_m = position_errors_m(predictions)
     order = np.argsort(-_infinite(errors_m), kind="stable")
     return [predictions[index] for index in order[:count]]
-
-
-def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
-    """Return whether a misaligned pose in the right room fits the mirrored room, see `_symmetric_area`."""
-    pose = prediction.final_pose
-    if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
-        return False
-    return shapely.Point(pose.x_m, pose.y_m).within(_symmetric_area(plan, prediction))
-
-
-def symmetric_by_chance(plan: FloorPlan, prediction: Prediction) -> float:
-    """Return the share of the wrong positions in the true room for which `is_symmetric` holds."""
-    truth = prediction.truth
-    room = plan.rooms[truth.room_index].shape
-    wrong = room.difference(shapely.Point(truth.x_m, truth.y_m).buffer(ALIGNMENT_LIMIT_M))
-    return wrong.intersection(_symmetric_area(plan, prediction)).area / wrong.area if wrong.area > 0.0 else 0.0
-
-
-def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry:
-    """Return the surroundings of the true position mirrored along either axis of its room's box, and turned by 180°."""
-    truth = prediction.truth
-    left, bottom, right, top = plan.rooms[truth.room_index].shape.bounds
-    across, along = left + right - truth.x_m, bottom + top - truth.y_m
-    places = [(across, truth.y_m), (truth.x_m, along), (across, along)]
-    return shapely.union_all(shapely.points(places)).buffer(ALIGNMENT_LIMIT_M)
 
 
 def _outcome(prediction: Prediction, stage: str | None, error_m: float) -> Outcome:
