@@ -15,13 +15,7 @@ from lalaloc_core.learn.training.batch_streams import LayoutBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, TrainConfig
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import (
-    TrainingStage,
-    build_decoder,
-    build_image_encoder,
-    build_layout_encoder,
-    sphere_batches,
-)
+from lalaloc_core.learn.training.stages import TrainingStage, build_image_encoder, build_layout_encoder, sphere_batches
 from lalaloc_core.nets import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder, LayoutNetwork
 from lalaloc_core.render.profile import back_project, layout_depth
 
@@ -34,7 +28,7 @@ class LayoutStage(TrainingStage[LayoutStageConfig]):
     def __init__(self, config: TrainConfig, source: Source) -> None:
         self.config, self.settings, self.source = config, config.layout, source
         self.encoder = build_layout_encoder(config)
-        self.decoder = build_decoder(config)
+        self.decoder = _decoder(config)
         self.objective = LayoutObjective(config.layout, self.encoder, self.decoder)
         self.modules: dict[str, nn.Module] = {"layout_encoder": self.encoder}
         if self.decoder is not None:
@@ -111,6 +105,11 @@ def chamfer_to_anchors(groups: Batch, stage: LayoutStageConfig) -> Float[Tensor,
     return chamfer_distance(neighbours, repeated).reshape(anchors, size - 1)
 
 
+def _decoder(config: TrainConfig) -> LayoutDecoder | None:
+    """Return an untrained layout decoder; None if the decoding loss is off."""
+    return LayoutDecoder(config.layout_sizes.latent_size) if config.layout.decode_weight else None
+
+
 def _decoding_error(decoder: LayoutDecoder, latent: Float[Tensor, "a n d"], groups: Batch) -> Tensor:
     """Return the mean |L' - L| (m) between decoded latents and these layouts."""
     profile, camera, ceiling = _flatten(groups)
@@ -150,7 +149,7 @@ class EndToEndStage(TrainingStage[ImageStageConfig]):
                 )
         # The image stage's settings have schedule, batch and weight of the latent distance; `config.layout` the rest.
         self.config, self.settings, self.source = config, config.image, source
-        layout_encoder, decoder = build_layout_encoder(config), build_decoder(config)
+        layout_encoder, decoder = build_layout_encoder(config), _decoder(config)
         self.objective = LayoutObjective(config.layout, layout_encoder, decoder)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"layout_encoder": layout_encoder, "image_encoder": self.encoder}

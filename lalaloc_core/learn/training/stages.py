@@ -17,7 +17,7 @@ from lalaloc_core.learn.training.batches import Batch, Photographs, load_batches
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredRenderer
 from lalaloc_core.learn.training.sources import GeneratedSource, Source
-from lalaloc_core.nets import ImageEncoder, LayoutDecoder, LayoutNetwork, RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.nets import ImageEncoder, LayoutNetwork, RingImageEncoder, RingLayoutEncoder
 from lalaloc_core.nets.image_features import StructureFeatures, WallModes
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.sphere_network import HorizonEncoder, TrunkImageEncoder
@@ -68,11 +68,6 @@ def build_image_encoder(config: TrainConfig) -> ImageEncoder:
     if config.architecture == "trunk":
         return TrunkImageEncoder(config.trunk, config.ring)
     return RingImageEncoder(config.ring) if config.has_ring else PaperImageEncoder(config.paper)
-
-
-def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
-    """Build an untrained layout decoder; None if the decoding loss is off."""
-    return LayoutDecoder(config.layout_sizes.latent_size) if config.layout.decode_weight else None
 
 
 def sphere_batches(
