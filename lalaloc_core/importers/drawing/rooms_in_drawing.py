@@ -7,9 +7,8 @@ drawing wins, and the report says by what. `room_bounds.py` has the bounds that 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -17,14 +16,13 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import check_network, check_overlaps, polygons_from_geometry, side_lengths
+from lalaloc_core.importers.common.geometry import check_overlaps, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
 from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.drawn_openings import cut_painted, drawn_panes
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose, explained_size
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, clusters, split_lines
 
-_MAX_SEGMENTS = 60_000
 _MAX_NAMED = 8
 
 
@@ -307,19 +305,6 @@ def _is_stroke_of_letter(shape: shapely.Polygon, bounds: RoomBounds) -> bool:
     return side_lengths(shape)[1] < bounds.letter_m and shape.buffer(-0.5 * bounds.letter_stroke_m).is_empty
 
 
-def split_lines(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
-    """Return the straight pieces of lines."""
-    pieces = []
-    for line in lines:
-        points = shapely.get_coordinates(line)
-        pieces += [shapely.LineString(pair) for pair in pairwise(points) if (pair[0] != pair[1]).any()]
-    if len(pieces) > _MAX_SEGMENTS:
-        raise InvalidFloorPlanError(
-            f"{len(pieces)} lines could be walls; the limit is {_MAX_SEGMENTS}; set layers to the layers of the walls"
-        )
-    return pieces
-
-
 def _closers(drawing: Drawing, bounds: RoomBounds) -> list[BaseGeometry]:
     """Return doors and windows drawn as areas across their wall, or as lines in it."""
     areas = [area.shape for area in drawing.areas if area.role in ("door", "window", "passage")]
@@ -352,22 +337,6 @@ class GapFinder:
             if fits and tip_distance <= self._bounds.open_leaf * gap.width and (best is None or distance < best[0]):
                 best = (distance, int(end) // 2)
         return None if best is None else best[1]
-
-
-def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
-    """Group shapes that are near each other into one geometry each."""
-    if not shapes:
-        return []
-    check_network(shapes)
-    around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
-    regions = list(shapely.get_parts(around))
-    tree = shapely.STRtree(regions)
-    members: dict[int, list[BaseGeometry]] = {}
-    for shape in shapes:
-        indices = tree.query(shape, predicate="intersects")
-        if len(indices):
-            members.setdefault(int(indices[0]), []).append(shape)
-    return [shapely.GeometryCollection(group) for group in members.values()]
 
 
 # Walls by which rooms are looked for, in words, in the order of trust.

@@ -33,16 +33,9 @@ from lalaloc_core.importers.drawing.door_leaves import (
 )
 from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, without_sizes, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
-from lalaloc_core.importers.drawing.rooms_in_drawing import (
-    GapFinder,
-    choose_reading,
-    clusters,
-    marked_rooms,
-    report_unused,
-    split_lines,
-)
+from lalaloc_core.importers.drawing.rooms_in_drawing import GapFinder, choose_reading, marked_rooms, report_unused
 from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale, measures_of
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing, clusters, split_lines
 
 # Letters of a line of prose, and the least number of such lines on a page of text.
 _LINE_LETTERS, _MIN_LINES_OF_TEXT = 25, 8

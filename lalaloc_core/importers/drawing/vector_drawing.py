@@ -6,16 +6,18 @@ The readers of SVG, PDF and DXF produce a `Drawing`; `sketch_drawing` finds room
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import point_xy
+from lalaloc_core.importers.common.geometry import check_network, point_xy
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
@@ -28,6 +30,7 @@ CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
 _SWING_DEG = (55.0, 125.0)
 _ROUND = 0.03
+_MAX_SEGMENTS = 60_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +213,35 @@ def fit_swing(
         return None
     hinge, first, last = centre + middle, points[0], points[-1]
     return Swing(point_xy(hinge), point_xy(first), point_xy(last), layer)
+
+
+def split_lines(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
+    """Return the straight pieces of lines."""
+    pieces = []
+    for line in lines:
+        points = shapely.get_coordinates(line)
+        pieces += [shapely.LineString(pair) for pair in pairwise(points) if (pair[0] != pair[1]).any()]
+    if len(pieces) > _MAX_SEGMENTS:
+        raise InvalidFloorPlanError(
+            f"{len(pieces)} lines could be walls; the limit is {_MAX_SEGMENTS}; set layers to the layers of the walls"
+        )
+    return pieces
+
+
+def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
+    """Group shapes that are near each other into one geometry each."""
+    if not shapes:
+        return []
+    check_network(shapes)
+    around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
+    regions = list(shapely.get_parts(around))
+    tree = shapely.STRtree(regions)
+    members: dict[int, list[BaseGeometry]] = {}
+    for shape in shapes:
+        indices = tree.query(shape, predicate="intersects")
+        if len(indices):
+            members.setdefault(int(indices[0]), []).append(shape)
+    return [shapely.GeometryCollection(group) for group in members.values()]
 
 
 def is_dark(red: float, green: float, blue: float) -> bool:
