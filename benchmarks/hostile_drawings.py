@@ -23,9 +23,9 @@ def _svg_lines(lines: Sequence[tuple[Point, Point]], attributes: str = "") -> by
     return _svg(f'<path d="{path}" fill="none" stroke="black" {attributes}/>')
 
 
-def _svg_rings(rings: Sequence[Sequence[Point]], attributes: str = "") -> bytes:
+def _svg_rings(rings: Sequence[Sequence[Point]]) -> bytes:
     path = "".join("M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in ring) + "z" for ring in rings)
-    return _svg(f'<path d="{path}" {attributes}/>')
+    return _svg(f'<path d="{path}" />')
 
 
 def _svg_many(rings: Sequence[Sequence[Point]], attributes: str = "", end: str = "z") -> bytes:

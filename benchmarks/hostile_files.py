@@ -175,7 +175,7 @@ def _grid(pitch: int, line: int) -> Image.Image:
     return _tiled(pattern)
 
 
-def _osm(ways: Sequence[Sequence[Point]], more: str = "", tags: str = '<tag k="indoor" v="room"/>') -> bytes:
+def _osm(ways: Sequence[Sequence[Point]], more: str = "") -> bytes:
     lines, number = ["<osm>"], 0
     for way in ways:
         refs = []
@@ -183,7 +183,7 @@ def _osm(ways: Sequence[Sequence[Point]], more: str = "", tags: str = '<tag k="i
             number += 1
             lines.append(f'<node id="{number}" lat="{y * 1e-5:.8f}" lon="{x * 1e-5:.8f}"/>')
             refs.append(f'<nd ref="{number}"/>')
-        lines.append(f'<way id="{number}">{"".join([*refs, refs[0]])}{tags}</way>')
+        lines.append(f'<way id="{number}">{"".join([*refs, refs[0]])}<tag k="indoor" v="room"/></way>')
     return "\n".join([*lines, more, "</osm>"]).encode()
 
 

@@ -60,19 +60,16 @@ def distinct(shapes: Sequence[Shape]) -> list[Shape]:
     return list(dict(zip(reversed(keys), reversed(shapes), strict=True)).values())[::-1]
 
 
-def check_overlaps(
-    shapes: Sequence[BaseGeometry], others: Sequence[BaseGeometry] | None = None, what: str = "areas"
-) -> None:
-    """Check the number of areas that lie over one another, or over `others`, before each pair is compared."""
-    number = len(shapes) + len(others or ())
-    limit, pairs = _PAIRS + _PAIRS_PER_AREA * number, 0
-    tree = shapely.STRtree(list(shapes if others is None else others))
+def check_overlaps(shapes: Sequence[BaseGeometry], what: str) -> None:
+    """Check the number of areas that lie over one another, before each pair is compared; errors call them `what`."""
+    limit, pairs = _PAIRS + _PAIRS_PER_AREA * len(shapes), 0
+    tree = shapely.STRtree(list(shapes))
     for begin in range(0, len(shapes), _AREAS_AT_A_TIME):
         pairs += tree.query(list(shapes[begin : begin + _AREAS_AT_A_TIME])).shape[1]
         if pairs > limit:
             raise InvalidFloorPlanError(
-                f"{number} {what} lie over one another in more than {limit} pairs, the limit for as many; remove those "
-                "that are drawn twice, or set layers to the layers of the plan"
+                f"{len(shapes)} {what} lie over one another in more than {limit} pairs, the limit for as many; remove "
+                "those that are drawn twice, or set layers to the layers of the plan"
             )
 
 

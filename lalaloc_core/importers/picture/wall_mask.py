@@ -46,6 +46,8 @@ _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
 _NOTCH_M = 0.15
 # Outlines of walls in a picture, with those of the areas that they enclose.
 _MAX_OUTLINES = 10_000
+# Edges of a smaller angle with an axis, or displacement across it, are parallel to it.
+_ALONG_AXIS_DEG, _ALONG_AXIS_M = 6.0, 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,12 +278,9 @@ def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
     return ink.to_plan(contour.reshape(-1, 2) + 0.5)
 
 
-def align_edges(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
+def align_edges(shape: shapely.Polygon) -> shapely.Polygon:
     """Align nearly axis-parallel edges with the axes; return the same polygon if that changes it too much."""
-    rings = [
-        _straight_ring(_sharp_ring(np.asarray(ring.coords)[:-1]), tolerance_deg, reach_m)
-        for ring in (shape.exterior, *shape.interiors)
-    ]
+    rings = [_straight_ring(_sharp_ring(np.asarray(ring.coords)[:-1])) for ring in (shape.exterior, *shape.interiors)]
     straight = shapely.Polygon(rings[0], rings[1:])
     if not straight.is_valid or abs(straight.area - shape.area) > 0.05 * shape.area:
         return shape
@@ -305,13 +304,13 @@ def _sharp_ring(points: np.ndarray) -> np.ndarray:
     return np.array(kept)
 
 
-def _straight_ring(points: np.ndarray, tolerance_deg: float, reach_m: float) -> np.ndarray:
+def _straight_ring(points: np.ndarray) -> np.ndarray:
     points = points.copy()
     steps = np.roll(points, -1, axis=0) - points
-    slope = np.tan(np.radians(tolerance_deg))
+    slope = np.tan(np.radians(_ALONG_AXIS_DEG))
     for axis in (0, 1):
         along, across = np.abs(steps[:, 1 - axis]), np.abs(steps[:, axis])
-        flat = (across <= slope * along) | ((across < reach_m) & (along > 2.0 * across))
+        flat = (across <= slope * along) | ((across < _ALONG_AXIS_M) & (along > 2.0 * across))
         for index in np.flatnonzero(flat):
             following = (index + 1) % len(points)
             middle = 0.5 * (points[index, axis] + points[following, axis])

@@ -98,7 +98,6 @@ def track_steps(
     known_heading: KnownHeading | None = None,
     hints: Hints = NO_HINTS,
     top_k: int = 5,
-    config: LocaliseConfig | None = None,
     clock: StageClock | None = None,
 ) -> TrackSteps:
     """Follow a camera to its next photograph; yield LPO jobs, as `pipeline.localise_steps` does.
@@ -109,7 +108,7 @@ def track_steps(
     Raises:
         InvalidStateError: the state is of another grid or model.
     """
-    photograph = _Photograph(plans, encoder, query, config or LocaliseConfig())
+    photograph = _Photograph(plans, encoder, query, LocaliseConfig())
     clock = clock or StageClock()
     state = plans.entered(state).with_sectors(len(query.roll))
     with clock.stage("predict"):

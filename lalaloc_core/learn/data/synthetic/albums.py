@@ -66,12 +66,11 @@ def taken_album(
     spheres: bool = False,
     furniture: FurnitureLevel = "full",
     textures: Path | None = None,
-    seed: int = 0,
 ) -> TakenAlbum:
     """Return an album of one home of a split."""
     number = SPLIT_NUMBERS[split]
-    home, rng = home_of(number, seed, index)
-    renderers = split_renderer_cache(number, seed, textures)
+    home, rng = home_of(number, 0, index)
+    renderers = split_renderer_cache(number, 0, textures)
     field_deg = float(rng.uniform(*FIELDS_DEG))
     camera = Perspective.of_hfov(*_SIZE, math.radians(field_deg))
     lowest_m = min(room.ceiling_height_m for room in home.plan.rooms) - CEILING_CLEARANCE_M
