@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import shapely
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from lalaloc_core.conventions import (
     TWO_PI,
@@ -19,10 +21,9 @@ from lalaloc_core.conventions import (
     row_elevations,
     wrap_angle,
 )
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.render.profile import back_project, cast_rays, layout_depth, wall_profile
-from lalaloc_core.render.reference import reference_depth, room_mesh
 from tests.strategies import Scene, plan_of, plans, present, rectangle, scenes
 
 COLUMNS = 64
@@ -39,6 +40,26 @@ def nearest_wall(position_m: np.ndarray, heading: np.ndarray, walls_m: np.ndarra
     return np.argmin(np.stack(alone), axis=0)
 
 
+def room_mesh(room: Room) -> trimesh.Trimesh:
+    return trimesh.creation.extrude_polygon(room.shape, room.ceiling_height_m)
+
+
+def reference_depth(room: Room, position_m: np.ndarray, heading: float, rows: int) -> np.ndarray:
+    """Return the layout depth (m) by casting every pixel's ray; inf for rays that escape through a seam of the mesh."""
+    j, i = np.meshgrid(np.arange(COLUMNS), np.arange(rows))
+    azimuth = heading + ((j + 0.5) / COLUMNS - 0.5) * 2.0 * np.pi
+    elevation = (0.5 - (i + 0.5) / rows) * np.pi
+    x = np.sin(azimuth) * np.cos(elevation)
+    y = np.cos(azimuth) * np.cos(elevation)
+    directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
+    origins = np.broadcast_to([*position_m, CAMERA_M], directions.shape)
+    mesh = room_mesh(room)
+    hits, ray, _ = RayMeshIntersector(mesh).intersects_location(origins, directions, multiple_hits=False)
+    depth = np.full(rows * COLUMNS, np.inf)
+    depth[ray] = np.linalg.norm(hits - origins[ray], axis=1)
+    return depth.reshape(rows, COLUMNS)
+
+
 class TestOracle:
     @given(scenes(count=1))
     def test_layout_depth_matches_mesh_ray_casting(self, scene: Scene) -> None:
@@ -46,7 +67,7 @@ class TestOracle:
         profile = profile_of(scene)
         depth = layout_depth(profile, np.full(1, CAMERA_M), scene.ceiling_height_m, rows)[0]
         position, heading = scene.poses.position_m[0], float(scene.heading[0])
-        oracle = reference_depth(scene.plan.rooms[0], position, heading, CAMERA_M, rows, COLUMNS)
+        oracle = reference_depth(scene.plan.rooms[0], position, heading, rows)
         # Next to an occluding corner rounding decides which wall a ray hits; such columns are skipped.
         before, after = (
             wall_profile(scene.poses.position_m, scene.heading + shift, scene.walls_m, COLUMNS)[0]
