@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,24 +66,20 @@ def bench_bounds(setting: Setting) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     for kind, (count, field_deg) in {"sphere": (None, _FIELDS_DEG[0]), **views, "turn": _TURN}.items():
         scenes = ViewScenes(homes, field_deg, count or 1)
-        loaded = (scenes.load(name) for name in scenes.scenes("test"))
-        figures[kind] = _shares(model, (asked for scene in loaded for asked in _asked(model, scene, count)))
+        figures[kind] = _shares(model, scenes, scenes.scenes("test"), count)
     if setting.annotated is not None:
-        figures |= {f"annotated_{field:g}": _of_annotated(model, setting.annotated, field) for field in _ANNOTATED_DEG}
+        photographs = AnnotatedPhotographs(setting.annotated)
+        galleries = [key.scene for key in photographs.keys(galleries=1) if not key.outline]
+        for field_deg in _ANNOTATED_DEG:
+            scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
+            figures[f"annotated_{field_deg:g}"] = _shares(model, scenes, galleries, 1)
     return figures
 
 
-def _of_annotated(model: LocalModel, folder: Path, field_deg: float) -> dict[str, Any]:
-    photographs = AnnotatedPhotographs(folder)
-    scenes = ViewScenes(photographs, field_deg, _ANNOTATED_VIEWS)
-    galleries = [scenes.load(key.scene) for key in photographs.keys(galleries=1) if not key.outline]
-    return _shares(model, (asked for scene in galleries for asked in _asked(model, scene, 1)))
-
-
-def _shares(model: LocalModel, every: Iterable[Asked]) -> dict[str, Any]:
+def _shares(model: LocalModel, scenes: ViewScenes, names: Iterable[str], count: int | None) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     outcomes: dict[str, Counter[str]] = {name: Counter() for name in _ROWS}
-    for asked in every:
+    for asked in (asked for name in names for asked in _asked(model, scenes.load(name), count)):
         grid = model.grid(asked.plan, asked.query.camera_height.height_m)
         for name, (noise, opened) in _ROWS.items():
             query = with_truth(asked, noise=noise, openings=opened, rng=rng)
