@@ -160,7 +160,9 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     closing = [swing for swing in (*leaves, *drawn_leaves(drawing)) if finder.closed_by(swing) is not None]
     swings = [swing for swing in (*drawing.swings, *closing) if LEAF_M[0] <= swing.radius <= LEAF_M[1]]
     sketch.openings = [*_symbols(drawing, closing, bounds.symbol_m), *_swings(swings, finder, shapes)]
-    sketch.leaves_m = _leaf_widths(swings, finder)
+    # Widths of leaves that close a gap, one for every gap; of all leaves without gaps.
+    leaf_m = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
+    sketch.leaves_m = list(leaf_m.values()) or [swing.radius for swing in swings]
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
     taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
     rooms = shapely.STRtree([room.shape for room in shapes])
@@ -316,12 +318,6 @@ def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -
         elif not walls.is_empty:
             found.append(_closed_leaf(swing, walls))
     return found
-
-
-def _leaf_widths(swings: Sequence[Swing], finder: GapFinder) -> list[float]:
-    """Return the widths of leaves that close a gap, one for every gap; of all leaves without gaps."""
-    closing = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
-    return list(closing.values()) or [swing.radius for swing in swings]
 
 
 def _closed_leaf(swing: Swing, walls: BaseGeometry) -> SketchedOpening:

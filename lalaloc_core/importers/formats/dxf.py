@@ -207,7 +207,10 @@ def _weight(entity: DXFEntity) -> int:
 def _read_drawing(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
     drawing = Drawing()
     hidden = {layer.dxf.name.casefold() for layer in document.layers if layer.is_off() or layer.is_frozen()}
-    sag = _sag(document)
+    low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
+    size = max(abs(high[0] - low[0]), abs(high[1] - low[1]))
+    # The maximum distance of a curve from its polyline, in drawing units.
+    sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     _name_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
@@ -441,10 +444,3 @@ def _filled_areas(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
         return []
     usable = [ring for ring in rings if len(ring) >= 4 and in_range(ring)]
     return even_odd_polygons(part for ring in usable for part in polygons_from_geometry(shapely.Polygon(ring)))
-
-
-def _sag(document: DxfDocument) -> float:
-    """Return the maximum distance of a curve from its polyline, in drawing units."""
-    low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
-    size = max(abs(high[0] - low[0]), abs(high[1] - low[1]))
-    return _SAG * size if 0.0 < size < 1e9 else 0.01

@@ -108,7 +108,7 @@ def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
     return [
         Shot(
             home=home,
-            position_m=_position_in(room, rng) if _is_roomy(room) else _middle_of(room),
+            position_m=_staged_position(room, rng),
             room_index=index,
             heading=0.0,
             camera_height_m=float(height),
@@ -120,12 +120,10 @@ def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
     ]
 
 
-def _is_roomy(room: Room) -> bool:
-    """Return true if more than a sliver of the room keeps `POSE_MARGIN_M` from its walls."""
-    return room.shape.buffer(-POSE_MARGIN_M).area > 1e-2
-
-
-def _middle_of(room: Room) -> Float[np.ndarray, "2"]:
+def _staged_position(room: Room, rng: np.random.Generator) -> Float[np.ndarray, "2"]:
+    """Draw a position clear of the walls; of a room with no more than a sliver of such, return the middle."""
+    if room.shape.buffer(-POSE_MARGIN_M).area > 1e-2:
+        return _position_in(room, rng)
     return np.array(shapely.maximum_inscribed_circle(room.shape, 0.01).coords[0])
 
 
