@@ -218,7 +218,9 @@ def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) 
                 group.append(second)
                 used.add(j)
         if len(group) >= 2:
-            found.append(_window(group, ink))
+            ends = opening_line(shapely.MultiPoint(ink.to_plan(np.concatenate(group))).convex_hull)
+            assert ends is not None
+            found.append(SketchedOpening("window", *ends))
     return found
 
 
@@ -262,9 +264,3 @@ def _side_by_side(first: np.ndarray, second: np.ndarray, ink: Ink, walls: WallMa
     lengths = sorted(side_lengths(strip)[1] for strip in (a, b))
     shared = a.buffer(line, cap_style="square", join_style="mitre").intersection(b)
     return lengths[0] > 0.8 * lengths[1] and shared.length > lengths[0]
-
-
-def _window(group: list[np.ndarray], ink: Ink) -> SketchedOpening:
-    ends = opening_line(shapely.MultiPoint(ink.to_plan(np.concatenate(group))).convex_hull)
-    assert ends is not None
-    return SketchedOpening("window", *ends)

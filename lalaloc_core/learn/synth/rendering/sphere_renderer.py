@@ -130,7 +130,8 @@ class SphereRenderer:
     def _photograph(self, batch: SceneBatch, hits: Hits, direction: Float[Tensor, "b c 2"]) -> UInt8[Tensor, "b h w 3"]:
         radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
         if self._rays_per_pixel != (1, 1):
-            radiance = _shrink(radiance, self._rays_per_pixel)
+            planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
+            radiance = torch.nn.functional.avg_pool2d(planes, self._rays_per_pixel).permute(0, 2, 3, 1)
         exposure = batch.exposure if self._window is None else without_stitching(batch.exposure)
         return develop(radiance, exposure, self._noise)
 
@@ -146,11 +147,6 @@ class SphereRenderer:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(self._device)
-
-
-def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Float[Tensor, "b h2 w2 3"]:
-    planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
-    return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)
 
 
 def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBatch:
