@@ -9,7 +9,6 @@ The centre column of every sphere looks along the world's +y, so all headings ar
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -157,12 +156,11 @@ class Structured3D:
         found: dict[Appearance, DatasetPhotograph] = {}
         for furniture in FURNITURE:
             level = folder / furniture
-            files, depth_path = _names(level), level / "depth.png"
             for lighting in LIGHTING:
-                file = f"rgb_{lighting}light.png"
-                if file in files:
+                path, depth_path = level / f"rgb_{lighting}light.png", level / "depth.png"
+                if path.exists():
                     found[Appearance(furniture, lighting)] = FilePhotograph(
-                        path=level / file, scene=scene, room=room, depth_path=depth_path, size=self.sphere_size
+                        path=path, scene=scene, room=room, depth_path=depth_path, size=self.sphere_size
                     )
         return found
 
@@ -185,13 +183,10 @@ def _read_three(path: Path, scene: str, room: str) -> tuple[float, float, float]
     return values[0], values[1], values[2]
 
 
-def _names(folder: Path) -> list[str]:
-    """Return the names of a folder's entries; empty if it does not exist."""
-    return os.listdir(folder) if folder.is_dir() else []
-
-
 def _folders(folder: Path) -> list[Path]:
-    return [folder / name for name in _names(folder) if not name.startswith(".") and (folder / name).is_dir()]
+    """Return the folders in one; none if it does not exist."""
+    paths = folder.iterdir() if folder.is_dir() else ()
+    return [path for path in paths if not path.name.startswith(".") and path.is_dir()]
 
 
 def _by_number(folder: Path) -> tuple[int, str]:
