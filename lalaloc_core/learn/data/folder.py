@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import shapely
@@ -27,7 +26,7 @@ from lalaloc_core.errors import DatasetError, InvalidFloorPlanError, InvalidInpu
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.assembly import path_below, pose_fault
 from lalaloc_core.learn.data.dataset import Appearance, Camera, FilePhotograph, Scene, Split, collect_error
-from lalaloc_core.learn.dataset_names import HELDOUT_HOMES
+from lalaloc_core.learn.dataset_names import HELDOUT_HOMES, SPLITS
 
 PLAN_FILE = "plan.json"
 POSES_FILE = "poses.csv"
@@ -81,8 +80,8 @@ class OwnData:
         found: dict[str, Split] = {}
         for row in _read_table(path, ("scene", "split"), (), scene=None):
             scene, split = row.cells["scene"], row.cells["split"]
-            if split not in get_args(Split):
-                raise row.error("split", f"it must be one of {', '.join(get_args(Split))}")
+            if split not in SPLITS:
+                raise row.error("split", f"it must be one of {', '.join(SPLITS)}")
             if scene not in names:
                 raise row.error("scene", f"no folder of this name has a {PLAN_FILE}")
             if scene in found:
