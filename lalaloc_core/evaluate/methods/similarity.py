@@ -67,7 +67,7 @@ def layouts_at(
     return profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[rooms]
 
 
-class _Grid(ABC):
+class LayoutGrid(ABC):
     """Layouts of poses, compared with a query whose wall profile has `columns` columns."""
 
     columns: int
@@ -77,6 +77,7 @@ class _Grid(ABC):
         """Return the distance of the query to every pose."""
 
     def nearest(self, query: Layout) -> int:
+        """Return the index of the pose nearest to the query."""
         return int(self.distances(query).argmin())
 
     def _check_columns(self, query: Layout) -> None:
@@ -86,7 +87,7 @@ class _Grid(ABC):
             )
 
 
-class ChamferGrid(_Grid):
+class ChamferGrid(LayoutGrid):
     """Symmetric Chamfer distance (m) between back-projected point clouds, see `learn.metrics.chamfer_distance`."""
 
     def __init__(
@@ -165,7 +166,7 @@ class _Comparison:
         return float(KDTree(self._clouds_m[index]).query(searched)[0].sum()) / len(self._query_m)
 
 
-class DepthGrid(_Grid):
+class DepthGrid(LayoutGrid):
     """Mean absolute difference of layout depth images, in metres or relative to each image's maximum."""
 
     def __init__(
@@ -193,7 +194,7 @@ class DepthGrid(_Grid):
         return (depth_m / scale).astype(np.float32)
 
 
-class EdgeGrid(_Grid):
+class EdgeGrid(LayoutGrid):
     """2-D Chamfer distance (pixels) between the edges of layouts as spheres, which wrap around horizontally."""
 
     def __init__(
@@ -214,9 +215,6 @@ class EdgeGrid(_Grid):
         to_poses = self._field[:, edges.ravel()].mean(axis=1, dtype=np.float64)
         to_query = np.bincount(self._owner, weights=distance_field(edges).ravel()[self._pixel])
         return to_poses + to_query / self._count
-
-
-LayoutGrid = ChamferGrid | DepthGrid | EdgeGrid
 
 
 def layout_grid(metric: LayoutMetric, plan: FloorPlan, poses: PoseSet, camera_height_m: float) -> LayoutGrid:
