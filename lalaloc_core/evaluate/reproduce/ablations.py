@@ -18,8 +18,8 @@ from lalaloc_core.errors import ConfigError
 from lalaloc_core.evaluate.reproduce.paper_tables import Budget
 from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.export.run_export import export_run
-from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training import PRESETS
+from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.run import StageName, train_stage
 from lalaloc_core.learn.training.training_data import TrainingData
