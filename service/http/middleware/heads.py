@@ -22,7 +22,6 @@ class FramingMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request."""
         if scope["type"] != "http" or not _framed_twice(scope):
             await self._app(scope, receive, send)
             return
@@ -44,7 +43,6 @@ class HeadMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request."""
         if scope["type"] != "http" or scope["method"] != "HEAD":
             await self._app(scope, receive, send)
             return
@@ -86,7 +84,6 @@ class CorsMiddleware:
         self._cors: tuple[frozenset[str], CORSMiddleware] | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request."""
         origins: frozenset[str] = getattr(scope["app"].state, "cors_origins", frozenset())
         if scope["type"] != "http" or not origins:
             await self._app(scope, receive, send)
@@ -125,8 +122,6 @@ class SecurityHeadersMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request."""
-
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
