@@ -46,7 +46,10 @@ _SERVICE = ""
 
 
 class AlbumSolver:
-    """Solver of the albums of all tenants; for one event loop."""
+    """Solver of the albums of all tenants; for one event loop.
+
+    `reads` are threads for the database, whose calls can read and write the features of an album.
+    """
 
     def __init__(
         self,
@@ -57,10 +60,6 @@ class AlbumSolver:
         settings: Settings,
         telemetry: Telemetry,
     ) -> None:
-        """Prepare the job.
-
-        `reads` are threads for the database, whose calls can read and write the features of an album.
-        """
         self._store, self._plans, self._localiser = store, plans, localiser
         self._reads, self._settings, self._telemetry = reads, settings, telemetry
         self._owner = uuid.uuid4().hex

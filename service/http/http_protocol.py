@@ -65,6 +65,13 @@ class PacedParser:
 
     Attributes:
         events_left: events that may be handled in this turn of the event loop.
+
+    Args:
+        transport: of the connection; it is not read while bytes wait.
+        parse: handles a piece; an empty one handles what the parser holds already.
+        piece_bytes: maximum size of a piece. A piece is parsed as a whole if the parser does not count its events.
+        may_read: tells whether the protocol itself wants more bytes.
+        spent: receives the CPU time (s) of each turn.
     """
 
     def __init__(
@@ -75,15 +82,6 @@ class PacedParser:
         may_read: Callable[[], bool],
         spent: Callable[[float], None],
     ) -> None:
-        """Create a feeder.
-
-        Args:
-            transport: of the connection; it is not read while bytes wait.
-            parse: handles a piece; an empty one handles what the parser holds already.
-            piece_bytes: maximum size of a piece. A piece is parsed as a whole if the parser does not count its events.
-            may_read: tells whether the protocol itself wants more bytes.
-            spent: receives the CPU time (s) of each turn.
-        """
         self.events_left, self._transport, self._parse = EVENTS_PER_TURN, transport, parse
         self._piece_bytes, self._may_read, self._spent = piece_bytes, may_read, spent
         self._waiting = bytearray()

@@ -36,14 +36,13 @@ _MAX_MAKING = 2
 
 
 class EncoderReplica:
-    """Encoder of photographs."""
+    """Encoder of photographs.
+
+    Raises:
+        RuntimeError: this machine has a different bundle.
+    """
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
-        """Load the networks.
-
-        Raises:
-            RuntimeError: this machine has a different bundle.
-        """
         self._encoder = warm_encoder(_same_bundle(settings, model_sha256), settings)
 
     def query(
@@ -62,7 +61,6 @@ class LpoReplica:
     """Pose refinement on torch: the body of an LPO worker, in a process that Ray supervises."""
 
     def __init__(self, settings: Settings, model_sha256: str) -> None:
-        """Load the refiner; check the bundle as `EncoderReplica` does."""
         self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.compute.worker_threads)
 
     def refine(self, job: RefinementJob) -> RefinementResult:
@@ -72,7 +70,7 @@ class LpoReplica:
 
 
 class _ServiceReplica:
-    """The service without HTTP, with remote encoder, LPO and indices."""
+    """The service without HTTP, with remote encoder and LPO; indices of venues are remote if there are `shards`."""
 
     def __init__(
         self,
@@ -82,10 +80,6 @@ class _ServiceReplica:
         lpo: DeploymentHandle | None = None,
         shards: Sequence[DeploymentHandle] = (),
     ) -> None:
-        """Start the service; check the bundle as `EncoderReplica` does.
-
-        Without `shards`, this process has the indices of venues.
-        """
         _same_bundle(settings, model_sha256)
         configure_logging(settings.log_level)
         backends = Backends(
@@ -106,7 +100,6 @@ class IndexReplica(_ServiceReplica):
     """Shard of the indices of venues; stages of a search are called by `index_shards.RemoteShard`."""
 
     def __init__(self, settings: Settings, model_sha256: str, encoder: DeploymentHandle) -> None:
-        """Start the service; check the bundle as `EncoderReplica` does."""
         super().__init__(settings, model_sha256, encoder)
         self._making: dict[bytes, asyncio.Task[None]] = {}
 

@@ -57,7 +57,10 @@ class _PendingJob:
 
 
 class RenditionCache:
-    """Files of stored plans, for one event loop. Jobs that no request waits for are cancelled before they begin."""
+    """Files of stored plans, for one event loop. Jobs that no request waits for are cancelled before they begin.
+
+    `max_pending` files are made or wait, shared between clients. A prediction needs one of the `turns`, and a core.
+    """
 
     def __init__(
         self,
@@ -71,10 +74,6 @@ class RenditionCache:
         turns: FairSemaphore,
         cores: FairSemaphore,
     ) -> None:
-        """Start the threads.
-
-        `max_pending` files are made or wait, shared between clients. A prediction needs one of the `turns`, and a core.
-        """
         self._plans, self._converter, self._bundle, self._step_m = plans, converter, bundle, step_m
         self._threads = Threads("lalaloc-renditions", _THREADS)
         self._cache: BoundedCache[_Key, Rendition] = BoundedCache(limit_bytes, lambda made: len(made.content))

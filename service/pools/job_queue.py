@@ -76,6 +76,9 @@ class PendingJob:
 class JobQueue:
     """Jobs that wait for a worker, those of the client with the least recent CPU time first. Thread-safe.
 
+    `served_by` tells whether a worker is expected to be warm at a time (`monotonic`); without shares in the `workers`,
+    a client can use all of them.
+
     Attributes:
         accounts: CPU time of the clients.
     """
@@ -83,11 +86,6 @@ class JobQueue:
     def __init__(
         self, limit: int, served_by: Callable[[float], bool], accounts: CpuAccounts, workers: Shares | None = None
     ) -> None:
-        """Create an empty queue.
-
-        `served_by` tells whether a worker is expected to be warm at a time (`monotonic`); without shares in the
-        `workers`, a client can use all of them.
-        """
         self.accounts, self._served_by, self._workers = accounts, served_by, workers
         self._waiting: FairQueue[PendingJob] = FairQueue(accounts)
         self._room = Shares(limit)

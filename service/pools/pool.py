@@ -50,7 +50,17 @@ class _Parts:
 
 
 class WorkerPool(Generic[Job, Result]):
-    """Bounded queue in front of supervised workers; safe to use from any thread."""
+    """Bounded queue in front of supervised workers; safe to use from any thread.
+
+    Args:
+        spec: program of the workers.
+        workers: number of workers.
+        queue_limit: maximum number of waiting jobs, besides the running ones.
+        keep_spare: keep one worker free of clients that already have jobs running; for jobs that take seconds.
+        accounts: CPU time of the clients; jobs are charged to theirs.
+        cores: cores to compute on, of which a job of `run_job` holds one; None: jobs need none.
+        on_restart: called with the reason whenever a worker is replaced.
+    """
 
     def __init__(
         self,
@@ -63,17 +73,6 @@ class WorkerPool(Generic[Job, Result]):
         cores: FairSemaphore | None = None,
         on_restart: Callable[[str], None] = lambda _reason: None,
     ) -> None:
-        """Create a pool, which `start` starts.
-
-        Args:
-            spec: program of the workers.
-            workers: number of workers.
-            queue_limit: maximum number of waiting jobs, besides the running ones.
-            keep_spare: keep one worker free of clients that already have jobs running; for jobs that take seconds.
-            accounts: CPU time of the clients; jobs are charged to theirs.
-            cores: cores to compute on, of which a job of `run_job` holds one; None: jobs need none.
-            on_restart: called with the reason whenever a worker is replaced.
-        """
         self._queue = JobQueue(
             queue_limit, self._served_by, accounts or CpuAccounts(), Shares(workers) if keep_spare else None
         )

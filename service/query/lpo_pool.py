@@ -17,15 +17,14 @@ _START_S, _MAX_START_S = 5.0, 120.0
 
 
 class LpoPool:
-    """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined."""
+    """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined.
+
+    Workers load no torch unless poses are refined `by_latents`.
+    """
 
     def __init__(
         self, bundle: Bundle, settings: Settings, telemetry: Telemetry, cores: FairSemaphore, by_latents: bool = True
     ) -> None:
-        """Create a pool, which `start` starts.
-
-        Workers load no torch unless poses are refined `by_latents`.
-        """
         self._telemetry = telemetry
         spec = WorkerSpec(
             name="lpo",

@@ -62,13 +62,12 @@ _SILENCE_MS = 5000
 
 
 class Database:
-    """Bounded pool of connections; safe to share between threads."""
+    """Bounded pool of connections, which connects on first use; safe to share between threads.
+
+    `wait_s` (s) limits waiting for a free connection, and making one.
+    """
 
     def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0) -> None:
-        """Prepare the pool, which connects on first use.
-
-        `wait_s` (s) limits waiting for a free connection, and making one.
-        """
         parsed = _parsed(url)
         self.is_postgresql = parsed.get_backend_name() == "postgresql"
         self._engine = create_engine(

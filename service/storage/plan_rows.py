@@ -198,10 +198,9 @@ class Originals:
 
 
 class PlanCache:
-    """Plans by tenant and id, bounded in bytes; safe to share between threads."""
+    """Plans by tenant and id, of about `limit_bytes`; safe to share between threads."""
 
     def __init__(self, limit_bytes: int) -> None:
-        """Create an empty cache of about `limit_bytes`; 0 keeps no plans."""
         self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
             limit_bytes, lambda entry: plan_bytes(entry[0].plan) + len(entry[0].report or "")
         )

@@ -70,8 +70,8 @@ class _NotInFileError(Exception):
 class PlanIndices:
     """Indices of plans in this process.
 
-    Prototypes lie in a file of this replica, filled from the database on demand. When plans of a venue change, a new
-    index takes the others from the old one.
+    Prototypes lie in a file of this replica, without a `path` a temporary one, which is opened on first use and filled
+    from the database on demand. When plans of a venue change, a new index takes the others from the old one.
     """
 
     def __init__(
@@ -84,7 +84,6 @@ class PlanIndices:
         file_bytes: int,
         limit_bytes: int,
     ) -> None:
-        """Create the cache; the file, without a path a temporary one, is opened on first use."""
         self._store, self._grids, self._reads = store, grids, reads
         self._path, self._file_bytes = path, file_bytes
         # Keys are digests of the plans' grids in order.

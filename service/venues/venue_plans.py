@@ -57,7 +57,8 @@ class ChosenPlans:
 class VenuePlans:
     """Reader of a venue's plans, which chooses among them by an index of their prototypes.
 
-    The rows of a venue's plans stay in memory. When plans of the venue change, their rows are read again.
+    The rows of a venue's plans stay in memory, up to `limit_bytes`. When plans of the venue change, their rows are read
+    again. `max_poses` limits the poses of the chosen plans.
     """
 
     def __init__(
@@ -70,7 +71,6 @@ class VenuePlans:
         max_poses: int,
         idle_cores: IdleCores | None = None,
     ) -> None:
-        """Limit the memory of the rows to `limit_bytes`, and the poses of the chosen plans to `max_poses`."""
         self._store, self._grids, self._reads = store, grids, reads
         self._max_poses, self._idle_cores = max_poses, idle_cores
         self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: ROW_BYTES * len(venue.rows))
