@@ -48,7 +48,7 @@ class WorkerSpec:
         arguments: picklable arguments.
         stall_s: limit (s) of a job's CPU time; the worker is killed after it, or if it does nothing for as long.
         start_s: usual duration (s) of a start, until one has been measured.
-        max_start_s: time limit (s) of a start.
+        max_start_s: time limit (s) of a start; loading torch takes seconds, on a busy machine many.
         nice: niceness above the service's own, for work that no query waits for.
     """
 

@@ -12,9 +12,6 @@ from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.lpo import run_worker
 
-# Loading torch takes seconds, on a busy machine many.
-_START_S, _MAX_START_S = 5.0, 120.0
-
 
 class LpoPool:
     """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined.
@@ -26,16 +23,9 @@ class LpoPool:
         self, bundle: Bundle, settings: Settings, telemetry: Telemetry, cores: FairSemaphore, by_latents: bool = True
     ) -> None:
         self._telemetry = telemetry
-        spec = WorkerSpec(
-            name="lpo",
-            target=run_worker,
-            arguments=(str(bundle.folder.resolve()), bundle.sha256, settings.compute.worker_threads, by_latents),
-            stall_s=settings.lpo.stall_s,
-            start_s=_START_S,
-            max_start_s=_MAX_START_S,
-        )
+        arguments = (str(bundle.folder.resolve()), bundle.sha256, settings.compute.worker_threads, by_latents)
         self._workers: WorkerPool[RefinementJob, RefinementResult] = WorkerPool(
-            spec,
+            WorkerSpec("lpo", run_worker, arguments, stall_s=settings.lpo.stall_s),
             workers=settings.cores.workers,
             queue_limit=settings.lpo.queue,
             accounts=telemetry.cpu_accounts,
