@@ -22,15 +22,11 @@ class AlbumPart:
     """Photograph of an album that is solved.
 
     Attributes:
-        facts: size, time and camera, as JSON.
         entry: its features.
         correction, pin: as JSON; None without.
     """
 
     id: str
-    number: int
-    sha256: str
-    facts: str
     entry: bytes
     correction: str | None
     pin: str | None
