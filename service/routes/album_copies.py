@@ -31,7 +31,7 @@ from service.routes.album_photographs import clean_name, photograph_answer
 from service.routes.albums import album_of
 from service.routes.dependencies import ApiCall, Call
 from service.routes.descriptions import BINARY, BODY_ERRORS, READ_ERRORS, photographs_schema
-from service.routes.query_request import FEATURES, PHOTO, read_files
+from service.routes.query_request import FEATURES, PHOTO, read_query
 from service.schemas.albums import AlbumPhotographForm, PinPlace
 from service.security import caller_of
 from service.storage.album_rows import AlbumRecord
@@ -70,7 +70,7 @@ async def copy_album_photographs(album_id: str, call: Call) -> Response:
     album = await call.read(album_of, call, album_id)
     limits = call.settings.photographs
     repeated = {PHOTO: Repeats(1, limits.max_batch_photographs, "max_batch_photographs")}
-    _, parts, context = await read_files(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
+    _, parts, context = await read_query(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
     if parts.named(FEATURES):
         raise errors.InvalidRequestError([(FEATURES, f"have no picture to copy; send {PHOTO}")])
     files = parts.named(PHOTO)

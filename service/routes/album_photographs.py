@@ -36,7 +36,7 @@ from service.routes.descriptions import (
     photographs_schema,
     reads,
 )
-from service.routes.query_request import FEATURES, PHOTO, VARY, read_files
+from service.routes.query_request import FEATURES, PHOTO, VARY, read_query
 from service.schemas.albums import (
     AlbumDocument,
     AlbumLine,
@@ -107,7 +107,7 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
     album.check_model(call.runtime.bundle.sha256)
     most = call.settings.photographs.max_batch_photographs
     repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
-    _, parts, _ = await read_files(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
+    _, parts, _ = await read_query(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
     files = parts.named(PHOTO) or parts.named(FEATURES)
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(files))
     document = AlbumDocument.model_validate_json(album.options)

@@ -31,16 +31,16 @@ from service.http.uploads import (
 from service.query import Content, QueryContext
 from service.routes.dependencies import ApiCall
 from service.routes.descriptions import BINARY, IDEMPOTENCY_KEY
-from service.schemas import LocaliseAnswer, LocaliseForm, PhotographForm, SequenceAnswer, SequenceForm
+from service.schemas import LocaliseAnswer, SequenceAnswer
 from service.schemas.photographs import PhotographFields
+from service.schemas.query_fields import CameraFields
 from service.storage.records import PlanRecord, VenueRecord
 
 PHOTO, FEATURES, FILM = "photo", "features", "film"
 # Name of the part in versions up to 0.5.
 _EARLIER_PHOTO = "panorama"
 VARY = {"Vary": "Accept"}
-Form = TypeVar("Form", LocaliseForm, SequenceForm, PhotographForm)
-AnyForm = TypeVar("AnyForm", bound=BaseModel)
+Form = TypeVar("Form", bound=BaseModel)
 Answer = TypeVar("Answer", LocaliseAnswer, SequenceAnswer)
 
 
@@ -75,23 +75,10 @@ async def read_query(
     repeated: Mapping[str, Repeats] | None = None,
     film: bool = False,
 ) -> tuple[Form, Parts, QueryContext]:
-    """Read the form of a query as `read_files` does, with at most as many candidates as the settings allow."""
-    form, parts, context = await read_files(call, form_type, limit, files=files, repeated=repeated, film=film)
-    if not isinstance(form, PhotographForm) and "top_k" not in form.model_fields_set:
-        form = form.model_copy(update={"top_k": min(form.top_k, call.settings.photographs.max_top_k)})
-    return form, parts, context
+    """Read a form with photographs and start the clock of its deadline.
 
-
-async def read_files(
-    call: ApiCall,
-    form_type: type[AnyForm],
-    limit: Settable,
-    *,
-    files: Collection[str] = (),
-    repeated: Mapping[str, Repeats] | None = None,
-    film: bool = False,
-) -> tuple[AnyForm, Parts, QueryContext]:
-    """Read a form with photographs and start the clock of its deadline."""
+    The query has at most as many candidates as the settings allow.
+    """
     media_type(call.request, (MULTIPART,))
     settings = call.settings
     clock = StageClock()
@@ -120,8 +107,10 @@ async def read_files(
             raise
     if settings.photographs.require_features and (parts.named(PHOTO) or parts.named(FILM)):
         raise errors.FeaturesRequiredError
-    context = QueryContext.starting(call.client, settings.requests.request_deadline_s, clock)
-    return validate_fields(form_type, parts.fields, bounds), parts, context
+    form = validate_fields(form_type, parts.fields, bounds)
+    if isinstance(form, CameraFields) and "top_k" not in form.model_fields_set:
+        form = form.model_copy(update={"top_k": min(form.top_k, settings.photographs.max_top_k)})
+    return form, parts, QueryContext.starting(call.client, settings.requests.request_deadline_s, clock)
 
 
 def photographs_of(parts: Parts, form: PhotographFields, call: ApiCall) -> list[Content]:
