@@ -115,7 +115,8 @@ class ProgressEvents(Generic[EventT]):
                     continue
                 if event is None:
                     return
-                yield _encoded(event, self._final)
+                name = event.status if event.status in self._final else "progress"
+                yield f"event: {name}\ndata: {event.model_dump_json(exclude_none=True)}\n\n".encode()
                 if event.status in self._final:
                     return
         finally:
@@ -189,8 +190,3 @@ def album_look(store: Store, model_sha256: str, album_ids: set[str]) -> dict[str
         )
         for album in store.albums.by_ids(album_ids)
     }
-
-
-def _encoded(event: PlanEvent | AlbumEvent, final: frozenset[str]) -> bytes:
-    name = event.status if event.status in final else "progress"
-    return f"event: {name}\ndata: {event.model_dump_json(exclude_none=True)}\n\n".encode()

@@ -118,15 +118,12 @@ class Supervisor:
                 self.fault = reason = f"cannot run a worker: {type(error).__name__}: {error}"
             if self._queue.closed:
                 return
-            self._note_restart(reason)
+            self._on_restart(reason)
+            fields = {"pool": self._spec.name, "worker": self._index, "reason": reason}
+            logging.getLogger(LOGGER_NAME).warning("worker is replaced", extra={"fields": fields})
             self._failed_starts = 0 if self.fault is None else self._failed_starts + 1
             short_lives = 0 if monotonic() - begin > self._start_s + _HEALTHY_S else short_lives + 1
             self._pause(short_lives)
-
-    def _note_restart(self, reason: str) -> None:
-        self._on_restart(reason)
-        fields = {"pool": self._spec.name, "worker": self._index, "reason": reason}
-        logging.getLogger(LOGGER_NAME).warning("worker is replaced", extra={"fields": fields})
 
     def _pause(self, short_lives: int) -> None:
         """Back off after several short lives in a row."""

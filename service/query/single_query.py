@@ -114,12 +114,9 @@ class SingleSearch:
                 is_sphere=composed.evidence.photograph.is_sphere,
                 max_size=PHOTOGRAPH_SIZE,
             )
-
-        def draw() -> str:
-            drawn = drawn_answer(composed)
-            return draw_answer(drawn, picture, query.picture, rooms=query.rooms)
-
-        svg = await self._parts.executor.compute(context, draw)
+        svg = await self._parts.executor.compute(
+            context, lambda: draw_answer(drawn_answer(composed), picture, query.picture, rooms=query.rooms)
+        )
         if query.as_png:
             return await self._parts.decoder.rasterise(svg, context)
         return svg.encode()

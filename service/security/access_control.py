@@ -151,7 +151,7 @@ class AccessControl:
     async def _holder_of_key(self, request: Request, presented: PresentedKey) -> Identity | None:
         """Return the holder of a key; None if it is unknown or revoked."""
         key = await self._keys.find(presented)
-        if key is not None and key.is_expired(datetime.now(UTC)):
+        if key is not None and key.expires_at is not None and datetime.now(UTC) >= key.expires_at:
             add_log_fields(request, key=key.id, tenant=key.tenant)
             raise errors.UnauthenticatedError(
                 f"the API key expired at {key.expires_at:%Y-%m-%dT%H:%M:%SZ}; use its successor, or ask the operator"

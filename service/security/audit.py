@@ -129,8 +129,9 @@ class AuditTrail:
 
     def count(self, entry: AuditEntry) -> None:
         """Count an entry, which is stored at the end of the minute."""
+        # Counted entries are equal in the rest.
+        same = replace(entry, count=1, request_id=None, detail=None, created_at=_NO_TIME)
         with self._lock:
-            same = _same(entry)
             if same not in self._counted:
                 same = self._new(same)
             before = self._counted.get(same)
@@ -183,8 +184,3 @@ class AuditTrail:
     def _run(self) -> None:
         while not self._stop.wait(_FLUSH_S):
             self.flush()
-
-
-def _same(entry: AuditEntry) -> AuditEntry:
-    """Return the part of an entry in which counted entries are equal."""
-    return replace(entry, count=1, request_id=None, detail=None, created_at=_NO_TIME)

@@ -157,7 +157,9 @@ class TokenVerifier:
         """Return the issuer's keys, with `renew` such that were fetched lately."""
         age_s = self._age_s()
         if renew or age_s >= _STALE_S:
-            await self._fetched()
+            if (task := self._begin_fetch()) is not None:
+                # Others wait for it too, so it outlasts the request.
+                await asyncio.shield(task)
         elif age_s >= _FRESH_S:
             self._begin_fetch()
         if self._published is None or self._age_s() >= _STALE_S:
@@ -167,13 +169,8 @@ class TokenVerifier:
     def _age_s(self) -> float:
         return float("inf") if self._published is None else self._clock() - self._published.fetched_s
 
-    async def _fetched(self) -> None:
-        """Wait for a fetch, unless the last one ended a moment ago."""
-        if (task := self._begin_fetch()) is not None:
-            # Others wait for it too, so it outlasts the request.
-            await asyncio.shield(task)
-
     def _begin_fetch(self) -> asyncio.Task[None] | None:
+        """Return a fetch in progress; None if the last one ended a moment ago."""
         if self._fetching is None or self._fetching.done():
             if self._clock() - self._tried_s < _PAUSE_S:
                 return None

@@ -41,11 +41,6 @@ class FoundPlan:
     plan: FloorPlan | PlanDocument
     is_current: bool
 
-    @property
-    def is_parsed(self) -> bool:
-        """True if the plan is in memory."""
-        return isinstance(self.plan, FloorPlan)
-
 
 class Plans:
     """Plans of all tenants; calls treat plans of other tenants as missing."""

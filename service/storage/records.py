@@ -215,10 +215,6 @@ class ApiKey:
     expires_at: datetime | None = None
     replaces: str | None = None
 
-    def is_expired(self, now: datetime) -> bool:
-        """Return True from the key's end on."""
-        return self.expires_at is not None and now >= self.expires_at
-
 
 # Actor of requests without a valid key or token.
 ANONYMOUS = "anonymous"

@@ -17,6 +17,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.floorplan import FloorPlan
 from service.capacity.threads import BoundedReads
 from service.errors import StoreBusyError, StoreUnavailableError, UnknownFloorPlanError, UnknownVenueError
 from service.settings import Settings
@@ -199,7 +200,7 @@ class PlanLookup:
             if (known := self._recent(tenant, plan_id)) is None:
                 raise
             return known
-        if found is None or found.is_parsed:
+        if found is None or isinstance(found.plan, FloorPlan):
             return None if found is None else self._store.plans.record(found)
         # On a thread of the tenant.
         return await reads.process(tenant, self._store.plans.record, found)

@@ -22,7 +22,8 @@ class FramingMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or not _framed_twice(scope):
+        both = {b"content-length", b"transfer-encoding"}
+        if scope["type"] != "http" or not both <= {name for name, _ in scope["headers"]}:
             await self._app(scope, receive, send)
             return
         error = MalformedRequestError("the request has both Content-Length and Transfer-Encoding; send one of them")
@@ -30,10 +31,6 @@ class FramingMiddleware:
         # The end of the body is ambiguous, so bytes that follow must not be read as a request.
         answer.headers["Connection"] = "close"
         await answer(scope, receive, send)
-
-
-def _framed_twice(scope: Scope) -> bool:
-    return {b"content-length", b"transfer-encoding"} <= {name for name, _ in scope["headers"]}
 
 
 class HeadMiddleware:
@@ -128,15 +125,11 @@ class SecurityHeadersMiddleware:
                 for name, value in _ALWAYS.items():
                     headers.setdefault(name, value)
                 if (target := headers.get("location")) is not None:
-                    headers["location"] = _without_host(target)
+                    # Without the host, which the framework takes from the request and a client can forge.
+                    headers["location"] = urlunsplit(urlsplit(target)._replace(scheme="", netloc=""))
                 # The server takes the scheme from X-Forwarded-Proto of trusted proxies.
                 if scope["scheme"] == "https":
                     headers.setdefault("Strict-Transport-Security", f"max-age={_ONE_YEAR_S}")
             await send(message)
 
         await self._app(scope, receive, send_with_headers if scope["type"] == "http" else send)
-
-
-def _without_host(target: str) -> str:
-    """Return a redirect without the host, which the framework takes from the request and a client can forge."""
-    return urlunsplit(urlsplit(target)._replace(scheme="", netloc=""))
