@@ -19,7 +19,7 @@ from lalaloc_core.render.sampling import grid_size
 from service.capacity.fair_share import FairSemaphore
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder, GridCache
-from service.grids.embedding import RENDERED, check_size, embed, embed_small
+from service.grids.embedding import RENDERED, embed, embed_small
 from service.grids.grid_jobs import GridJob
 from service.schemas.stored_plans import PlanStatus
 from service.settings import Settings
@@ -144,23 +144,19 @@ class GridProvider:
     def states(self, plans: list[PlanSummary]) -> list[GridState]:
         """Return the state of each plan's own grid, whichever replica computes it."""
         keys = [self.key(summary.revision_id, summary.camera_height_m) for summary in plans]
-        step_m, revision_ids = self._settings.grids.grid_step_m, [summary.revision_id for summary in plans]
+        revision_ids = [summary.revision_id for summary in plans]
         places = [(key.revision_id, key.camera_height_mm) for key in keys]
         jobs = [self._jobs.get(key) for key in keys]
-        stored = self._store.grids.poses(self._model_sha256, step_m, revision_ids)
+        stored = self._store.grids.poses(*self.model, revision_ids)
         leased = {}
         if not all(place in stored for place in places):
-            leased = self._store.leases.progress(self._model_sha256, step_m, revision_ids)
+            leased = self._store.leases.progress(*self.model, revision_ids)
             # Read again, because a grid can have been stored, and its lease ended, in between.
-            stored = self._store.grids.poses(self._model_sha256, step_m, revision_ids)
+            stored = self._store.grids.poses(*self.model, revision_ids)
         return [
             GridState.of_stored(summary.failure, stored.get(place), leased.get(place), job)
             for summary, place, job in zip(plans, places, jobs, strict=True)
         ]
-
-    def check_size(self, plan: FloorPlan, level: str | None = None) -> None:
-        """Check the estimated number of poses of a plan; the error names its level."""
-        check_size(plan, self._settings, level)
 
     def prepare(self, plan: FloorPlan, client: str) -> ComputedGrid | None:
         """Compute the own grid of a client's small plan at once; None leaves it to the background."""
@@ -290,9 +286,8 @@ class GridProvider:
         """Queue the oldest grids that no replica computes, unless the queue is long; tell whether more are left."""
         if len(self._jobs) >= _BATCH:
             return True
-        model = (self._model_sha256, self._settings.grids.grid_step_m)
-        missing = self._store.grids.missing(*model, _BATCH)
-        self._unprepared = self._store.grids.count_unprepared(*model)
+        missing = self._store.grids.missing(*self.model, _BATCH)
+        self._unprepared = self._store.grids.count_unprepared(*self.model)
         with suppress(StoppingError, OverloadedError):
             for summary in missing:
                 key = self.key(summary.revision_id, summary.camera_height_m)
@@ -306,7 +301,7 @@ class GridProvider:
         if not jobs:
             return
         revision_ids = [job.key.revision_id for job in jobs]
-        leased = self._store.leases.progress(self._model_sha256, self._settings.grids.grid_step_m, revision_ids)
+        leased = self._store.leases.progress(*self.model, revision_ids)
         for job in jobs:
             progress = leased.get((job.key.revision_id, job.key.camera_height_mm))
             if progress is None or job.cancelled.is_set():

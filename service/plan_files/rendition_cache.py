@@ -42,11 +42,6 @@ class _PendingJob:
     in_worker: Future | None = None
     waiting: int = 0
 
-    @property
-    def abandoned(self) -> bool:
-        """True if no request waits for the file any more."""
-        return self.waiting == 0
-
     def cancel(self) -> bool:
         """Cancel the job, unless a worker runs it already."""
         assert self.task is not None
@@ -104,7 +99,7 @@ class RenditionCache:
             return await asyncio.shield(job.task)
         finally:
             job.waiting -= 1
-            if job.abandoned and not job.task.done() and job.cancel():
+            if not job.waiting and not job.task.done() and job.cancel():
                 self._pending.pop(key, None)
 
     def close(self) -> None:
@@ -148,7 +143,7 @@ class RenditionCache:
     def _begin(self, job: _PendingJob, plan_id: str, key: _Key, client: str, report: bytes) -> Rendition | Future:
         """Read a plan; return the file of a small one, and the job of a worker for others."""
         revision_id, kind = key
-        stored = None if job.abandoned else self._plans.stored(revision_id)
+        stored = self._plans.stored(revision_id) if job.waiting else None
         if stored is None:
             raise UnknownFloorPlanError(plan_id)
         bundle = self._bundle if kind in PREDICTIONS else None
@@ -156,7 +151,7 @@ class RenditionCache:
         if len(stored.document.document) <= _SMALL and kind not in SLOW:
             return make_rendition(rendition)
         begun = self._converter.begin_rendition(rendition, client)
-        if job.abandoned:
+        if not job.waiting:
             begun.cancel()
         return begun
 

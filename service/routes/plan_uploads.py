@@ -29,6 +29,7 @@ from lalaloc_core.importers import (
     is_json,
 )
 from service.errors import InvalidRequestError
+from service.grids.embedding import check_size
 from service.http.idempotent_request import REPLAYED, IdempotentRequest
 from service.http.problems import problem_in_line
 from service.http.representations import NDJSON, LinesResponse, preferred
@@ -175,11 +176,11 @@ def prepare_plan(uploaded: PlanUpload, call: ApiCall, on_step: OnStep | None = N
 
     `on_step` is as for `Converter.read`.
     """
-    content, grids = uploaded.file.read(), call.runtime.grids
+    content = uploaded.file.read()
     (file,) = _plan_files(uploaded, content, call, building_name(uploaded.file.name), on_step, every_level=False)
-    grids.check_size(file.plan)
+    check_size(file.plan, call.settings)
     original = Original(content, file.media_type, file.report)
-    return _new_plan(file, original, grids.prepare(file.plan, call.client), 0.0, call), file
+    return _new_plan(file, original, call.runtime.grids.prepare(file.plan, call.client), 0.0, call), file
 
 
 def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnStep | None = None) -> list[NewPlan]:
@@ -187,15 +188,15 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnSt
 
     `on_step` is as for `Converter.read`.
     """
-    content, provider = uploaded.file.read(), call.runtime.grids
+    content = uploaded.file.read()
     files = _plan_files(uploaded, content, call, name, on_step, every_level=True)
     limit = call.settings.plans.max_venue_plans
     if len(files) > limit:
         fault = f"has {len(files)} levels; the limit is {limit} floor plans (LALALOC_MAX_VENUE_PLANS)"
         raise InvalidRequestError([("file", fault)])
     for file in files:
-        provider.check_size(file.plan, None if file.level is None else file.level.name)
-    grids = provider.prepare_all([file.plan for file in files], call.client)
+        check_size(file.plan, call.settings, None if file.level is None else file.level.name)
+    grids = call.runtime.grids.prepare_all([file.plan for file in files], call.client)
     originals = [_original(file, content if len(files) == 1 else None) for file in files]
     return [_new_plan(*values, call) for values in zip(files, originals, grids, _level_numbers(files), strict=True)]
 
