@@ -106,11 +106,6 @@ class WorkerPool(Generic[Job, Result]):
         """Memory of all workers."""
         return sum(supervisor.resident_bytes for supervisor in self._supervisors)
 
-    @property
-    def closing(self) -> bool:
-        """True while the pool shuts down."""
-        return self._queue.closed
-
     def submit(
         self, job: Job, timeout_s: float, client: str = "", on_news: Callable[[Any], None] = lambda _value: None
     ) -> Future[Result]:

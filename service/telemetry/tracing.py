@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from opentelemetry.trace import Span
 
 _EXPORT_TIMEOUT_S = 5.0
+# Attributes of `RequestLogFields` in spans.
+_ATTRIBUTES = ("request_id", "plan", "venue", "revision", "stage", "rejection", "tenant")
 
 
 def otlp_exporter(endpoint: str) -> SpanExporter:
@@ -83,18 +85,8 @@ class Tracing:
 
         span = opened.span
         span.update_name(f"{method} {route}")
-        attributes = {
-            "http.request.method": method,
-            "http.route": route,
-            "http.response.status_code": status,
-            "lalaloc.request_id": log_fields.request_id,
-            "lalaloc.plan": log_fields.plan,
-            "lalaloc.venue": log_fields.venue,
-            "lalaloc.revision": log_fields.revision,
-            "lalaloc.stage": log_fields.stage,
-            "lalaloc.rejection": log_fields.rejection,
-            "lalaloc.tenant": log_fields.tenant,
-        }
+        attributes = {f"lalaloc.{name}": getattr(log_fields, name) for name in _ATTRIBUTES}
+        attributes |= {"http.request.method": method, "http.route": route, "http.response.status_code": status}
         span.set_attributes({name: value for name, value in attributes.items() if value is not None})
         if status >= 500:
             span.set_status(trace.StatusCode.ERROR)

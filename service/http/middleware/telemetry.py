@@ -31,6 +31,8 @@ _PLAN_ID = re.compile(r"[0-9a-f]{32}")
 _PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 # nginx's status for a client that disconnected before the answer.
 _CLIENT_CLOSED = 499
+# Attributes of `RequestLogFields` in the log line.
+_LOGGED = ("bytes_in", "plan", "venue", "revision", "stage", "gave_up", "rejection", "key", "tenant")
 
 
 class TelemetryMiddleware:
@@ -97,16 +99,8 @@ class TelemetryMiddleware:
             "route": route,
             "status": status,
             "ms": round(duration_s * 1e3, 1),
-            "bytes_in": log_fields.bytes_in,
-            "plan": log_fields.plan,
-            "venue": log_fields.venue,
-            "revision": log_fields.revision,
-            "stage": log_fields.stage,
+            **{name: getattr(log_fields, name) for name in _LOGGED},
             "stages_ms": {name: round(spent_s * 1e3, 1) for name, (_, spent_s) in spans.items()},
-            "gave_up": log_fields.gave_up,
-            "rejection": log_fields.rejection,
-            "key": log_fields.key,
-            "tenant": log_fields.tenant,
             "span_id": log_fields.trace.span_id,
         }
         level = logging.DEBUG if route in _PROBES else logging.INFO
