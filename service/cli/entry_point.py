@@ -292,7 +292,3 @@ def _overlap(given: str) -> timedelta:
     if (overlap := duration(given)).total_seconds() > MAX_OVERLAP_S:
         raise argparse.ArgumentTypeError(f"0s to {MAX_OVERLAP_S // 86400}d")
     return overlap
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -20,7 +20,6 @@ from service.decoding.decoder import Decoder
 from service.query.executor import Executor
 from service.query.queries import Content
 from service.query_context import QueryContext
-from service.schemas import LocaliseForm, PhotographForm, StatedHeading
 from service.uploaded_file import UploadedFile
 
 # Photographs of a query that are decoded at the same time.
@@ -85,15 +84,14 @@ class PhotographReader:
             return await self._decoder.film(content, stated, context)
 
     def known_heading(
-        self, form: LocaliseForm | StatedHeading | PhotographForm, north: float | None, photograph: Photograph
+        self, heading_deg: float | None, tolerance_deg: float, north: float | None, photograph: Photograph
     ) -> KnownHeading:
         """Return the heading in the request, else the photograph's compass heading if `north` is known, else none.
 
         `north` is the azimuth of true north (radians) in the plan.
         """
-        return known_heading(
-            north, form.heading_deg, form.heading_tolerance_deg, photograph.compass_heading, self._compass_tolerance_deg
-        )
+        compass = photograph.compass_heading
+        return known_heading(north, heading_deg, tolerance_deg, compass, self._compass_tolerance_deg)
 
     async def encode(
         self,

@@ -75,8 +75,8 @@ class SequenceSearch:
         """Return the photographs with what the request and their overlap tell about their headings."""
         form = query.form
         known = [
-            self._parts.reader.known_heading(form.heading_of(index), site.north, photograph)
-            for index, photograph in enumerate(photographs)
+            self._parts.reader.known_heading(heading_deg, form.heading_tolerance_deg, site.north, photograph)
+            for heading_deg, photograph in zip(form.headings_deg or [None] * len(photographs), photographs, strict=True)
         ]
         if angles is not None:
             return Turn.of_overlap(photographs, known, site.height, angles, film)

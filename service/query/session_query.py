@@ -58,7 +58,8 @@ class SessionSearch:
             # Hints are the prior of the first photograph.
             hinted = document if state is None else None
             site = await self._parts.grounds.site(where, document, hinted, max_poses=MAX_POSES)
-            known = self._parts.reader.known_heading(form, site.north, photograph)
+            heading = form.heading_deg, form.heading_tolerance_deg
+            known = self._parts.reader.known_heading(*heading, site.north, photograph)
             await site.wait(context)
             (encoded,) = await self._parts.reader.encode([Spot(photograph)], [UNKNOWN_HEADING], [site.height], context)
             favour = None

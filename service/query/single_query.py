@@ -63,7 +63,8 @@ class SingleSearch:
         site = await self._parts.grounds.site(where, form, form)
         # Decode first, so that an unreadable picture is refused without waiting for plans.
         (photograph,) = await self._parts.reader.decode([query.content], form.stated_camera, context)
-        known = self._parts.reader.known_heading(form, site.north, photograph)
+        heading = form.heading_deg, form.heading_tolerance_deg
+        known = self._parts.reader.known_heading(*heading, site.north, photograph)
         await site.wait(context)
         spot = Spot(photograph)
         (encoded,) = await self._parts.reader.encode([spot], [known], [site.height], context)

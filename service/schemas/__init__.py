@@ -30,5 +30,5 @@ from service.schemas.localise_answer import (
     TimingsAnswer,
 )
 from service.schemas.query_fields import EarthPoint, LocaliseForm
-from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading
+from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer
 from service.schemas.sessions import PathPoint, PhotographForm, SessionDocument, StoredPose, TrackedPoseAnswer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from lalaloc_core.answer_numbers import Degrees, HeadingDeg, Metres, Score, Share
@@ -21,13 +21,6 @@ _WALK = (
     "photographs of a walk are no query of their own: send them to a session (POST /sessions), or to an album "
     "(POST /albums); photographs from one spot need motion=turn"
 )
-
-
-class StatedHeading(BaseModel):
-    """Given heading of one photograph."""
-
-    heading_deg: float | None
-    heading_tolerance_deg: float
 
 
 class SequenceForm(PlaceFields, CameraFields, PhotographFields):
@@ -96,11 +89,6 @@ class SequenceForm(PlaceFields, CameraFields, PhotographFields):
         """Return (field, message) for fields that do not go with a film."""
         given = [name for name in ("relative_heading_deg", "headings_deg") if getattr(self, name) is not None]
         return [(name, "does not go with a film, whose frames are chosen by the service") for name in given]
-
-    def heading_of(self, index: int) -> StatedHeading:
-        """Return the given heading of a photograph."""
-        heading_deg = None if self.headings_deg is None else self.headings_deg[index]
-        return StatedHeading(heading_deg=heading_deg, heading_tolerance_deg=self.heading_tolerance_deg)
 
 
 class SequencePoseAnswer(ResponseModel):

@@ -33,9 +33,7 @@ MAX_PATH = 200
 class SessionDocument(PlaceFields, CameraFields):
     """Begin of a session: the plan or venue, the camera, and what is known about the place of the first photograph."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", json_schema_extra={"example": {"floorplan_id": "0" * 32, "camera_height_m": 1.5}}
-    )
+    model_config = ConfigDict(json_schema_extra={"example": {"floorplan_id": "0" * 32, "camera_height_m": 1.5}})
 
     venue_id: str | None = Field(
         None, min_length=1, description="Id of a venue; the camera can move between its plans."
@@ -69,8 +67,6 @@ class PhotographForm(PhotographFields):
 
     The motion is that since the photograph before, in the frame of the camera at that photograph.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     number: int | None = Field(
         None, ge=1, description="Number of the photograph, from 1: 409 if it is not the next one of the session."
