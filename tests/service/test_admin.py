@@ -90,9 +90,7 @@ def test_pages_list_every_key_once(admin: httpx.Client) -> None:
 
 def test_both_keys_are_valid_during_the_overlap(admin: httpx.Client, app_store: Store, tmp_path: Path) -> None:
     old = _created(admin, expires_in_s=1000)
-    rotated = admin.post(f"/admin/keys/{old['id']}/rotation", json={"overlap_s": 600})
-    assert rotated.status_code == 201
-    new = rotated.json()
+    new = document_of(admin.post(f"/admin/keys/{old['id']}/rotation", json={"overlap_s": 600}), 201)
     assert new["replaces"] == old["id"]
     assert {name: new[name] for name in NEW_KEY} == NEW_KEY | {"scopes": ["localise", "read"]}
 

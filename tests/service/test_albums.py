@@ -280,11 +280,10 @@ def test_correction_is_certain_and_can_be_undone(
     if "room_id" in correction:
         rooms = client.get(f"/floorplans/{plan_id}").json()["plan"]["rooms"]
         correction = {"room_id": next(row["id"] for row in rooms if row["name"] == room)}
-    answer = correct(client, solved, before["id"], correction)
-    assert answer.status_code == 200, answer.text
-    given = {name: value for name, value in answer.json()["correction"].items() if value is not None}
+    changed = document_of(correct(client, solved, before["id"], correction))
+    given = {name: value for name, value in changed["correction"].items() if value is not None}
     assert correction.items() <= given.items()
-    assert answer.json()["revision"] != before["revision"]
+    assert changed["revision"] != before["revision"]
     wait_until_solved(client, solved)
     after = client.get(f"/albums/{solved}/photographs/{before['id']}").json()
     if room is None:
@@ -522,8 +521,7 @@ def test_album_in_a_venue_names_plan_and_level(client: httpx.Client, plan_id: st
     place = row["pin"]["place"]
     assert place["level"] == {plan_id: 0.0, upper: 1.0}[place["floorplan_id"]]
     correction = {"position": {"x_m": 1, "y_m": 1}, "floorplan_id": upper}
-    moved = correct(client, album_id, line["photograph"]["id"], correction)
-    assert moved.status_code == 200, moved.text
+    document_of(correct(client, album_id, line["photograph"]["id"], correction))
     wait_until_solved(client, album_id)
     (row,) = photographs(client, album_id, floorplan_id=upper)
     assert (row["pin"]["place"]["level"], row["pin"]["place"]["room"]) == (1.0, "living room")

@@ -29,7 +29,7 @@ from lalaloc_core.photograph import Photograph, open_photograph
 from service.routes import model_files
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import HOME, StartApp, assert_problem, upload, wait_for
+from tests.service.conftest import HOME, StartApp, assert_problem, document_of, upload, wait_for
 from tests.service.test_process import children
 from tests.service.test_security import bearer, make_key
 from tests.service.test_stopping import running_service
@@ -91,8 +91,7 @@ def test_features_get_the_answer_of_their_photograph(
         ask(client, name, content, floorplan_id=home, camera_height_m=1.6, refine="vdr")
         for name, content in (("photo", photograph), ("features", features))
     )
-    assert by_features.status_code == 200, by_features.text
-    assert same(by_features.json(), by_photograph.json())
+    assert same(document_of(by_features), by_photograph.json())
 
 
 @pytest.mark.parametrize("height_m", [0.8, 1.3, 2.2])
@@ -137,9 +136,8 @@ def test_sequences_venues_and_sessions_take_features(client: httpx.Client, home:
     assert found.json()["floorplan_id"] == home, found.text
     session = client.post("/sessions", json={"floorplan_id": home}).json()["id"]
     for content in features:
-        tracked = client.post(f"/sessions/{session}/photographs", files={"features": content})
-        assert tracked.status_code == 200, tracked.text
-    assert tracked.json()["photographs"] == 2
+        tracked = document_of(client.post(f"/sessions/{session}/photographs", files={"features": content}))
+    assert tracked["photographs"] == 2
 
 
 def test_features_have_no_photograph_to_draw(client: httpx.Client, home: str, device: Device) -> None:
@@ -267,11 +265,9 @@ def test_nothing_of_a_photograph_remains(
         for photo in (photograph, photograph[:-20_000], mark + photograph):
             service.client.post("/localise", data=fields, files={"photo": photo}, headers=keyed)
         turn = {"floorplan_id": plan_id, "motion": "turn"}
-        sequence = service.client.post("/localise/sequence", data=turn, files=_two(photograph))
-        assert sequence.status_code == 200, sequence.text
+        document_of(service.client.post("/localise/sequence", data=turn, files=_two(photograph)))
         session = service.client.post("/sessions", json={"floorplan_id": plan_id}).json()["id"]
-        tracked = service.client.post(f"/sessions/{session}/photographs", files={"photo": photograph})
-        assert tracked.status_code == 200, tracked.text
+        document_of(service.client.post(f"/sessions/{session}/photographs", files={"photo": photograph}))
         others = [
             service.client.post("/localise/batch", data={"floorplan_id": plan_id}, files=_two(photograph)),
             service.client.post("/localise", data=fields, files={"photo": photograph}, headers={"Accept": "image/png"}),

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 from lalaloc_core.floorplan import FloorPlan
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import FLAT, StartApp, assert_problem, document_of, localise, upload, wait_for
 from tests.strategies import rectangle
 
 
@@ -105,11 +105,10 @@ def test_plan_can_be_downloaded_and_uploaded_again(client: httpx.Client) -> None
 
 def test_json_file_equals_json_body(client: httpx.Client) -> None:
     content = json.dumps(FLAT).encode()
-    response = client.post("/floorplans", files={"file": ("flat.json", content, "application/octet-stream")})
-    assert response.status_code == 201
-    plan_id = response.json()["id"]
-    assert client.get(f"/floorplans/{plan_id}/original").content == content
-    assert response.json()["rooms"] == client.post("/floorplans", json=FLAT).json()["rooms"]
+    files = {"file": ("flat.json", content, "application/octet-stream")}
+    plan = document_of(client.post("/floorplans", files=files), 201)
+    assert client.get(f"/floorplans/{plan['id']}/original").content == content
+    assert plan["rooms"] == client.post("/floorplans", json=FLAT).json()["rooms"]
 
 
 def test_unknown_and_missing_parts_are_rejected(client: httpx.Client) -> None:

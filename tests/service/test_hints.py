@@ -23,7 +23,7 @@ from service.query.ground import Ground
 from service.storage.records import PlanRecord
 from tests.core.test_photo_sphere import xmp
 from tests.painted import picture_file
-from tests.service.conftest import FLAT, assert_problem, encode_picture, localise, upload
+from tests.service.conftest import FLAT, assert_problem, document_of, encode_picture, localise, upload
 from tests.strategies import rectangle
 
 APP_SETTINGS = {"compass_tolerance_deg": 15.0}
@@ -54,9 +54,8 @@ def plan_id(client: httpx.Client) -> str:
 def test_strict_rooms_exclude_others(
     client: httpx.Client, plan_id: str, sphere: bytes, rooms: str, possible: set[str], refine: str
 ) -> None:
-    response = localise(client, plan_id, sphere, rooms=rooms, strict="true", refine=refine)
-    assert response.status_code == 200, response.text
-    assert {candidate["room_id"] for candidate in response.json()["candidates"]} <= possible
+    answer = document_of(localise(client, plan_id, sphere, rooms=rooms, strict="true", refine=refine))
+    assert {candidate["room_id"] for candidate in answer["candidates"]} <= possible
 
 
 def test_strict_point_bounds_all_candidates(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
@@ -149,8 +148,7 @@ def north(client: httpx.Client) -> str:
 
 
 def poses(response: httpx.Response) -> tuple[str, list[object]]:
-    assert response.status_code == 200, response.text
-    answer = response.json()
+    answer = document_of(response)
     return answer["heading_source"], [
         (candidate["position"], candidate["heading_deg"]) for candidate in answer["candidates"]
     ]

@@ -12,7 +12,7 @@ import pytest
 from service.capacity.fair_share import max_per_client
 from service.schemas.service_state import LimitsAnswer
 from service.settings import Settings
-from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, document_of, encode_picture, localise, upload
 
 
 def room(x: float, width: float = 3.0) -> dict[str, Any]:
@@ -69,9 +69,8 @@ def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, sphe
     with start_app(tmp_path, max_pixels=100_000, max_scans=9, max_top_k=3, max_photograph_bytes=100_000) as client:
         plan_id = upload(client)
         # A request without top_k gets no more candidates than allowed.
-        allowed = localise(client, plan_id, encode_picture(256, 128, "JPEG"))
-        assert allowed.status_code == 200
-        assert len(allowed.json()["candidates"]) <= 3
+        allowed = document_of(localise(client, plan_id, encode_picture(256, 128, "JPEG")))
+        assert len(allowed["candidates"]) <= 3
         refusals = {
             "max_pixels": localise(client, plan_id, sphere, top_k=3),
             "max_scans": localise(client, plan_id, many_scans, top_k=3),

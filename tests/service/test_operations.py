@@ -19,7 +19,7 @@ from lalaloc_core.bundle import default_bundle
 from service.cli.entry_point import main as lalaloc_service
 from service.storage import Store
 from tests.service import test_albums as albums
-from tests.service.conftest import StartApp, localise, upload, wait_for
+from tests.service.conftest import StartApp, document_of, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 from tests.strategies import present
 
@@ -30,9 +30,7 @@ PAGE = (GUIDES / "operate.md").read_text(encoding="utf-8")
 def stored(client: httpx.Client, sphere: bytes) -> tuple[list[dict[str, object]], object]:
     """Return all plans, and the position of the sphere in the oldest plan."""
     plans = client.get("/floorplans").json()["floorplans"]
-    answer = localise(client, plans[-1]["id"], sphere, heading_deg=0)
-    assert answer.status_code == 200, answer.text
-    return plans, answer.json()["position"]
+    return plans, document_of(localise(client, plans[-1]["id"], sphere, heading_deg=0))["position"]
 
 
 @pytest.fixture

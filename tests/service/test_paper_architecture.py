@@ -14,7 +14,7 @@ from lalaloc_core.learn.export.bundle_export import export_bundle
 from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.nets.paper_encoders import PaperConfig
-from tests.service.conftest import FLAT, localise, localise_turn, upload, wait_for
+from tests.service.conftest import FLAT, document_of, localise, localise_turn, upload, wait_for
 
 # Seconds of LPO on the small networks, even on a busy machine.
 LPO_DEADLINE_S = 60.0
@@ -42,9 +42,7 @@ def test_query_reaches_each_stage(
     answers: list[dict[str, Any]] = []
 
     def reached() -> bool:
-        response = localise(client, plan_id, sphere, refine=refine, **fields)
-        assert response.status_code == 200, response.text
-        answers.append(response.json())
+        answers.append(document_of(localise(client, plan_id, sphere, refine=refine, **fields)))
         return answers[-1]["stage"] == stage
 
     # LPO falls back to the VDR pose until the worker has started.
@@ -60,8 +58,7 @@ def test_query_reaches_each_stage(
 
 @pytest.mark.slow
 def test_turn_is_refined_by_latents(client: httpx.Client, sphere: bytes) -> None:
-    response = localise_turn(client, upload(client), sphere, sphere)
-    assert response.status_code == 200, response.text
+    answer = document_of(localise_turn(client, upload(client), sphere, sphere))
     # The pose on the grid is the answer until the worker has started.
-    assert response.json()["stage"] in ("lpo", "retrieval")
-    assert len(response.json()["poses"]) == 2
+    assert answer["stage"] in ("lpo", "retrieval")
+    assert len(answer["poses"]) == 2

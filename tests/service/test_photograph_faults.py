@@ -10,7 +10,7 @@ import pytest
 from lalaloc_core.photograph.file_segments import END
 from tests.core.fault_photographs import CONTRADICTED, FAULTS, Fault, fault_id
 from tests.core.taken import EXAMPLES
-from tests.service.conftest import assert_problem
+from tests.service.conftest import assert_problem, document_of
 from tests.service.test_photographs import ask, turn
 
 KITCHEN = (EXAMPLES / "kitchen.jpg").read_bytes()
@@ -30,8 +30,7 @@ def data_of(fault: Fault, plan_id: str) -> dict[str, str]:
 def test_file_is_localised_right_or_refused_by_name(shipped: httpx.Client, home: str, fault: Fault) -> None:
     response = shipped.post("/localise", data=data_of(fault, home), files={"photo": (fault.name, fault.content)})
     if fault.is_usable:
-        assert response.status_code == 200, response.text
-        fault.check(response.json())
+        fault.check(document_of(response))
     else:
         fault.check_refusal(assert_problem(response, 422, "invalid-photograph")["detail"])
 

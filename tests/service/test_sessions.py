@@ -221,9 +221,7 @@ def test_session_in_a_venue_names_the_plan(
     assert (empty["venue_id"], empty["floorplan_id"], empty["floorplan_revision"]) == (venue_id, None, None)
     for number in (1, 2, 3):
         motion: dict[str, Any] = {} if number == 1 else {"forward_m": 0, "turn_deg": 0}
-        sent = send(client, session_id, sphere, number=number, **motion)
-        assert sent.status_code == 200, sent.text
-    answer = sent.json()
+        answer = document_of(send(client, session_id, sphere, number=number, **motion))
     levels = {lower: 0.0, upper: 1.0}
     assert [point["number"] for point in answer["path"]] == [1, 2, 3]
     for place in (answer["pose"], *answer["pose"]["candidates"], *answer["path"]):
@@ -278,11 +276,10 @@ def test_session_of_an_earlier_version_goes_on(
         for place in (pose["pose"], *pose["pose"]["candidates"], *pose["path"]):
             del place["floorplan_id"], place["level"]
         app_store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
-        after = send(client, session_id, sphere, forward_m=0, turn_deg=0)
-        assert after.status_code == 200, after.text
+        after = document_of(send(client, session_id, sphere, forward_m=0, turn_deg=0))
         # `finish` counted a photograph.
-        assert after.json()["photographs"] == 3
-        assert after.json()["path"][0] == before["path"][0] | {"floorplan_id": None, "level": None}
+        assert after["photographs"] == 3
+        assert after["path"][0] == before["path"][0] | {"floorplan_id": None, "level": None}
 
 
 def _first_version(state: bytes) -> bytes:

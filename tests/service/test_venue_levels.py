@@ -270,9 +270,8 @@ def test_file_that_cannot_be_added_changes_nothing(start_app: StartApp, tmp_path
         assert_problem(extend(client, venue_id, street(3, 2), **{"If-Match": '"old"'}), 412, "revision-mismatch")
         assert_problem(extend(client, "0" * 32, street(3, 2)), 404, "unknown-venue")
         wrong = json.dumps({"plans": [random_home(3), {**random_home(4), "rooms": []}]}).encode()
-        assert (
-            "level 'home 00004'" in assert_problem(extend(client, venue_id, wrong), 422, "invalid-floorplan")["detail"]
-        )
+        problem = assert_problem(extend(client, venue_id, wrong), 422, "invalid-floorplan")
+        assert "level 'home 00004'" in problem["detail"]
         assert counts(client) == before
         assert client.get("/usage").json()["stored_bytes"] == used
         assert client.get(path).json() == venue.json()

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from service.storage import Store
-from tests.service.conftest import FLAT, StartApp, assert_problem, pages, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, document_of, pages, upload
 from tests.service.test_security import bearer, make_key
 
 JSON = {"Content-Type": "application/json"}
@@ -29,8 +29,7 @@ def member(plan_id: str, level: float = 0.0, **more: Any) -> dict[str, Any]:
 
 def make(client: httpx.Client, *members: dict[str, Any], **more: Any) -> dict[str, Any]:
     response = client.post("/venues", json={"plans": list(members), **more})
-    assert response.status_code == 201, response.text
-    return response.json() | {"etag": response.headers["etag"]}
+    return document_of(response, 201) | {"etag": response.headers["etag"]}
 
 
 def plans_of(client: httpx.Client, venue_id: str, **params: Any) -> list[dict[str, Any]]:
@@ -77,9 +76,9 @@ def test_venues_are_listed_newest_first(client: httpx.Client, plans: list[str]) 
 def test_put_replaces_and_patch_changes(client: httpx.Client, plans: list[str]) -> None:
     venue = make(client, member(plans[0]), member(plans[1], 1), name="old", anchor=ANCHOR)
     path = f"/venues/{venue['id']}"
-    changed = client.patch(path, json={"plans": [member(plans[0], 3), member(plans[2])], "remove": [plans[1]]})
-    assert changed.status_code == 200, changed.text
-    assert (changed.json()["name"], changed.json()["anchor"]) == ("old", ANCHOR)
+    change = {"plans": [member(plans[0], 3), member(plans[2])], "remove": [plans[1]]}
+    changed = document_of(client.patch(path, json=change))
+    assert (changed["name"], changed["anchor"]) == ("old", ANCHOR)
     levels = {entry["floorplan_id"]: entry["level"] for entry in plans_of(client, venue["id"])}
     assert levels == {plans[0]: 3, plans[2]: 0}
     assert client.patch(path, json={"anchor": None}).json()["anchor"] is None
