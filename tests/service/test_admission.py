@@ -184,20 +184,12 @@ def test_query_waiting_for_a_grid_blocks_no_other(small: httpx.Client, sphere: b
 
 def test_disconnect_frees_the_slot(small: httpx.Client, sphere: bytes) -> None:
     preparing = upload(small, HALL, wait=False)
-    body, content_type = _multipart(preparing, sphere)
+    query = small.build_request("POST", "/localise", data={"floorplan_id": preparing}, files={"photo": ("p", sphere)})
+    head = b"".join(name + b": " + value + b"\r\n" for name, value in query.headers.raw)
     with connection_to(small) as connection:
-        lines = ["POST /localise HTTP/1.1", "Host: localhost", f"Content-Type: {content_type}"]
-        head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
-        connection.sendall(head.encode() + body)
+        connection.sendall(b"POST /localise HTTP/1.1\r\n" + head + b"\r\n" + query.read())
         wait_for(lambda: metric(small, IN_FLIGHT) == 1)
     wait_for(lambda: metric(small, IN_FLIGHT) == 0)
     assert 'lalaloc_disconnects_total{route="/localise"} 1.0' in small.get("/metrics").text
     assert small.delete(f"/floorplans/{preparing}").status_code == 204
     assert metric(small, "lalaloc_queries_in_work") == 0
-
-
-def _multipart(plan_id: str, sphere: bytes) -> tuple[bytes, str]:
-    request = httpx.Request(
-        "POST", "http://test", data={"floorplan_id": plan_id}, files={"photo": ("p.jpg", sphere, "image/jpeg")}
-    )
-    return request.read(), request.headers["content-type"]

@@ -202,10 +202,8 @@ def test_right_heading_is_not_doubted(right: list[dict[str, Any]], given: bool) 
 
 @pytest.mark.parametrize(("size_m", "ways"), [((3.2, 4.6), 2), ((3.2, 3.2), 4)], ids=["rectangle", "square"])
 def test_plain_room_splits_between_its_headings(shipped: httpx.Client, size_m: tuple[float, float], ways: int) -> None:
-    room, picture = (
-        upload(shipped, plan_document(rectangle(*size_m), camera_height_m=1.5)),
-        painted_room(size_m, (0.8, 1.0)),
-    )
+    room = upload(shipped, plan_document(rectangle(*size_m), camera_height_m=1.5))
+    picture = painted_room(size_m, (0.8, 1.0))
     answer = ask(shipped, room, picture, None, top_k=5)
     shares = [candidate["probability"] for candidate in answer["candidates"]]
     assert shares[:ways] == pytest.approx([1.0 / ways] * ways, abs=0.08)

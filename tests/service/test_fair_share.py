@@ -23,6 +23,7 @@ from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
+from tests.core.test_images import of_scans
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
 
 WORST = "127.0.0.2"
@@ -425,7 +426,8 @@ def test_streams_of_one_client_leave_slots_for_others(start_app: StartApp, tmp_p
 @pytest.mark.slow
 @pytest.mark.one_replica
 def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
-    slow = _endless_picture()
+    # Its decoding takes most of a minute.
+    slow = of_scans(14_000, 7_000, 400)
     with start_app(tmp_path, decode_workers=2, decode_stall_s=1.5, max_scans=10_000) as client, ExitStack() as attack:
         plan_id = upload(client)
         wait_for(lambda: client.get("/readyz").status_code == 200)
@@ -441,10 +443,3 @@ def test_slow_picture_delays_no_other_tenant(start_app: StartApp, tmp_path: Path
         begin = monotonic()
         assert localise(client, plan_id, sphere, refine="none").status_code == 200
         assert metric(client, "lalaloc_queries_in_work") >= 2, f"all were done after {monotonic() - begin:.1f} s"
-
-
-def _endless_picture() -> bytes:
-    """Return a JPEG with so many scans that decoding it takes most of a minute."""
-    from tests.core.test_images import of_scans
-
-    return of_scans(14_000, 7_000, 400)

@@ -57,6 +57,10 @@ def _query(client: httpx.Client, key: str, plan_id: str, picture: bytes, **field
     return client.post("/localise", data=data, files={"photo": ("p.jpg", picture)}, headers=_keyed(key))
 
 
+def _post_content(client: httpx.Client) -> httpx.Response:
+    return client.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
+
+
 def _count(client: httpx.Client) -> int:
     return len(client.get("/floorplans", params={"limit": 500}).json()["floorplans"])
 
@@ -102,7 +106,7 @@ def test_answer_survives_a_restart(start_app: StartApp, tmp_path: Path) -> None:
 
 
 def test_multipart_boundary_does_not_matter(own: httpx.Client) -> None:
-    first = own.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
+    first = _post_content(own)
     for name in ("flat.json", "again.json"):
         # Every form has its own boundary.
         assert _same(first, own.post("/floorplans", files={"file": (name, CONTENT)}, headers=_keyed("a")))
@@ -178,15 +182,10 @@ def test_plan_of_a_dead_process_is_found_by_the_next(start_app: StartApp, tmp_pa
         claim = keys.begin("default", "POST /floorplans", "a", digest)
         assert isinstance(claim, Claimed)
         plan_id = claim.token
-        headers = _keyed("a") | {"Content-Type": "application/json"}
-
-        def send() -> httpx.Response:
-            return client.post("/floorplans", content=CONTENT, headers=headers)
-
-        assert_problem(send(), 409, "idempotency-in-progress")
+        assert_problem(_post_content(client), 409, "idempotency-in-progress")
         app_store.plans.add("default", plan_id, NewPlan(FloorPlan.from_json(CONTENT), Original(CONTENT)), limit=10)
-        wait_for(lambda: send().status_code == 201, 10.0)
-        again = send()
+        wait_for(lambda: _post_content(client).status_code == 201, 10.0)
+        again = _post_content(client)
         assert again.json()["id"] == plan_id
         assert again.headers["idempotency-replayed"] == "true"
         assert _count(client) == 1
@@ -199,12 +198,8 @@ def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:
     )
     with connection_to(own) as connection:
         connection.sendall(head.encode() + CONTENT)
-
-    def send() -> httpx.Response:
-        return own.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
-
-    wait_for(lambda: send().status_code == 201, 10.0)
-    assert send().headers["idempotency-replayed"] == "true"
+    wait_for(lambda: _post_content(own).status_code == 201, 10.0)
+    assert _post_content(own).headers["idempotency-replayed"] == "true"
     assert _count(own) == 1
 
 

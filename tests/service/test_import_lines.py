@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -95,21 +94,18 @@ def test_same_key_stores_the_plan_once_with_and_without_lines(client: httpx.Clie
     assert refusals[1] == refusals[0] | {"replayed": True}
 
 
-@pytest.fixture
-def own(start_app: StartApp, tmp_path: Path) -> Iterator[httpx.Client]:
-    with start_app(tmp_path / "data") as started:
-        yield started
-
-
 @pytest.mark.slow
-def test_plan_of_a_client_that_left_is_stored(own: httpx.Client, picture: tuple[bytes, dict[str, str]]) -> None:
-    content, fields = picture
-    request = own.build_request("POST", "/floorplans", files={"file": ("plan", content)}, data=fields, headers=LINES)
-    head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
-    with connection_to(own) as connection:
-        connection.sendall(f"POST /floorplans HTTP/1.1\r\n{head}\r\n".encode() + request.read())
-        received = b""
-        while b"reading" not in received and b"opening" not in received:
-            received += connection.recv(65_536)
-    wait_for(lambda: len(own.get("/floorplans").json()["floorplans"]) == 1)
-    wait_for(lambda: own.get("/readyz").status_code == 200)
+def test_plan_of_a_client_that_left_is_stored(
+    start_app: StartApp, tmp_path: Path, picture: tuple[bytes, dict[str, str]]
+) -> None:
+    form: dict[str, Any] = {"files": {"file": ("plan", picture[0])}, "data": picture[1]}
+    with start_app(tmp_path) as own:
+        request = own.build_request("POST", "/floorplans", headers=LINES, **form)
+        head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
+        with connection_to(own) as connection:
+            connection.sendall(f"POST /floorplans HTTP/1.1\r\n{head}\r\n".encode() + request.read())
+            received = b""
+            while b"reading" not in received and b"opening" not in received:
+                received += connection.recv(65_536)
+        wait_for(lambda: len(own.get("/floorplans").json()["floorplans"]) == 1)
+        wait_for(lambda: own.get("/readyz").status_code == 200)

@@ -122,10 +122,7 @@ def test_cursor_texts_are_unique(text: str) -> None:
 # Entity tags
 
 
-REPRESENTATIONS = ["", "/original", "/preview.svg", "/mesh.glb"]
-
-
-@pytest.mark.parametrize("path", REPRESENTATIONS)
+@pytest.mark.parametrize("path", ["", "/original", "/preview.svg", "/mesh.glb"])
 def test_matching_tag_gets_304(client: httpx.Client, path: str) -> None:
     url = f"/floorplans/{upload(client)}{path}"
     first = client.get(url)

@@ -131,7 +131,6 @@ def test_stored_bytes_follow_every_change(store: Store) -> None:
     kept = [store.answers.add("a", "p" * 32, lambda answer_id: answer_id * 100, limit=2) for _ in range(4)]
     _keep_answer(store, "a", "k", 1000)
     _recounted(store, "a")
-    used = store.quota.account("a").used
     album = NewAlbum(name="a", plan_id="q" * 32, venue_id=None, options="{}", model_sha256="m1")
     store.albums.add("a", "c" * 32, album, ttl_s=60.0, limit=9)
     photograph = NewPhotograph(sha256="0" * 64, name="p.jpg", facts="{}", entry=bytes(1000))
