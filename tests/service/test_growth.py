@@ -8,7 +8,6 @@ from contextlib import suppress
 
 import pytest
 from starlette.requests import Request
-from starlette.types import Message
 
 from lalaloc_core.errors import LaLaLocError
 from service.http.idempotent_request import _key_of
@@ -19,18 +18,33 @@ from service.security.access_control import is_allowed_host
 from service.security.keys import parse_authorization
 from service.telemetry.logs import parse_traceparent
 from tests.growth import assert_no_worse_than_linear
+from tests.service.test_uploads import request_of
 
 # Slightly more than the maximum size of a request's head.
 _HEAD = 12_000
 _LIMITS = UploadLimits(
     max_bytes=10**8, name="max_photograph_bytes", deadline_s=60.0, idle_s=60.0, bytes_per_s=1.0, memory_bytes=2**20
 )
-_UPLOAD_CHUNK = 65_536
 
 
 def _request(name: str, value: str) -> Request:
     headers = [(name.encode(), value.encode("latin-1"))]
     return Request({"type": "http", "method": "GET", "path": "/", "query_string": b"", "headers": headers})
+
+
+def _assert_linear(make: Callable[[int], str], parse: Callable[[str], object]) -> None:
+    """Check that the time to parse a text of a head, or to refuse it, grows at most linearly with its size."""
+
+    def make_work(size: int) -> Callable[[], None]:
+        text = make(size)
+
+        def work() -> None:
+            with suppress(LaLaLocError):
+                parse(text)
+
+        return work
+
+    assert_no_worse_than_linear(make_work, _HEAD)
 
 
 _TAGS: dict[str, Callable[[int], str]] = {
@@ -46,16 +60,7 @@ _TAGS: dict[str, Callable[[int], str]] = {
 
 @pytest.mark.parametrize("kind", _TAGS)
 def test_entity_tag_parsing_is_linear(kind: str) -> None:
-    def make_work(size: int) -> Callable[[], None]:
-        request = _request("if-match", _TAGS[kind](size))
-
-        def work() -> None:
-            with suppress(LaLaLocError):
-                expected_revision(request, "p", "r")
-
-        return work
-
-    assert_no_worse_than_linear(make_work, _HEAD)
+    _assert_linear(_TAGS[kind], lambda text: expected_revision(_request("if-match", text), "p", "r"))
 
 
 _PARSED: dict[str, Callable[[str], object]] = {
@@ -71,16 +76,7 @@ _PARSED: dict[str, Callable[[str], object]] = {
 @pytest.mark.parametrize("unit", ["a", "-", "_", " ", ":", "[", "1.", "%0a", "@", "-a"])
 @pytest.mark.parametrize("kind", _PARSED)
 def test_head_parsing_is_linear(kind: str, unit: str) -> None:
-    def make_work(size: int) -> Callable[[], None]:
-        text = unit * (size // len(unit))
-
-        def work() -> None:
-            with suppress(LaLaLocError):
-                _PARSED[kind](text)
-
-        return work
-
-    assert_no_worse_than_linear(make_work, _HEAD)
+    _assert_linear(lambda size: unit * (size // len(unit)), _PARSED[kind])
 
 
 _PART = b'--b\r\nContent-Disposition: form-data; name="photo"; filename="p"\r\n\r\n'
@@ -102,44 +98,26 @@ _BODIES: dict[str, Callable[[int], bytes]] = {
 }
 
 
+def _reading(content: bytes, media: str, chunk: int = 65_536) -> Callable[[], None]:
+    """Return the work of reading a form."""
+
+    async def read() -> None:
+        scope, receive = request_of(content, media, chunk)
+        with suppress(LaLaLocError):
+            await read_parts(Request(scope, receive), _LIMITS, files={"photo"}, fields={"x"})
+
+    return lambda: asyncio.run(read())
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("chunk", [_UPLOAD_CHUNK, 512])
+@pytest.mark.parametrize("chunk", [65_536, 512])
 @pytest.mark.parametrize("kind", _BODIES)
 def test_form_parsing_is_linear(kind: str, chunk: int) -> None:
-    def make_work(size: int) -> Callable[[], None]:
-        body = _BODIES[kind](size)
-
-        async def read() -> None:
-            pieces = iter([body[first : first + chunk] for first in range(0, len(body), chunk)])
-
-            async def receive() -> Message:
-                piece = next(pieces, None)
-                return {"type": "http.request", "body": piece or b"", "more_body": piece is not None}
-
-            headers = [(b"content-type", b"multipart/form-data; boundary=b")]
-            scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
-            with suppress(LaLaLocError):
-                await read_parts(Request(scope, receive), _LIMITS, files={"photo"}, fields={"x"})
-
-        return lambda: asyncio.run(read())
-
-    assert_no_worse_than_linear(make_work, 300_000)
+    media = "multipart/form-data; boundary=b"
+    assert_no_worse_than_linear(lambda size: _reading(_BODIES[kind](size), media, chunk), 300_000)
 
 
 @pytest.mark.parametrize("unit", [";", "; a=b", '; a="', "\\", '"', "=", "; charset", " "])
 def test_media_type_parsing_is_linear(unit: str) -> None:
-    async def read(media: str) -> None:
-        headers = [(b"content-type", media.encode())]
-        scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
-
-        async def receive() -> Message:
-            return {"type": "http.request", "body": b"", "more_body": False}
-
-        with suppress(LaLaLocError):
-            await read_parts(Request(scope, receive), _LIMITS, files=set(), fields=set())
-
-    def make_work(size: int) -> Callable[[], None]:
-        media = "multipart/form-data; boundary=b" + unit * (size // len(unit))
-        return lambda: asyncio.run(read(media))
-
-    assert_no_worse_than_linear(make_work, _HEAD)
+    begin = "multipart/form-data; boundary=b"
+    assert_no_worse_than_linear(lambda size: _reading(b"", begin + unit * (size // len(unit))), _HEAD)

@@ -215,14 +215,14 @@ def test_bodies_beyond_the_memory_limit_are_on_disk_until_the_request_ends() -> 
     )
 
     async def scenario() -> None:
-        scope, receive = _request(form + b"--b--\r\n", "multipart/form-data; boundary=b")
+        scope, receive = request_of(form + b"--b--\r\n", "multipart/form-data; boundary=b")
         with ending_request(scope):
             parts = await read_parts(Request(scope, receive), _LIMITS, files={"small", "large"}, fields=set())
             assert [_is_on_disk(parts.files[name]) for name in ("small", "large")] == [False, True]
             assert [parts.files[name].read() for name in ("small", "large")] == [small, large]
             # Workers and other machines get the content.
             assert pickle.loads(pickle.dumps(parts.files["large"])) == large
-            scope_of_body, receive_body = _request(large, "application/json")
+            scope_of_body, receive_body = request_of(large, "application/json")
             body = await read_body(Request(scope | scope_of_body, receive_body), _LIMITS)
             assert _is_on_disk(body)
             assert (len(body), b"".join(body.chunks())) == (len(large), large)
@@ -233,8 +233,9 @@ def test_bodies_beyond_the_memory_limit_are_on_disk_until_the_request_ends() -> 
     asyncio.run(scenario())
 
 
-def _request(content: bytes, media: str) -> tuple[dict[str, Any], Any]:
-    pieces = iter([content[first : first + 65_536] for first in range(0, len(content), 65_536)])
+def request_of(content: bytes, media: str, chunk: int = 65_536) -> tuple[dict[str, Any], Any]:
+    """Return the scope of a request, and the function that receives its body in pieces."""
+    pieces = iter([content[first : first + chunk] for first in range(0, len(content), chunk)])
 
     async def receive() -> Message:
         piece = next(pieces, None)
