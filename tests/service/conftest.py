@@ -26,7 +26,7 @@ import uvicorn
 from fastapi import FastAPI
 from PIL import Image
 
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.bundle import Bundle, default_bundle
 from service.app import create_app
 from service.pools import supervisor
 from service.pools.supervisor import Watchdog
@@ -93,6 +93,11 @@ def _forked_workers() -> Iterator[None]:
 def sphere() -> bytes:
     """Return a valid sphere without content: smooth colours, 512 x 256."""
     return encode_picture(512, 256, "JPEG")
+
+
+@pytest.fixture(scope="session")
+def bundle(tiny_bundle: Path) -> Bundle:
+    return Bundle.open(tiny_bundle)
 
 
 @pytest.fixture(scope="session")

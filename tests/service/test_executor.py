@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,11 +25,6 @@ Steps = Generator[RefinementJob | None, RefinementResult | None, RefinementResul
 def _search(job: RefinementJob) -> Steps:
     """Return a search whose result is that of its one job."""
     return (yield job)
-
-
-@pytest.fixture(scope="module")
-def bundle(tiny_bundle: Path) -> Bundle:
-    return Bundle.open(tiny_bundle)
 
 
 @pytest.fixture

@@ -74,11 +74,6 @@ class CountingEncoders(PhotographEncoder):
         return result
 
 
-@pytest.fixture(scope="module")
-def bundle(tiny_bundle: Path) -> Bundle:
-    return Bundle.open(tiny_bundle)
-
-
 @pytest.fixture
 def encoders(bundle: Bundle) -> CountingEncoders:
     return CountingEncoders(bundle)

@@ -43,11 +43,6 @@ def _pool(bundle: Bundle, *, by_latents: bool = True, **overrides: Any) -> Itera
 
 
 @pytest.fixture(scope="module")
-def bundle(tiny_bundle: Path) -> Bundle:
-    return Bundle.open(tiny_bundle)
-
-
-@pytest.fixture(scope="module")
 def pool(bundle: Bundle) -> Iterator[LpoPool]:
     with _pool(bundle, workers=1, lpo_stall_s=600.0) as started:
         wait_for(lambda: started.state.ready == 1, 120.0)

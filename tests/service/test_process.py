@@ -49,7 +49,7 @@ def _uvicorn(environment: dict[str, str], log: Path) -> Iterator[tuple[subproces
         process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as client:
-            wait_for(lambda: process.poll() is not None or _answers(client), 120.0)
+            wait_for(lambda: process.poll() is not None or is_up(client), 120.0)
             assert process.poll() is None, log.read_text()
             yield process, client
     finally:
@@ -58,9 +58,10 @@ def _uvicorn(environment: dict[str, str], log: Path) -> Iterator[tuple[subproces
         process.wait(10.0)
 
 
-def _answers(client: httpx.Client) -> bool:
+def is_up(client: httpx.Client, status: int = 200) -> bool:
+    """Return True if something listens, and tells health with a status."""
     try:
-        return client.get("/healthz").status_code == 200
+        return client.get("/healthz").status_code == status
     except httpx.TransportError:
         return False
 

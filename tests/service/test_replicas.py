@@ -23,6 +23,7 @@ from tests.local_servers import free_port
 from tests.service import test_albums as albums
 from tests.service.conftest import StartApp, assert_problem, connection_to, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
+from tests.service.test_process import is_up
 
 CONFIGURATION = Path(__file__).parents[2] / "docker" / "nginx.conf"
 
@@ -50,18 +51,11 @@ def nginx(
     process = subprocess.Popen([program, "-c", str(path), "-g", options])
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as client:
-            wait_for(lambda: _listens(client, status))
+            wait_for(lambda: is_up(client, status))
             yield client
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(10.0)
-
-
-def _listens(client: httpx.Client, status: int) -> bool:
-    try:
-        return client.get("/healthz").status_code == status
-    except httpx.TransportError:
-        return False
 
 
 def test_two_replicas_act_as_one_service(
