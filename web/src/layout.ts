@@ -38,16 +38,6 @@ function nearestWall(x: number, y: number, azimuth: number, walls: RoomLayout["w
   return found;
 }
 
-/** Return the azimuths of the centres of columns, once around. */
-function columnAzimuths(columns: number): number[] {
-  return Array.from({ length: columns }, (_, column) => ((column + 0.5) / columns - 0.5) * 2 * Math.PI);
-}
-
-/** Return the elevations at which a wall meets floor and ceiling. */
-function wallElevations(distance: number, cameraHeight: number, ceilingHeight: number): Point {
-  return [-Math.atan2(cameraHeight, distance), Math.atan2(ceilingHeight - cameraHeight, distance)];
-}
-
 /** Line of the layout as directions from the camera: azimuth and elevation of each point. */
 export interface LayoutLine {
   kind: "edge" | OpeningKind;
@@ -64,34 +54,33 @@ interface Piece {
 export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight: number): LayoutLine[] {
   const pieces = visiblePieces(x, y, room);
   const distanceAt = (wall: number, azimuth: number): number => toWall(x, y, azimuth, room.walls_m[wall]!);
+  const elevation = (height: number, distance: number): number => Math.atan2(height - cameraHeight, distance);
+  // Where a wall meets floor and ceiling.
+  const heights = [0, room.ceiling_height_m];
   const lines: LayoutLine[] = [];
-  pieces.forEach((piece, index) => {
-    const along = sampled(piece.from, piece.to);
-    const ends = along.map((azimuth) =>
-      wallElevations(distanceAt(piece.wall, azimuth), cameraHeight, room.ceiling_height_m),
-    );
-    lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![0]]) });
-    lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![1]]) });
+  pieces.forEach(({ wall, from, to }, index) => {
+    for (const height of heights)
+      lines.push({
+        kind: "edge",
+        points: sampled(from, to).map((azimuth) => [azimuth, elevation(height, distanceAt(wall, azimuth))]),
+      });
     const next = pieces[(index + 1) % pieces.length]!;
-    const near = Math.min(distanceAt(piece.wall, piece.to), distanceAt(next.wall, piece.to));
-    const corner = wallElevations(near, cameraHeight, room.ceiling_height_m);
-    if (pieces.length > 1) lines.push({ kind: "edge", points: corner.map((elevation) => [piece.to, elevation]) });
-    lines.push(...openingLines(x, y, piece, room, cameraHeight));
+    const near = Math.min(distanceAt(wall, to), distanceAt(next.wall, to));
+    if (pieces.length > 1) lines.push({ kind: "edge", points: heights.map((height) => [to, elevation(height, near)]) });
+    lines.push(...openingLines(x, y, { wall, from, to }, room, cameraHeight));
   });
   return lines;
 }
 
 function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, cameraHeight: number): LayoutLine[] {
-  const wall = room.walls_m[piece.wall]!;
+  const wall = room.walls_m[piece.wall]!,
+    [x0, y0, x1, y1] = wall;
   return room.openings
     .filter((opening) => opening.wall === piece.wall)
     .flatMap((opening) => {
       const sides = [opening.start, opening.end]
         .map((share) => {
-          const azimuth = Math.atan2(
-            wall[0] + share * (wall[2] - wall[0]) - x,
-            wall[1] + share * (wall[3] - wall[1]) - y,
-          );
+          const azimuth = Math.atan2(x0 + share * (x1 - x0) - x, y0 + share * (y1 - y0) - y);
           return unwrapped(azimuth, 0.5 * (piece.from + piece.to));
         })
         .sort((a, b) => a - b) as Point;
@@ -102,13 +91,11 @@ function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, came
       const sill = opening.sill_m ?? usualSill,
         head = Math.min(opening.head_m ?? usualHead, room.ceiling_height_m);
       if (sill >= head) return [];
-      const elevations = (azimuth: number): Point => {
-        const distance = toWall(x, y, azimuth, wall);
-        return [Math.atan2(sill - cameraHeight, distance), Math.atan2(head - cameraHeight, distance)];
-      };
       const along = sampled(from, to);
-      const lower = along.map((azimuth): Point => [azimuth, elevations(azimuth)[0]]);
-      const upper = along.map((azimuth): Point => [azimuth, elevations(azimuth)[1]]);
+      const at = (height: number): Point[] =>
+        along.map((azimuth) => [azimuth, Math.atan2(height - cameraHeight, toWall(x, y, azimuth, wall))]);
+      const lower = at(sill),
+        upper = at(head);
       // One line around the opening; a side that another wall hides stays open.
       const whole = sides[0] >= piece.from - 1e-9,
         closed = sides[1] <= piece.to + 1e-9;
@@ -126,7 +113,7 @@ function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, came
 /** Return the visible pieces of walls, clockwise, once around. */
 function visiblePieces(x: number, y: number, room: RoomLayout): Piece[] {
   const wallAt = (azimuth: number): number => nearestWall(x, y, azimuth, room.walls_m);
-  const azimuths = columnAzimuths(COLUMNS);
+  const azimuths = Array.from({ length: COLUMNS }, (_, column) => ((column + 0.5) / COLUMNS - 0.5) * 2 * Math.PI);
   const walls = azimuths.map(wallAt);
   const borders: { azimuth: number; wall: number }[] = [];
   walls.forEach((wall, column) => {
