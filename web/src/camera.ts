@@ -14,6 +14,8 @@ const LARGEST_STEP = radians(1);
 // Perspective cameras are drawn up to this angle from the optical axis.
 const WIDEST = Math.tan(radians(80));
 
+export const dot = (a: Ray, b: Ray): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
 /** Return the direction of an azimuth and an elevation. */
 export const rayOf = (azimuth: number, elevation: number): Ray => [
   Math.cos(elevation) * Math.sin(azimuth),
@@ -47,13 +49,11 @@ function dense(line: Point[]): Point[] {
   return line.flatMap((point, index) => {
     const next = line[index + 1];
     if (next === undefined) return [point];
-    const steps = Math.max(
-      1,
-      Math.ceil(Math.max(Math.abs(next[0] - point[0]), Math.abs(next[1] - point[1])) / LARGEST_STEP),
-    );
+    const [dx, dy] = [next[0] - point[0], next[1] - point[1]];
+    const steps = Math.max(1, Math.ceil(Math.max(Math.abs(dx), Math.abs(dy)) / LARGEST_STEP));
     return Array.from({ length: steps }, (_, step): Point => [
-      point[0] + (step / steps) * (next[0] - point[0]),
-      point[1] + (step / steps) * (next[1] - point[1]),
+      point[0] + (step / steps) * dx,
+      point[1] + (step / steps) * dy,
     ]);
   });
 }

@@ -1,6 +1,6 @@
 /** Tilt of a camera from straight lines, as in lalaloc_core/photograph/levelling.py, which explains the method; angles are radians. */
 
-import { type Ray, tiltOf } from "../camera";
+import { dot, type Ray, tiltOf } from "../camera";
 import { degrees, radians } from "../layout";
 import type { Size } from "../projection";
 import type { Segment } from "./segments";
@@ -57,7 +57,6 @@ const LONG_FOVS = [44, 48, 52, 57, 62, 67, 73, 79, 86, 93, 100, 108, 116].map(ra
   FOV_SD = 0.35,
   FOCAL_FLOOR = 0.03;
 
-const dot = (a: Ray, b: Ray): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const range = (first: number, last: number, step: number): number[] =>
   Array.from({ length: Math.round((last - first) / step) + 1 }, (_, index) => radians(first + index * step));
 const PITCHES = range(-40, 40, 2.5),

@@ -1,6 +1,6 @@
 /** Objects in photographs that are no spheres, as in lalaloc_core/localise/encode/view_encoder.py. */
 
-import { type CameraView, type Ray, tiltOf } from "../camera";
+import { type CameraView, dot, type Ray, tiltOf } from "../camera";
 import { radians } from "../layout";
 import type { Size } from "../projection";
 
@@ -29,8 +29,6 @@ export function columnAzimuths(view: CameraView, columns: number): number[] {
       camera === null
         ? [Math.sin(share * radians(view.hfov.value_deg)), Math.cos(share * radians(view.hfov.value_deg)), 0]
         : [(share * camera.width) / camera.fx, 1, 0];
-    return Math.atan2(product(ray, right), product(ray, forward));
+    return Math.atan2(dot(ray, right), dot(ray, forward));
   });
 }
-
-const product = (a: Ray, b: Ray): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
