@@ -210,12 +210,8 @@ export class AnswerController {
   }
 
   /** Localise the chosen photograph, or its group, and show errors. */
-  private async localise(): Promise<void> {
-    try {
-      await this.search();
-    } catch (error) {
-      showError(this.error, error, this.fields);
-    }
+  private localise(): Promise<void> {
+    return attempt(this.error, () => this.search(), this.fields);
   }
 
   /** Localise the frames of a guided turn; null if it was stopped. */

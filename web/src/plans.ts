@@ -50,7 +50,7 @@ export class Plans {
   private readonly importing = new ImportForm(
     (file, fields) => void this.upload(file, fields),
     (file, fields) => void this.uploadLevels(file, fields),
-    () => this.cancelImport(),
+    () => this.closeImport(),
   );
   private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
   private found: PlanSummary[] = [];
@@ -109,9 +109,7 @@ export class Plans {
   }
 
   choose(id: string, revision?: string): Promise<Plan | null> {
-    const chosen = this.open(id, revision);
-    this.pending = chosen;
-    return chosen;
+    return (this.pending = this.open(id, revision));
   }
 
   /** Wait until the plan that was chosen last is shown, or cannot be. */
@@ -122,8 +120,7 @@ export class Plans {
   }
 
   private async open(id: string, revision?: string): Promise<Plan | null> {
-    clearError(this.error, this.importing.fields);
-    this.importing.close();
+    this.closeImport();
     const request = this.discardPending();
     try {
       const plan = await api.plan(id, revision);
@@ -185,7 +182,7 @@ export class Plans {
     else await this.upload(file);
   }
 
-  private cancelImport(): void {
+  private closeImport(): void {
     clearError(this.error, this.importing.fields);
     this.importing.close();
   }
@@ -296,6 +293,6 @@ export class Plans {
     show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));
     byId("plan-none").hidden = this.found.length > 0;
     byId("plan-none").textContent =
-      byId<HTMLInputElement>("plan-search").value.trim() === "" ? "No plan is stored yet." : "No plan with this name.";
+      this.search.value.trim() === "" ? "No plan is stored yet." : "No plan with this name.";
   }
 }

@@ -104,10 +104,9 @@ export class Venues {
   }
 
   private draw(): void {
-    const entries = this.found.map(({ id, name, plans }) => {
-      const choose = planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id));
-      return h("li", {}, choose);
-    });
+    const entries = this.found.map(({ id, name, plans }) =>
+      h("li", {}, planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id))),
+    );
     show(this.list, ...entries);
     byId("venues").hidden = this.found.length === 0;
   }
