@@ -3,7 +3,7 @@
 import { api, key } from "./api";
 import { byId } from "./dom";
 import { connectKeyDialog } from "./key_dialog";
-import { showError } from "./notices";
+import { attempt } from "./notices";
 
 interface SwaggerUi {
   preauthorizeApiKey(scheme: string, value: string): void;
@@ -11,24 +11,18 @@ interface SwaggerUi {
 
 declare const SwaggerUIBundle: (options: Record<string, unknown>) => SwaggerUi;
 
-async function start(): Promise<void> {
-  connectKeyDialog();
-  try {
-    const spec: unknown = await api.json("/openapi.json");
-    const ui = SwaggerUIBundle({
-      spec,
-      dom_id: "#api",
-      deepLinking: true,
-      docExpansion: "list",
-      validatorUrl: null,
-      onComplete: () => {
-        const given = key.get();
-        if (given !== null) ui.preauthorizeApiKey("api_key", given);
-      },
-    });
-  } catch (error) {
-    showError(byId("docs-error"), error);
-  }
-}
-
-void start();
+connectKeyDialog();
+void attempt(byId("docs-error"), async () => {
+  const spec: unknown = await api.json("/openapi.json");
+  const ui = SwaggerUIBundle({
+    spec,
+    dom_id: "#api",
+    deepLinking: true,
+    docExpansion: "list",
+    validatorUrl: null,
+    onComplete: () => {
+      const given = key.get();
+      if (given !== null) ui.preauthorizeApiKey("api_key", given);
+    },
+  });
+});
