@@ -15,7 +15,7 @@ from lalaloc_core.learn.data.dataset import Camera
 from lalaloc_core.localise.match import layouts_at
 from lalaloc_core.localise.query import CameraHeight, PredictedOpenings, PredictedProfile, Query
 from lalaloc_core.render.sampling import PoseSet
-from tests.strategies import plan_of, rectangle
+from tests.strategies import plan_of, present, rectangle
 
 # Room of 4 x 3 m with a window in the whole of its nearest wall, on the left of the camera.
 WINDOW = {"kind": "window", "line": [[0.0, 0.01], [0.0, 2.99]]}
@@ -30,8 +30,7 @@ def camera(heading: float) -> Camera:
 @pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
 @pytest.mark.parametrize(("openings", "expected"), [([], -math.pi / 2.0), ([WINDOW], 0.0)])
 def test_blank_wall_is_the_nearest_without_openings(heading: float, openings: list, expected: float) -> None:
-    found = blank_azimuth(plan_of(ROOM, openings=openings), camera(heading))
-    assert found is not None
+    found = present(blank_azimuth(plan_of(ROOM, openings=openings), camera(heading)))
     # The wall to the north is one metre away; near the corner the view also shows a part of the window.
     off = (found + heading - expected + math.pi) % (2.0 * math.pi) - math.pi
     assert abs(off) < 0.5
@@ -78,23 +77,19 @@ def test_the_hypothesis_of_the_true_heading_has_the_layout_of_the_plan() -> None
     one = asked(number * TWO_PI / COLUMNS)
     query = with_truth(one, noise=1e-9, openings=True, rng=np.random.default_rng(0))
     layouts = layouts_at(PLAN, PoseSet(one.pose.position_m[None], np.array([0])), np.zeros(1), COLUMNS)
-    assert query.profile is not None
-    assert query.openings is not None
-    assert layouts.kind is not None
-    np.testing.assert_allclose(query.profile.log_m[number], layouts.log_profile[0], atol=1e-6)
-    seen = query.profile.seen[number]
-    likeliest = query.openings.log_probability[number].argmax(axis=1)
-    np.testing.assert_array_equal(likeliest[seen], layouts.kind[0][seen])
-    assert (layouts.kind[0][seen] != 0).any()
+    profile, openings, kind = present(query.profile), present(query.openings), present(layouts.kind)[0]
+    np.testing.assert_allclose(profile.log_m[number], layouts.log_profile[0], atol=1e-6)
+    seen = profile.seen[number]
+    likeliest = openings.log_probability[number].argmax(axis=1)
+    np.testing.assert_array_equal(likeliest[seen], kind[seen])
+    assert (kind[seen] != 0).any()
 
 
 def test_azimuths_that_are_not_seen_stay_unknown_and_walls_stay_predicted_without_noise() -> None:
     one = asked(0.4)
     query = with_truth(one, noise=None, openings=True, rng=np.random.default_rng(0))
     assert query.profile is one.query.profile
-    assert query.openings is not None
-    assert one.query.profile is not None
-    unseen = ~one.query.profile.seen[0]
-    np.testing.assert_allclose(np.exp(query.openings.log_probability[0][unseen]), [[0.7, 0.1, 0.1, 0.1]] * unseen.sum())
-    assert query.ceiling is not None
-    np.testing.assert_allclose(np.exp(query.ceiling.log_m), 1.0)
+    unseen = ~present(one.query.profile).seen[0]
+    shares = np.exp(present(query.openings).log_probability[0][unseen])
+    np.testing.assert_allclose(shares, [[0.7, 0.1, 0.1, 0.1]] * unseen.sum())
+    np.testing.assert_allclose(np.exp(present(query.ceiling).log_m), 1.0)

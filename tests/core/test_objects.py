@@ -100,9 +100,7 @@ def test_idle_core_takes_over_objects_and_chance_with_equal_answers() -> None:
     assert features.outputs.keys() == same.outputs.keys() >= set(OBJECT_OUTPUTS)
     for name, values in features.outputs.items():
         np.testing.assert_array_equal(same.outputs[name], values)
-    assert beside.objects is not None
-    assert alone.objects is not None
-    assert beside.objects.objects == alone.objects.objects
+    assert present(beside.objects).objects == present(alone.objects).objects
     assert again.signals == found.signals
 
 
@@ -116,10 +114,9 @@ def test_room_of_the_seen_type_wins_among_equal_rooms() -> None:
 
 def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
     asked = query((view(BED_DEG), 0.0))
-    assert asked.objects is not None
     cost = MatchingCost(plan("bedroom", "bathroom", "unknown"), asked, 0.1, MatchingWeights(), MatchingConfig())
     bedroom, bathroom, unknown = cost.room_costs[0]
-    share = asked.objects.room_type.shares()["bedroom"]
+    share = present(asked.objects).room_type.shares()["bedroom"]
     assert bedroom < unknown < bathroom
     # A log likelihood: the odds against a room without a type, over the temperature.
     ratio = 0.03 + 0.97 * share * (len(ROOM_TYPES) - 1)
@@ -128,9 +125,8 @@ def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
 
 def test_views_of_one_spot_share_their_objects() -> None:
     bed, wall = view(BED_DEG), view(0.0)
-    alone, both = query((bed, 0.0)).objects, query((wall, 0.0), (bed, math.radians(BED_DEG))).objects
-    assert alone is not None
-    assert both is not None
+    alone = present(query((bed, 0.0)).objects)
+    both = present(query((wall, 0.0), (bed, math.radians(BED_DEG))).objects)
     turned = {seen.name: seen.azimuth for seen in both.objects}
     for seen in alone.objects:
         assert turned[seen.name] == pytest.approx(seen.azimuth + math.radians(BED_DEG), abs=1e-6)
@@ -139,8 +135,7 @@ def test_views_of_one_spot_share_their_objects() -> None:
 
 
 def test_photograph_without_recognised_objects_tells_no_type() -> None:
-    manifest = bundle().manifest.objects
-    assert manifest is not None
+    manifest = present(bundle().manifest.objects)
     azimuth = np.zeros(len(manifest.names))
     # What the classifier gives every object in any photograph.
     noise = np.full(len(manifest.names), manifest.floor)
@@ -165,9 +160,7 @@ def test_thumbnails_have_a_bounded_size(width: int, height: int) -> None:
 def test_features_carry_objects_and_files_of_version_1_are_read() -> None:
     photograph = view(BED_DEG)
     content = FeatureEncoder(bundle(), threads=1).features(photograph)
-    expected, found = (query((read, 0.0)).objects for read in (photograph, read_features(content, bundle())))
-    assert expected is not None
-    assert found is not None
+    expected, found = (present(query((read, 0.0)).objects) for read in (photograph, read_features(content, bundle())))
     assert [seen.name for seen in found.objects] == [seen.name for seen in expected.objects]
     for seen, other in zip(found.objects, expected.objects, strict=True):
         assert (seen.azimuth, seen.probability) == pytest.approx((other.azimuth, other.probability))

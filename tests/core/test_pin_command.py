@@ -27,6 +27,7 @@ from lalaloc_core.shown_text import no_formula, printable
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import PHONE, jpeg, sphere, take
 from tests.painted import picture_file
+from tests.strategies import present
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLACE = Place(room="Küche", level="Ground & first", latitude=-33.8568, longitude=151.2153, direction_deg=271.24)
@@ -113,10 +114,7 @@ def test_selected_text_lies_over_its_picture() -> None:
     assert text.get_text_range().splitlines()[:2] == [name, "end"]
     ink = np.asarray(page.render(scale=1).to_pil().convert("L")) < 128
     for word in (name, "end", "turned"):
-        found = text.search(word)
-        match = found.get_next()
-        assert match is not None
-        index, count = match
+        index, count = present(text.search(word).get_next())
         boxes = [text.get_charbox(number) for number in range(index, index + count)]
         left, bottom = (min(box[side] for box in boxes) for side in (0, 1))
         right, top = (max(box[side] for box in boxes) for side in (2, 3))
@@ -272,8 +270,7 @@ def test_other_formats_get_a_file_beside_them(kind: str) -> None:
     copy, sidecar = placed_copy(content, PLACE)
     # Byte by byte, so that the pixels are the same whatever decodes them.
     assert copy == content
-    assert sidecar is not None
-    root = fromstring(sidecar.decode().partition("?>")[2].rpartition("<?xpacket")[0])
+    root = fromstring(present(sidecar).decode().partition("?>")[2].rpartition("<?xpacket")[0])
     names = [element.text for element in root.iter() if element.tag.endswith("}li")]
     assert names == ["Küche", "Ground & first", "Ground & first|Küche"]
     stated = {element.tag.rpartition("}")[2]: element.text for element in root.iter()}

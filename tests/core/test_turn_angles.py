@@ -23,6 +23,7 @@ from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.turn_angles import Overview, TurnAngles, TurnView, angles_of_turn
 from lalaloc_core.photograph.turned import open_turn, turn_views, turned_photographs
 from tests.core.taken import jpeg, sphere, take
+from tests.strategies import present
 
 PORTRAIT = Perspective.of_hfov(360, 480, math.radians(53.0))
 ONCE_AROUND = [24.0 * index for index in range(15)]
@@ -56,8 +57,7 @@ def test_closed_turn_fixes_the_field_of_view() -> None:
     for found in turned:
         assert found.hfov.source == "estimated"
         assert math.degrees(found.hfov.value) == pytest.approx(53.0, abs=0.6)
-        assert found.camera is not None
-        assert found.camera.hfov == found.hfov.value
+        assert present(found.camera).hfov == found.hfov.value
     assert "estimated from all photographs of the turn" in turned[0].warnings[-1]
 
 
@@ -100,8 +100,7 @@ def test_links_against_the_order_are_dropped() -> None:
     right = [Link(index, index + 1, rays, math.radians(30.0)) for index in range(6)]
     closing = Link(0, 11, rays, math.radians(-30.0))
     repeated = Link(3, 8, rays, math.radians(20.0))
-    steps = usual_steps(12, [*right, closing, repeated])
-    assert steps is not None
+    steps = present(usual_steps(12, [*right, closing, repeated]))
     assert [math.degrees(step.turn) for step in steps] == pytest.approx([30.0] * 12)
     assert agreeing_links([*right, closing, repeated], 12, steps) == [*right, closing]
     # Steps that do not lead once around, or are not alike, tell nothing.

@@ -24,6 +24,7 @@ from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
 from tests.painted import picture_file, png_file
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, metric, upload, wait_for
+from tests.strategies import present
 
 pytestmark = pytest.mark.one_replica
 
@@ -41,9 +42,7 @@ def decoders() -> list[BaseProcess]:
 def decoder() -> int:
     """Return the process id of the only decoding worker."""
     wait_for(lambda: len(decoders()) == 1 and decoders()[0].pid is not None)
-    pid = decoders()[0].pid
-    assert pid is not None
-    return pid
+    return present(decoders()[0].pid)
 
 
 def most_memory(pid: int) -> int:

@@ -13,6 +13,7 @@ from lalaloc_client import Client
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import jpeg
 from tests.service.conftest import StartApp, assert_problem, upload
+from tests.strategies import present
 
 pytestmark = needs_ffmpeg
 QUICK = {"refine": "none", "top_k": "1", "hfov_deg": "53", "motion": "turn"}
@@ -96,12 +97,9 @@ def test_python_client_sends_films(client: httpx.Client, flat: str, film: bytes,
     path.write_bytes(film)
     with Client(str(client.base_url), timeout_s=200.0) as service:
         found = service.localise_film(flat, path, hfov_deg=53.0, refine="none")
-    assert found.film is not None
-    assert found.film.frames_kept == len(found.poses)
+    assert present(found.film).frames_kept == len(found.poses)
     assert found.poses[0].time_s is not None
-    view = found.poses[1].view
-    assert view is not None
-    assert view.relative_heading is not None
+    assert present(found.poses[1].view).relative_heading is not None
 
 
 def film_workers() -> set[int | None]:

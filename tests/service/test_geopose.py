@@ -302,8 +302,7 @@ def test_client_uploads_with_options_and_exports(client: httpx.Client) -> None:
         assert plan.name == "named"
         drawing = service.export(plan.id, "svg")
         again = service.replace_floorplan(plan.id, drawing, options={"ceiling_height_m": 3})
-        assert again.import_report is not None
-        assert again.import_report["format"] == "svg"
+        assert present(again.import_report)["format"] == "svg"
         assert {room.ceiling_height_m for room in again.rooms} == {3.0}
         assert service.upload_floorplan(drawing).import_report == service.upload_floorplan(drawing).import_report
 
@@ -320,8 +319,7 @@ def test_venue_anchor_places_plans_anywhere(place: tuple[float, float]) -> None:
 def test_geopose_is_valid_anywhere(place: tuple[float, float], heading_deg: float) -> None:
     anchor = Anchor(latitude=place[1], longitude=place[0])
     for position_m in ((0.0, 0.0), (40.0, -30.0), (-40.0, 30.0)):
-        pose = geopose_at(anchor, position_m, heading_deg, 1.5)
-        assert pose is not None
+        pose = present(geopose_at(anchor, position_m, heading_deg, 1.5))
         distance_m = pyproj.Geod(ellps="WGS84").inv(*place, pose.position.lon, pose.position.lat)[2]
         assert distance_m == pytest.approx(np.hypot(*position_m), abs=1e-3)
         assert -180.0 < pose.angles.yaw <= 180.0

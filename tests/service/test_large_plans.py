@@ -17,6 +17,7 @@ from service.plan_files.converter import Converter
 from service.settings import Settings
 from service.telemetry import Telemetry
 from tests.service.conftest import StartApp, document_of, tiled_plan
+from tests.strategies import present
 
 _SIDE = 45
 
@@ -115,9 +116,6 @@ def test_stored_large_plan_is_parsed_by_a_worker(monkeypatch: pytest.MonkeyPatch
             assert converter.parse(PlanDocument(stored.document, "0" * 64, stored.warnings)) is None
     finally:
         converter.close()
-    assert found is not None
-    assert found.to_dict() == plan.to_dict()
+    assert present(found).to_dict() == plan.to_dict()
     # Without workers the service parses it.
-    found = converter.parse(stored)
-    assert found is not None
-    assert found.to_dict() == plan.to_dict()
+    assert present(converter.parse(stored)).to_dict() == plan.to_dict()

@@ -34,7 +34,7 @@ from service.storage.records import NewPlan, Original
 from service.telemetry import Telemetry
 from tests.growth import assert_no_worse_than_linear
 from tests.service.conftest import FLAT, StartApp, assert_problem, tiled_plan, upload
-from tests.strategies import plan_of, spiral
+from tests.strategies import plan_of, present, spiral
 
 READS = ["", "/layout", "/preview.svg", "/mesh.glb", "/original", "/export", "/export?format=dxf"]
 
@@ -134,8 +134,7 @@ def test_worker_finishes_a_file_without_a_client(store: Store, cache: RenditionC
         # It continues for the next request, instead of being made from the start.
         await _started(cache.get("p", revision_id, "layout", "a"))
         assert next(iter(cache._pending.values())) is pending
-        assert pending.task is not None
-        assert json.loads((await pending.task).content)["revision"] == revision_id
+        assert json.loads((await present(pending.task)).content)["revision"] == revision_id
 
     asyncio.run(request())
 

@@ -25,6 +25,7 @@ from tests.core.taken import sphere as taken_sphere
 from tests.painted import picture_file
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, encode_picture, upload
 from tests.service.test_venue_queries import venue_of
+from tests.strategies import present
 
 
 def begin(client: httpx.Client, plan_id: str, **fields: Any) -> str:
@@ -270,12 +271,10 @@ def test_session_of_an_earlier_version_goes_on(
         session_id = begin(client, upload(client))
         before = send(client, session_id, sphere).json()
         record = app_store.sessions.claim("default", session_id, None, "0" * 32)
-        assert record.state is not None
-        assert record.pose is not None
-        pose = json.loads(record.pose)
+        state, pose = present(record.state), json.loads(present(record.pose))
         for place in (pose["pose"], *pose["pose"]["candidates"], *pose["path"]):
             del place["floorplan_id"], place["level"]
-        app_store.sessions.finish(record, "0" * 32, _first_version(record.state), json.dumps(pose), ttl_s=60.0)
+        app_store.sessions.finish(record, "0" * 32, _first_version(state), json.dumps(pose), ttl_s=60.0)
         after = document_of(send(client, session_id, sphere, forward_m=0, turn_deg=0))
         # `finish` counted a photograph.
         assert after["photographs"] == 3

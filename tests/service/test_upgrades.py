@@ -198,8 +198,7 @@ def _assert_works(client: httpx.Client, version: str, script: str, sphere: bytes
     original = client.get(f"{address}/original")
     assert original.json()["name"] == plan["name"]
     if parts(version) > (0, 1, 0):
-        first = re.search(r"^INSERT INTO \"revisions\" VALUES\('(\w+)','\w+',1,", script, re.MULTILINE)
-        assert first is not None
+        first = present(re.search(r"^INSERT INTO \"revisions\" VALUES\('(\w+)','\w+',1,", script, re.MULTILINE))
         assert client.get(f"{address}?revision={first[1]}").json()["name"] == f"Flat of {version}"
     document_of(localise(client, plan["id"], sphere, heading_deg=0))
     if parts(version) >= (0, 3, 0):

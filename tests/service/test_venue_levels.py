@@ -28,6 +28,7 @@ from tests.importers.test_roomplan import two_stories
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, wait_for
 from tests.service.test_security import bearer, make_key
 from tests.service.test_venues import plans_of
+from tests.strategies import present
 
 SQUARE = [[11.0, 48.0], [11.00005, 48.0], [11.00005, 48.00005], [11.0, 48.00005], [11.0, 48.0]]
 
@@ -291,9 +292,7 @@ def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
     token, limits = uuid.uuid4().hex, dict[str, Any](max_plans=9, max_venue_plans=9)
     venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
     assert_stored_once(lambda: app_store.venue_imports.extend("t", venue.id, token, new_plans(), **limits))
-    extended = app_store.venues.get("t", venue.id)
-    assert extended is not None
-    assert extended.plans == 4
+    assert present(app_store.venues.get("t", venue.id)).plans == 4
     used = app_store.quota.account("t").used
     app_store.quota.recount()
     assert app_store.quota.account("t").used == used

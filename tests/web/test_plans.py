@@ -20,6 +20,7 @@ from tests.importers.test_lettering import AREAS_M2, PrintedPlan
 from tests.importers.test_pictures import open_hall
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import EVERYTHING, make_key
+from tests.strategies import present
 from tests.web.conftest import EXAMPLES, Visit, choose_plan, visit
 from tests.web.test_answer import _assert_accessible
 
@@ -45,9 +46,7 @@ def test_areas_without_a_room_are_marked(phone: Visit) -> None:
     phone.client.post("/floorplans", files={"file": file}, data=form).raise_for_status()
     page = phone.open()
     choose_plan(page, "Open hall")
-    area, view = page.locator(".no-room").bounding_box(), page.locator("#plan").bounding_box()
-    assert area is not None
-    assert view is not None
+    area, view = (present(page.locator(name).bounding_box()) for name in (".no-room", "#plan"))
     assert view["x"] < area["x"] < area["x"] + area["width"] < view["x"] + view["width"]
     expect(page.locator("#plan .name", has_text="no room")).to_have_count(1)
     expect(page.locator("#plan-warnings")).to_contain_text("set “Ceiling”")
@@ -102,8 +101,7 @@ def _scan() -> Image.Image:
 
 def _drag_end(page: Page, index: int, x: float, y: float) -> None:
     """Move an end of the line that measures a picture to a pixel."""
-    end = page.locator(".measured circle").nth(index).bounding_box()
-    assert end is not None
+    end = present(page.locator(".measured circle").nth(index).bounding_box())
     script = """([x, y]) => { const point = new DOMPoint(x, y).matrixTransform(
         document.querySelector('svg.picture').getScreenCTM()); return [point.x, point.y]; }"""
     to_x, to_y = page.evaluate(script, [x, y])
