@@ -95,8 +95,7 @@ def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None
         plan = _said(await client.call_tool("import_plan", {"plan": str(flat)}))
         shown = _JPEG + base64.b64encode(encode_picture(640, 480, "JPEG")).decode()
         asked = {"photographs": [shown, shown], "floorplan_id": plan["id"], "hfov_deg": 70.0}
-        answer = _said(await client.call_tool("localise_turn", asked))
-        assert len(answer["poses"]) == 2
+        assert len(_said(await client.call_tool("localise_turn", asked))["poses"]) == 2
 
     _over_stdio(str(app.base_url), talk)
 

@@ -43,8 +43,7 @@ def service(app: httpx.Client, make_client: MakeClient, cache: Path) -> Iterator
 def test_photographs_stay_on_the_device(service: Any, home: str, cache: Path) -> None:
     with pytest.raises(UnauthorisedError, match="features-required"):
         service.localise(home, KITCHEN, refine="none")
-    answer = service.localise(home, KITCHEN, on_device=True, refine="none")
-    assert answer.room == "kitchen"
+    assert service.localise(home, KITCHEN, on_device=True, refine="none").room == "kitchen"
     (folder,) = cache.iterdir()
     assert {path.name for path in folder.iterdir()} == set(DEVICE_FILES) - {MANIFEST_NAME}
     phone = service.localise(home, PHONE, on_device=True, refine="none").view.wall_direction

@@ -63,8 +63,7 @@ def test_transforms_compose_like_matrices() -> None:
 
 def test_base_of_a_robot_is_behind_its_camera() -> None:
     # The camera is 0.3 m ahead of the base and looks to its left; the photograph looks along the plan's +y.
-    mount = FloorTransform(0.3, 0.0, math.pi / 2)
-    base = map_from_base(answer(2.0, 5.0, 0.0), mount)
+    base = map_from_base(answer(2.0, 5.0, 0.0), FloorTransform(0.3, 0.0, math.pi / 2))
     # So the base looks along +x, 0.3 m behind the camera.
     assert same(base, FloorTransform(1.7, 5.0, 0.0))
 

@@ -236,8 +236,7 @@ def test_an_id_is_added_once(ground: AlbumGround, photographs: list[AlbumPhotogr
 
 
 def test_evidence_of_photographs_of_one_spot_counts_once() -> None:
-    rng = np.random.default_rng(2)
-    logs = rng.normal(2.0, 1.0, (3, 6))
+    logs = np.random.default_rng(2).normal(2.0, 1.0, (3, 6))
     pose, room = np.arange(6), np.array([0, 0, 0, 1, 1, 1])
     states = [
         States.of(

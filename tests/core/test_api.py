@@ -111,8 +111,7 @@ def test_photographs_of_a_turn_are_one_answer(model: LaLaLoc, plan: lalaloc_core
 @pytest.mark.slow
 @needs_ffmpeg
 def test_film_is_a_turn(model: LaLaLoc, plan: lalaloc_core.FloorPlan, tmp_path: Path) -> None:
-    content = encode(turn()[:46], tmp_path / "turn.mp4")
-    answer = model.localise_turn(plan, content, camera=PHONE)
+    answer = model.localise_turn(plan, encode(turn()[:46], tmp_path / "turn.mp4"), camera=PHONE)
     assert answer.film is not None
     assert answer.film.frames_read == 46
     assert [pose["time_s"] for pose in answer.document()["poses"]] == answer.times_s

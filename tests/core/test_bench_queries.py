@@ -80,8 +80,7 @@ def test_the_hypothesis_of_the_true_heading_has_the_layout_of_the_plan() -> None
     profile, openings, kind = present(query.profile), present(query.openings), present(layouts.kind)[0]
     np.testing.assert_allclose(profile.log_m[number], layouts.log_profile[0], atol=1e-6)
     seen = profile.seen[number]
-    likeliest = openings.log_probability[number].argmax(axis=1)
-    np.testing.assert_array_equal(likeliest[seen], kind[seen])
+    np.testing.assert_array_equal(openings.log_probability[number].argmax(axis=1)[seen], kind[seen])
     assert (kind[seen] != 0).any()
 
 

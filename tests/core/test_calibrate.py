@@ -433,8 +433,7 @@ def test_cohort_has_a_fixed_size_and_is_reproducible(cohort: Cohort, encoders: P
     assert cohort.log_profile.shape == cohort.kind.shape == (min(SIZE, len(cohort.kind)), columns)
     assert len(cohort.kind) > 500
     assert set(np.unique(cohort.kind)) > {0, 1}
-    again = cohort_of(PLANS, columns, 0)
-    np.testing.assert_array_equal(again.log_profile, cohort.log_profile)
+    np.testing.assert_array_equal(cohort_of(PLANS, columns, 0).log_profile, cohort.log_profile)
 
 
 class TestBundles:

@@ -102,8 +102,7 @@ def test_rays_behind_and_beyond_the_picture_are_not_seen() -> None:
 def test_rays_beyond_the_turning_point_of_a_distortion_are_not_seen() -> None:
     """A strong barrel distortion folds wide rays back into the picture."""
     camera = Perspective(width=640, height=480, fx=300.0, fy=300.0, cx=320.0, cy=240.0, radial=(-0.3, 0.0, 0.0))
-    wide = np.array([[1.6, 1.0, 0.0]])
-    pixels, seen = camera.pixels(wide)
+    pixels, seen = camera.pixels(np.array([[1.6, 1.0, 0.0]]))
     assert 0.0 < pixels[0, 0] < 640.0 or not seen[0]
     assert not seen[0]
 

@@ -233,8 +233,7 @@ def test_near_candidates_are_drawn_as_one_place() -> None:
 
 def test_ellipse_axes_match_the_covariance() -> None:
     assert ellipse_m((0.01, 0.0, 0.04)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
-    turned = ellipse_m((0.025, 0.015, 0.025))
-    assert turned == pytest.approx((0.4895, 0.2448), abs=1e-3)
+    assert ellipse_m((0.025, 0.015, 0.025)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
 
 
 def test_confidence_words_are_distinct() -> None:

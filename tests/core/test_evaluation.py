@@ -73,8 +73,7 @@ class TestRunning:
         assert np.median(errors) < np.median(position_errors_m(predictions, "retrieval"))
         assert heading_errors_deg(predictions).max() < 1e-3
         assert set(predictions[0].timings_ms) == {"encode", "retrieve", "vdr", "lpo"}
-        scores = score(predictions)
-        assert present(scores.layout_recall).value > 0.3
+        assert present(score(predictions).layout_recall).value > 0.3
         assert [prediction.scene for prediction in predictions[::3]] == list(build_dataset(info).scenes("test"))
 
     @pytest.mark.slow
@@ -103,8 +102,7 @@ class TestRunning:
 
     @pytest.mark.slow
     def test_interrupted_run_resumes_to_the_same_file(self, layout_run: RunInfo, tmp_path: Path) -> None:
-        whole = RunFolder(tmp_path / "whole")
-        expected = run_evaluation(whole, layout_run, workers=0)
+        expected = run_evaluation(RunFolder(tmp_path / "whole"), layout_run, workers=0)
         broken = RunFolder(tmp_path / "broken")
         broken.write_info(layout_run)
         # Interruption within the second scene.

@@ -216,8 +216,7 @@ def test_positions_belong_to_the_first_room() -> None:
 
 @pytest.mark.parametrize(("degrees", "azimuth"), [(0, 0.0), (90, math.pi / 2), (-90, 1.5 * math.pi), (360, 0.0)])
 def test_north_is_an_azimuth_of_the_plan(degrees: float, azimuth: float) -> None:
-    plan = FloorPlan.from_dict(EXAMPLE | {"north_deg": degrees})
-    assert plan.north == pytest.approx(azimuth)
+    assert FloorPlan.from_dict(EXAMPLE | {"north_deg": degrees}).north == pytest.approx(azimuth)
     assert FloorPlan.from_dict(EXAMPLE).north is None
     assert "north_deg" not in FloorPlan.from_dict(EXAMPLE).to_dict()
 
@@ -245,8 +244,7 @@ def test_deep_nesting_is_refused_before_it_is_parsed(text: str) -> None:
 
 def test_brackets_in_strings_are_not_nesting() -> None:
     name = '[[[[[[[[[[ {{{{{{{{{{ \\" \\\\'
-    plan = FloorPlan.from_json(json.dumps(EXAMPLE | {"name": name}))
-    assert plan.name == name
+    assert FloorPlan.from_json(json.dumps(EXAMPLE | {"name": name})).name == name
 
 
 def test_million_vertices_are_refused() -> None:

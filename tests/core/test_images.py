@@ -92,12 +92,10 @@ class TestAccepted:
 
     def test_transparent_colours_of_other_modes_become_neutral(self) -> None:
         palette = picture().quantize(8)
-        red = palette.getpixel((10, 100))
-        pixels = read(encoded(palette, transparency=red))
+        pixels = read(encoded(palette, transparency=palette.getpixel((10, 100))))
         assert pixels[24, 8].tolist() == list(NEUTRAL)
         np.testing.assert_allclose(pixels[24, 24], (0, 255, 0), atol=3)
-        grey = picture("L")
-        pixels = read(encoded(grey, transparency=255))
+        pixels = read(encoded(picture("L"), transparency=255))
         assert pixels[24, 56].tolist() == list(NEUTRAL)
         assert pixels[24, 8].tolist() == [76, 76, 76]
         pixels = read(encoded(picture(), transparency=(0, 255, 0)))

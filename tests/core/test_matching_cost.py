@@ -181,8 +181,7 @@ class TestOpenings:
         # An uninformative prediction equals the prior, so every class costs the same.
         query = make_query(np.zeros((1, 8)), np.zeros((1, 8)), openings=openings(np.tile(PRIOR, (1, 8, 1))))
         kinds = np.array([[WALL_CODE] * 8, [WINDOW_CODE] * 8, [DOOR_CODE] * 8], np.uint8)
-        found = costs(query, hall_layouts(np.zeros((3, 8)), kinds))[0]
-        assert np.ptp(found) < 1e-3
+        assert np.ptp(costs(query, hall_layouts(np.zeros((3, 8)), kinds))[0]) < 1e-3
 
     def test_openings_are_blurred_by_the_distance_of_walls_that_are_seen(self) -> None:
         seen = np.arange(64) < 20
@@ -294,8 +293,7 @@ class TestCameraHeight:
     def test_best_height_offset_is_found_and_penalised(self) -> None:
         height = CameraHeight(1.5, 0.1)
         true = height.offsets[0]
-        rng = np.random.default_rng(0)
-        profile = rng.normal(size=(1, 16))
+        profile = np.random.default_rng(0).normal(size=(1, 16))
         query = make_query(profile - true, np.full((1, 16), -4.0), height)
         cost, offset = MatchingCost(PLAN, query, 0.05, WEIGHTS, CONFIG).costs(hall_layouts(profile))
         assert offset[0, 0] == true

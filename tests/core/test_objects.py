@@ -150,8 +150,7 @@ def test_photograph_without_recognised_objects_tells_no_type() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640), (1280, 320), (200, 900)])
 def test_thumbnails_have_a_bounded_size(width: int, height: int) -> None:
-    thumbnail = present(view(BED_DEG, width, height).thumbnail)
-    rows, columns = thumbnail.shape[:2]
+    rows, columns = present(view(BED_DEG, width, height).thumbnail).shape[:2]
     assert rows % 32 == columns % 32 == 0
     assert 0.7 < rows * columns / (320 * 256) < 1.3
     assert columns / rows == pytest.approx(width / height, rel=0.2)
@@ -164,8 +163,7 @@ def test_features_carry_objects_and_files_of_version_1_are_read() -> None:
     assert [seen.name for seen in found.objects] == [seen.name for seen in expected.objects]
     for seen, other in zip(found.objects, expected.objects, strict=True):
         assert (seen.azimuth, seen.probability) == pytest.approx((other.azimuth, other.probability))
-    objects = present(bundle().manifest.objects)
-    arrays = 2 * 4 * len(objects.names)
+    arrays = 2 * 4 * len(present(bundle().manifest.objects).names)
     first = content[:4] + struct.pack("<H", 1) + content[6:-arrays]
     assert query((read_features(first, bundle()), 0.0)).objects is None
     with pytest.raises(InvalidFeaturesError, match="bytes"):

@@ -114,8 +114,7 @@ class TestConvergence:
     @settings(max_examples=20)
     def test_levenberg_marquardt_converges_in_convex_rooms(self, heading_known: bool, polygon: list, seed: int) -> None:
         scene = scene_of(plan_of(polygon), 4, seed)
-        job = job_near(scene, seed, heading_known=heading_known)
-        result = refined(job)
+        result = refined(job_near(scene, seed, heading_known=heading_known))
         assert errors_m(result, scene).max() < 1e-3
         assert np.abs(result.heading).max() < 1e-3
         assert latent_distance(result).max() < 1e-3
@@ -126,8 +125,7 @@ class TestConvergence:
         self, config: LpoConfig, share: float, heading_known: bool
     ) -> None:
         scene = scene_of(plan_of(L_ROOM), 24, 0)
-        job = job_near(scene, 1, heading_known=heading_known)
-        result = refined(job, config)
+        result = refined(job_near(scene, 1, heading_known=heading_known), config)
         assert np.mean(errors_m(result, scene) < 0.01) >= share
 
     @pytest.mark.slow
@@ -274,8 +272,7 @@ class TestBatches:
     @given(polygon=room_polygons(), seed=seeds())
     @settings(max_examples=8)
     def test_batch_equals_single_jobs(self, heading_known: bool, polygon: list, seed: int) -> None:
-        scene = scene_of(plan_of(polygon), 4, seed)
-        job = job_near(scene, seed, heading_known=heading_known)
+        job = job_near(scene_of(plan_of(polygon), 4, seed), seed, heading_known=heading_known)
         together = refined(job)
         for index in range(4):
             alone = refined(single_job(job, index))
@@ -287,8 +284,7 @@ class TestBatches:
         plan = plan_of(L_ROOM, [[6.0, 0.0], [9.0, 0.0], [8.0, 3.0]])
         poses = PoseSet(np.array([[1.0, 1.0], [7.5, 1.0]]), np.array([0, 1]))
         scene = Scene(plan, poses, np.zeros(2))
-        job = job_near(scene, 0, heading_known=True)
-        result = refined(job)
+        result = refined(job_near(scene, 0, heading_known=True))
         assert errors_m(result, scene).max() < 1e-3
 
     @pytest.mark.slow
@@ -296,8 +292,7 @@ class TestBatches:
     @settings(max_examples=10)
     def test_pruning_keeps_the_best_result(self, seed: int) -> None:
         # One start lies near the target, four anywhere in the room.
-        scene = scene_of(plan_of(L_ROOM), 5, seed)
-        job = job_near(scene, seed, heading_known=True)
+        job = job_near(scene_of(plan_of(L_ROOM), 5, seed), seed, heading_known=True)
         job = dataclasses.replace(job, targets=job.targets[:1].repeat(5, axis=0))
         pruned, full = (refined(job, config) for config in (LpoConfig(), LM))
         best = int(latent_distance(full).argmin())
@@ -308,15 +303,13 @@ class TestBatches:
     @given(seeds())
     @settings(max_examples=10)
     def test_best_start_is_never_pruned(self, seed: int) -> None:
-        scene = scene_of(plan_of(L_ROOM), 1, seed)
-        job = job_near(scene, seed, heading_known=False)
+        job = job_near(scene_of(plan_of(L_ROOM), 1, seed), seed, heading_known=False)
         strict = LpoConfig(prune_after=1, prune_ratio=1.0)
         pruned, full = (refined(job, config) for config in (strict, LM))
         np.testing.assert_allclose(pruned.position_m, full.position_m, atol=1e-6)
 
     def test_known_heading_is_unchanged(self) -> None:
-        scene = scene_of(plan_of(L_ROOM), 3, 1)
-        job = job_near(scene, 0, heading_known=True)
+        job = job_near(scene_of(plan_of(L_ROOM), 3, 1), 0, heading_known=True)
         job = dataclasses.replace(job, heading=np.array([0.01, -0.02, 0.0]))
         np.testing.assert_allclose(refined(job, LpoConfig()).heading, job.heading, atol=1e-7)
 

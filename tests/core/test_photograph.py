@@ -145,8 +145,7 @@ class TestProjection:
 
     def test_similar_borders_alone_make_no_sphere(self) -> None:
         tile = np.random.default_rng(0).integers(0, 256, (8, 16, 3)).astype(np.uint8)
-        smooth = cv2.resize(np.concatenate([tile, tile[:, ::-1]], axis=1), (256, 128))
-        assert not is_sphere(smooth)
+        assert not is_sphere(cv2.resize(np.concatenate([tile, tile[:, ::-1]], axis=1), (256, 128)))
 
     @pytest.mark.parametrize("row", [slice(None, 6), slice(-6, None)])
     def test_an_object_at_one_pole_leaves_a_sphere(self, row: slice) -> None:
@@ -228,8 +227,7 @@ class TestTilt:
 
     def test_stated_tilt_levels_a_sphere(self) -> None:
         tilted = sphere("kitchen")
-        content = jpeg(tilted)
-        view = opened(content, projection="equirectangular", pitch_deg=10.0, roll_deg=0.0)
+        view = opened(jpeg(tilted), projection="equirectangular", pitch_deg=10.0, roll_deg=0.0)
         expected = cv2.resize(
             level(tilted, pitch=math.radians(10.0), roll=0.0), (256, 128), interpolation=cv2.INTER_AREA
         )

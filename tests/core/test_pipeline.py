@@ -232,8 +232,7 @@ class TestStages:
         config = LocaliseConfig(lpo_candidates=2, profile_candidates=3)
         by_profile = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
         for start in (query, by_profile):
-            found = search(start, top_k=4, refiner=refiner, config=config)
-            assert len(found.candidates) == 4
+            assert len(search(start, top_k=4, refiner=refiner, config=config).candidates) == 4
         assert sizes == [2, 3]
 
     def test_candidates_that_meet_become_one(self, search: Search, query: Query) -> None:

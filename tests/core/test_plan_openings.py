@@ -92,8 +92,7 @@ def test_nearer_wall_gets_the_opening() -> None:
 
 
 def test_openings_can_touch_but_not_overlap() -> None:
-    beside = {"kind": "window", "line": [[4.0, 1.9], [4.0, 2.5]]}
-    assert len(with_openings(DOOR, beside).openings) == 2
+    assert len(with_openings(DOOR, {"kind": "window", "line": [[4.0, 1.9], [4.0, 2.5]]}).openings) == 2
     over = {"kind": "window", "line": [[4.0, 1.8], [4.0, 2.5]], "name": "hatch"}
     assert "opening 0 (door) and opening 1 (window 'hatch') overlap" in refused(with_openings, DOOR, over)
 

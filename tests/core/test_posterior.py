@@ -78,8 +78,7 @@ def test_map_is_of_the_refined_positions() -> None:
     starts = [candidate(-0.6, 0.2), candidate(0.6, 0.2)]
     ends = [dataclasses.replace(start, x_m=0.1, cost=0.02) for start in starts]
     found_map = probability_map(plan, grid.poses, posterior_at(grid, starts, ends))
-    best = found_map.probability.argmax()
-    assert found_map.position_m[best] == pytest.approx([0.1, 0.0])
+    assert found_map.position_m[found_map.probability.argmax()] == pytest.approx([0.1, 0.0])
     at_end = np.linalg.norm(found_map.position_m - [0.1, 0.0], axis=1) < 1e-9
     assert found_map.probability[at_end].sum() > 0.9
     assert found_map.probability.sum() == pytest.approx(1.0)
@@ -110,8 +109,7 @@ def test_equal_places_share_the_mass_without_candidates_too(copies: int) -> None
 def test_refined_cost_decides_between_modes() -> None:
     grid = costs_at([0.0, 5.0], np.array([0.20, 0.18]))
     starts = [candidate(5.0, 0.18), candidate(0.0, 0.20)]
-    ends = [candidate(5.0, 0.17), candidate(0.1, 0.02)]
-    found = posterior_at(grid, starts, ends)
+    found = posterior_at(grid, starts, [candidate(5.0, 0.17), candidate(0.1, 0.02)])
     assert found.candidate[0] == pytest.approx(1.0 / (1.0 + math.exp(-16.0 * 0.15)), rel=1e-3)
     assert found.pose[0] == pytest.approx(found.candidate[0])
 
@@ -163,8 +161,7 @@ def test_candidates_that_meet_are_one_mode() -> None:
     starts = [candidate(0.0, 0.05), candidate(1.2, 0.05), candidate(10.0, 0.05)]
     ends = [candidate(0.6, 0.01), candidate(0.6, 0.01), candidate(10.6, 0.01)]
     places = weighted_places(grid, np.zeros(3), PLAIN, starts=starts, ends=ends, temperature=16.0, separation_m=1.0)
-    found = places.posterior([ends[0], ends[2]])
-    assert found.candidate == pytest.approx((0.5, 0.5))
+    assert places.posterior([ends[0], ends[2]]).candidate == pytest.approx((0.5, 0.5))
 
 
 def test_poses_weigh_by_their_share_of_the_room() -> None:
@@ -317,8 +314,7 @@ class TestLocalisation:
     @pytest.mark.parametrize("room", [0, 1])
     @pytest.mark.parametrize("refine", ["none", "vdr", "lpo"])
     def test_hint_decides_between_identical_rooms(self, ask: Ask, query: Query, room: int, refine: Refine) -> None:
-        unhinted = ask(query, refine=refine)
-        assert unhinted.posterior.candidate[:2] == pytest.approx([0.5, 0.5], abs=0.02)
+        assert ask(query, refine=refine).posterior.candidate[:2] == pytest.approx([0.5, 0.5], abs=0.02)
         near = Near(STANDS_M[0] + room * OFFSET_M + 0.5, STANDS_M[1], 2.0)
         for hints in (Hints(near=near), Hints(rooms=frozenset({room}))):
             found = ask(query, hints, refine)
@@ -343,8 +339,7 @@ class TestLocalisation:
     def test_hint_changes_the_odds_as_documented(self, ask: Ask, plan: FloorPlan, query: Query) -> None:
         share = ROOM_M[0] * ROOM_M[1] / plan.area_m2
         odds = 1.0 + 0.98 / (0.02 * share)
-        found = ask(query, Hints(rooms=frozenset({1})), "lpo")
-        first, second = found.posterior.candidate[:2]
+        first, second = ask(query, Hints(rooms=frozenset({1})), "lpo").posterior.candidate[:2]
         assert first / second == pytest.approx(odds, rel=0.05)
 
     @pytest.mark.parametrize("refine", ["none", "vdr", "lpo"])

@@ -105,8 +105,7 @@ class TestTorch:
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_result_has_the_type_of_the_positions(self, dtype: torch.dtype) -> None:
-        plan = plan_of(rectangle(4.0, 3.0))
-        walls = torch.tensor(plan.walls_m[:1], dtype=dtype)
+        walls = torch.tensor(plan_of(rectangle(4.0, 3.0)).walls_m[:1], dtype=dtype)
         profile = wall_profile(torch.ones(1, 2, dtype=dtype), torch.zeros(1, dtype=dtype), walls, 8)
         heights = torch.ones(1, dtype=dtype)
         assert profile.dtype == dtype
@@ -235,8 +234,7 @@ class TestProperties:
         ends = scene.poses.position_m[:, None] + profile[..., None] * np.stack(
             [np.sin(azimuth), np.cos(azimuth)], axis=-1
         )
-        outline = scene.plan.rooms[0].shape.exterior
-        assert shapely.distance(outline, shapely.points(ends)).max() < 1e-6
+        assert shapely.distance(scene.plan.rooms[0].shape.exterior, shapely.points(ends)).max() < 1e-6
         # Points before the wall are inside the room, so no nearer wall is missed.
         before = scene.poses.position_m[:, None] + 0.999 * (ends - scene.poses.position_m[:, None])
         room = shapely.buffer(scene.plan.rooms[0].shape, 1e-3)

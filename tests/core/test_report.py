@@ -219,8 +219,7 @@ class TestFigures:
         rows = {row[0]: row for row in page.table("Milliseconds")}
         assert rows["retrieve"][1:] == ["12", "6.50", "11.4"]
         assert rows[TOTAL][1] == "12"
-        error = score(mixed()).calibration_error
-        assert f"“within 1 m”: {error:.3f}" in page.text
+        assert f"“within 1 m”: {score(mixed()).calibration_error:.3f}" in page.text
         assert len(page.table("Confidence and share")) == 1 + len(score(mixed()).reliability)
 
     def test_run_description_is_shown(self, page: Page) -> None:

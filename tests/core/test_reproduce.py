@@ -141,8 +141,7 @@ class TestCommand:
         names = [word for name in tables for word in ("--table", name)]
         common = ["--data", data, "--out", str(out), "--bundle", str(tiny_bundle), "--limit", "3", "--workers", "0"]
         assert main(["lab", "reproduce", *names, *common]) == 0
-        printed = capsys.readouterr().out
-        assert "Layout-similarity metric" in printed
+        assert "Layout-similarity metric" in capsys.readouterr().out
         similarity = TableResult.read(out / "tables" / "similarity.json")
         pose = similarity.rows[0].figures
         assert pose["pose_recall"].value == 1.0
@@ -240,8 +239,7 @@ class TestTraining:
         assert first.manifest.training["image"]["data"]["description"] == HOMES.description
         assert not (tmp_path / "image-l2-kd" / "layout.pt").exists()
         teacher = Checkpoint.load(tmp_path / BASE / "layout.pt", stage="layout")
-        decoder = safetensors.torch.load(first.read(DECODER_WEIGHTS))
-        bias = decoder["to_depth.bias"]
+        bias = safetensors.torch.load(first.read(DECODER_WEIGHTS))["to_depth.bias"]
         torch.testing.assert_close(bias, teacher.inference_weights["decoder"]["to_depth.bias"])
         before = written(tmp_path)
         assert train("image-l2-kd", tmp_path).sha256 == first.sha256

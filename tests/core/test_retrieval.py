@@ -276,8 +276,7 @@ class TestResampling:
 
     def test_optimal_candidate_is_kept(self) -> None:
         query = self.query(2.0, 2.0)
-        start = self.candidate(query, 2.0, 2.0)
-        found = self.resample(query, start, 1.0)
+        found = self.resample(query, self.candidate(query, 2.0, 2.0), 1.0)
         assert (found.x_m, found.y_m, found.room_index, found.frame_heading) == (2.0, 2.0, 0, 0.0)
 
     def test_only_an_unknown_heading_is_resampled(self) -> None:

@@ -92,8 +92,7 @@ class TestScores:
         assert np.isnan(heading_errors_deg([prediction()])[0])
 
     def test_method_without_retrieval_has_no_recall(self) -> None:
-        plain = prediction_of(TRUTH)
-        assert score([plain]).layout_recall is None
+        assert score([prediction_of(TRUTH)]).layout_recall is None
 
     def test_slices_are_sorted_worst_first(self) -> None:
         both, query = ("corridor", "mirror"), ("corridor",)
@@ -340,7 +339,6 @@ class TestWorst:
         assert "camera 'gone' is missing" in summary["left_out"][0]
 
     def test_run_without_predictions_is_refused(self, layout_run: Path, tmp_path: Path) -> None:
-        run = RunFolder(tmp_path)
-        run.write_info(RunFolder(layout_run).read_info())
+        RunFolder(tmp_path).write_info(RunFolder(layout_run).read_info())
         with pytest.raises(RunError, match="has no predictions"):
             write_worst(tmp_path, tmp_path / "out", 1)

@@ -238,8 +238,7 @@ class TestLevels:
         height = CameraHeight(CAMERA_M, 0.0)
         queries = [query for level, walk in CLIMB for query in queries_along(encoders, plans[level], walk, height)]
         walk = [pose for _, part in CLIMB for pose in part]
-        ground = building(encoders, plans)
-        found = follow(ground, encoders, queries, odometry_along(walk))
+        found = follow(building(encoders, plans), encoders, queries, odometry_along(walk))
         levels = [level for level, part in CLIMB for _ in part]
         # The photographs on the stairs of both levels are alike.
         for index in (1, 2, 5, 6):

@@ -109,8 +109,7 @@ class TestDrawing:
             ]
 
     def test_layout_anchors_are_camera_poses(self, data: OwnData) -> None:
-        source = SceneSource(CONFIG, data)
-        batch = next(load_batches(LayoutBatches(CONFIG, source), 0))
+        batch = next(load_batches(LayoutBatches(CONFIG, SceneSource(CONFIG, data)), 0))
         cameras = [camera for name in data.scenes("train") for camera in data.load(name).cameras]
         plan = crooked_flat()
         places = np.stack([camera.position_m for camera in cameras])

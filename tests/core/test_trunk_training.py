@@ -107,8 +107,7 @@ class TestLabels:
         np.testing.assert_allclose(edges[:, 32], np.arctan2([-0.6, 0.5], 2.0 / np.cos(np.pi / 64)), rtol=1e-5)
 
     def test_renderings_tell_where_walls_are_seen(self) -> None:
-        source = GeneratedSource(TINY)
-        (sample, *_) = source.samples(0, 64, 128)
+        (sample, *_) = GeneratedSource(TINY).samples(0, 64, 128)
         assert isinstance(sample.image, np.ndarray)
         walls = sample.image[..., 3]
         assert set(np.unique(walls)) == {0, 255}
@@ -184,8 +183,7 @@ class TestLosses:
 
     def test_trunk_has_its_own_learning_rate(self) -> None:
         stage = stage_of()
-        settings = OptimiserConfig(learning_rate=1e-3, trunk_factor=0.1)
-        optimiser = build_optimiser(stage.modules, settings)
+        optimiser = build_optimiser(stage.modules, OptimiserConfig(learning_rate=1e-3, trunk_factor=0.1))
         assert isinstance(stage.encoder, TrunkImageEncoder)
         trunk = {id(p) for p in stage.encoder.trunk.parameters() if p.requires_grad}
         factors = {id(p): group["factor"] for group in optimiser.param_groups for p in group["params"]}
@@ -222,8 +220,7 @@ class TestHiddenParts:
         changed = dict(batch)
         changed["opening_kind"] = torch.where(columns, (batch["opening_kind"] + 1) % 4, batch["opening_kind"])
         changed["profile_m"] = torch.where(columns, 2.0 * batch["profile_m"], batch["profile_m"])
-        again = stage_of(TINY.with_settings(hiding))
-        terms = again.losses(changed)
+        terms = stage_of(TINY.with_settings(hiding)).losses(changed)
         for name in ("profile", "opening"):
             torch.testing.assert_close(terms[name], before[name])
         seen = stage_of(TINY.with_settings(hiding)).losses(dict(batch, profile_m=2.0 * batch["profile_m"]))
@@ -279,8 +276,7 @@ class TestRuns:
 
     def test_run_starts_from_a_trunk_bundle(self, folder: Path) -> None:
         start = load_warm_start(folder / "bundle", "image", TINY)
-        encoder = build_image_encoder(TINY)
-        start.load_into({"image_encoder": encoder})
+        start.load_into({"image_encoder": build_image_encoder(TINY)})
         assert start.origin["name"] == "tiny-trunk"
         with pytest.raises(CheckpointError, match="was trained with trunk TrunkEncoderConfig"):
             load_warm_start(folder / "bundle", "image", TINY.with_settings({"trunk.mixer_blocks": 2}))
@@ -318,8 +314,7 @@ class TestRuns:
     @pytest.mark.slow
     def test_old_checkpoint_without_rate_factors_resumes(self, tmp_path: Path) -> None:
         """Parameter groups of older checkpoints have no factor."""
-        stage = stage_of(SHORT)
-        checkpoint = run_stage(stage, tmp_path, device=CPU, workers=0)
+        checkpoint = run_stage(stage_of(SHORT), tmp_path, device=CPU, workers=0)
         for group in checkpoint.optimiser["param_groups"]:
             del group["factor"]
         checkpoint.save(tmp_path / "image.pt")

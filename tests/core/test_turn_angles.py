@@ -117,8 +117,7 @@ def test_groups_are_placed_by_steps_that_close(first: int) -> None:
     # Optical flow tells a tenth too much.
     steps = [Step(1.1 * math.radians(30.0), math.radians(5.0))] * 11
     heading, sd = headings_in_order(group, wrap_angle(within), steps)
-    missed = np.degrees(np.abs(wrap_angle(heading - true)))
-    assert missed.max() < 3.0
+    assert np.degrees(np.abs(wrap_angle(heading - true))).max() < 3.0
     main = int(np.bincount(group).argmax())
     assert (sd[group == main] == 0.0).all()
     assert (sd[group != main] > 0.0).all()

@@ -369,8 +369,7 @@ def test_few_comparisons_find_the_best_plan(prototype_sets: list[np.ndarray]) ->
 
 
 def test_unknown_camera_height_is_searched(prototype_sets: list[np.ndarray]) -> None:
-    rng = np.random.default_rng(6)
-    query = query_at(prototype_sets[7], 4, rng)
+    query = query_at(prototype_sets[7], 4, np.random.default_rng(6))
     # The camera stood at 1.95 m, not at 1.5 m, so predicted distances are too small.
     smaller = replace(present(query.profile), log_m=present(query.profile).log_m - np.log(1.3))
     unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))

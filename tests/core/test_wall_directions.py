@@ -110,8 +110,7 @@ def test_uncertain_directions_tell_nothing_and_several_count_by_their_mean() -> 
         return PlaceCost.of(plan, told, NO_HINTS, 1.0, np.zeros((1, 2)), np.zeros(1, int))
 
     def cost(*directions: WallDirection) -> np.ndarray:
-        told = present(found(*directions))
-        return told.of_poses(np.array([0]))
+        return present(found(*directions)).of_poses(np.array([0]))
 
     assert found(WallDirection(0.0, math.radians(20.0))) is None
     exact, other = (WallDirection(math.radians(each), math.radians(1.0)) for each in (0.0, 20.0))

@@ -212,8 +212,7 @@ def test_dxf_without_unit_and_doors_is_rejected_with_the_likely_one():
 def test_wrong_unit_gives_a_warning():
     with pytest.raises(InvalidFloorPlanError):
         import_plan(dxf_file(_german_walls(insunits=6)))  # A plan of ten kilometres.
-    document = _german_walls(insunits=5)
-    warnings = import_plan(dxf_file(document)).report.warnings
+    warnings = import_plan(dxf_file(_german_walls(insunits=5))).report.warnings
     assert any("the side of a typical room is 7" in warning for warning in warnings)
 
 

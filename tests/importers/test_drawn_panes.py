@@ -112,6 +112,5 @@ def test_drawn_home_is_imported_untouched(format: FileFormat, style: FileStyle) 
     plan = import_plan(content, ImportOptions.from_text(options))
     areas = sorted(room.area_m2 for room in plan.plan().rooms)
     assert areas == pytest.approx([4.5 * 4.0, 4.8 * 4.0], rel=0.03)
-    kinds = sorted(opening["kind"] for opening in plan.document["openings"])
-    assert kinds == ["door", "window", "window"]
+    assert sorted(opening["kind"] for opening in plan.document["openings"]) == ["door", "window", "window"]
     assert {room.type for room in plan.plan().rooms} == {"kitchen", "bedroom"}

@@ -78,8 +78,7 @@ def test_outlines_of_separate_lines_on_a_layer_of_rooms_are_rooms():
 def test_turned_shapes_of_an_svg_are_walls(turn_deg: int):
     turned = f'<g transform="rotate({turn_deg})" fill="none" stroke="#000" stroke-width="12">{{}}</g>'
     outer, inner = '<rect width="1000" height="700"/>', '<path d="M450,0 V300 M450,390 V700"/>'
-    plan = _svg(turned.format(outer + inner))
-    assert _areas(plan) == [37.0, 30.1]
+    assert _areas(_svg(turned.format(outer + inner))) == [37.0, 30.1]
 
 
 def test_outlines_with_holes_are_faces_of_walls():

@@ -204,8 +204,7 @@ def test_duplex_has_a_plan_per_storey(duplex: tuple[ImportedPlan, ...]):
 
 def test_level_option_selects_a_storey_of_the_duplex(duplex: tuple[ImportedPlan, ...]):
     assert DUPLEX is not None
-    plan = import_plan(DUPLEX.read_bytes(), ImportOptions(level="Level 2"))
-    assert plan.document == duplex[1].document
+    assert import_plan(DUPLEX.read_bytes(), ImportOptions(level="Level 2")).document == duplex[1].document
 
 
 def _mapped(levels: int, copies: int) -> bytes:

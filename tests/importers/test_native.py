@@ -111,8 +111,7 @@ def test_faulty_plans_are_refused(document: dict, words: str):
 
 
 def test_y_down_flips_plan_and_north():
-    plan = {**FLAT, "y_axis": "down", "north_deg": 30.0}
-    imported = _import(plan)
+    imported = _import({**FLAT, "y_axis": "down", "north_deg": 30.0})
     assert imported.document["north_deg"] == pytest.approx(150.0)
     assert imported.document["rooms"][2]["polygon"] == [[0, 0], [9, 0], [9, -1.9], [0, -1.9]]
 

@@ -165,8 +165,7 @@ def test_unknown_areas_are_no_rooms():
 
 def test_negated_and_transparent_pictures():
     cells = _scanned()
-    negated = import_plan(_map(255 - cells, negate=1))
-    assert len(negated.document["rooms"]) == 2
+    assert len(import_plan(_map(255 - cells, negate=1)).document["rooms"]) == 2
     opaque = np.where(cells == 205, 0, 255).astype(np.uint8)
     picture = _picture(np.dstack([cells, opaque]), "PNG")
     settings = yaml.safe_dump(SETTINGS | {"image": "maps/map.png"})

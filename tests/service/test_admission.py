@@ -55,8 +55,7 @@ def test_requests_beyond_the_limit_are_refused(small: httpx.Client) -> None:
         assert small.get("/floorplans").status_code == 200
         assert small.get("/healthz").status_code == 200
         # A refusal does not wait for the body.
-        refused = uploads.enter_context(_open_upload(small))
-        assert refused.recv(4096).startswith(b"HTTP/1.1 503 ")
+        assert uploads.enter_context(_open_upload(small)).recv(4096).startswith(b"HTTP/1.1 503 ")
     wait_for(lambda: metric(small, IN_FLIGHT) == 0)
     upload(small)
 

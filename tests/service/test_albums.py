@@ -417,8 +417,7 @@ def test_stored_album_has_no_picture_position_or_owner(
         app_store.album_jobs.release(album_id, "")
         with app_store.database.writing() as connection:
             connection.execute(update(ALBUMS).values(solved_number=0))
-        job = present(app_store.album_jobs.claim(album_id, "test", 10.0))
-        (part,) = job.photographs
+        (part,) = present(app_store.album_jobs.claim(album_id, "test", 10.0)).photographs
         assert len(part.entry) <= 20_000
         for secret in (b"Mustermann", b"\xff\xd8\xff", b"GPS"):
             assert secret not in part.entry
@@ -454,8 +453,7 @@ def test_albums_of_another_tenant_do_not_exist(
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == used
         assert client.delete(f"/albums/{album_id}").status_code == 204
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["albums"] == 0
-        actions = [entry.action for entry in app_store.audit_log.page(limit=50)]
-        assert "DELETE /albums/{album_id}" in actions
+        assert "DELETE /albums/{album_id}" in [entry.action for entry in app_store.audit_log.page(limit=50)]
 
 
 def test_photographs_count_against_the_storage_quota(

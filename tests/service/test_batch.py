@@ -81,8 +81,7 @@ def test_each_photograph_counts_for_the_rate_limit(
     start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes
 ) -> None:
     with start_app(tmp_path, api_keys=True, rate_per_minute=8, rate_burst=0) as client:
-        unlimited = make_key(app_store, rate_per_minute=0)
-        client.headers.update(bearer(unlimited))
+        client.headers.update(bearer(make_key(app_store, rate_per_minute=0)))
         plan_id = upload(client)
         client.headers.update(bearer(make_key(app_store)))
         assert len(lines_of(ask(client, plan_id, 6 * [sphere]))) == 6

@@ -22,8 +22,7 @@ def test_open_shares_use_every_core_once(cores: int) -> None:
 
 @pytest.mark.parametrize("cores", [1, 2, 3])
 def test_single_lpo_worker_takes_no_core_of_few(cores: int) -> None:
-    shares = share_cores(cores, workers=None, compute_threads=0, onnx_threads=0)
-    assert shares == CoreShares(1, cores, 1)
+    assert share_cores(cores, workers=None, compute_threads=0, onnx_threads=0) == CoreShares(1, cores, 1)
 
 
 def test_given_numbers_are_kept() -> None:

@@ -145,8 +145,7 @@ def test_stream_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, monkey
 
 
 def test_streams_end_when_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW)
-    app = create_app(settings)
+    app = create_app(Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW))
     with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
         plan_id = upload(client, HALL, wait=False)
         with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
@@ -157,8 +156,7 @@ def test_streams_end_when_the_service_stops(tiny_bundle: Path, tmp_path: Path) -
 
 
 def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW)
-    app = create_app(settings)
+    app = create_app(Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW))
     with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
         plan_id = upload(client, HALL, wait=False)
         runtime = app.state.runtime
@@ -173,8 +171,7 @@ def test_idle_stream_sends_heartbeats(tiny_bundle: Path, tmp_path: Path) -> None
             )
             return [chunk async for chunk in events.stream(plan_id, authorised)]
 
-        chunks = asyncio.run(read())
-        assert chunks.count(b": heartbeat\n\n") >= 3
+        assert asyncio.run(read()).count(b": heartbeat\n\n") >= 3
 
 
 @pytest.mark.slow
@@ -208,8 +205,7 @@ def test_progress_of_another_replica_is_streamed(postgres: PostgresServer, start
         wait_for(lambda: first.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
         with second.stream("GET", f"/floorplans/{plan_id}/events") as response:
             events = _events(response)
-            seen = {next(events)[1]["progress"] for _ in range(3)}
-            assert max(seen) > 0.0
+            assert max(next(events)[1]["progress"] for _ in range(3)) > 0.0
             sleep(0.1)
             assert first.delete(f"/floorplans/{plan_id}").status_code == 204
             assert list(events)[-1][0] == "deleted"

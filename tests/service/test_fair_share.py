@@ -65,8 +65,7 @@ def test_greedy_clients_get_equal_shares(limit: int, clients: int) -> None:
         shares.take("a")
     # The busiest client gives back a unit, and the permitted clients with the fewest units take units.
     for _ in range(20 * limit):
-        busiest = max(names, key=shares.held_by)
-        shares.give_back(busiest)
+        shares.give_back(max(names, key=shares.held_by))
         for name in sorted(names, key=shares.held_by):
             if shares.may_take(name):
                 shares.take(name)

@@ -339,8 +339,7 @@ def test_range_of_a_file_of_the_model_resumes_it(client: httpx.Client) -> None:
 
 
 def test_packed_networks_of_a_phone_are_small(client: httpx.Client) -> None:
-    runtime = client.get("/web/onnxruntime.wasm.gz").content
-    loaded_bytes = len(runtime)
+    loaded_bytes = len(client.get("/web/onnxruntime.wasm.gz").content)
     for name in (VIEW_ONNX, OBJECTS_ONNX):
         url = f"/model/{name}.planes.gz"
         packed = client.get(url)

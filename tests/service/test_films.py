@@ -114,6 +114,5 @@ def test_angles_of_many_photographs_are_found_beside_the_decoders(
         # Those of the module's app can run as well.
         plan_id, others = upload(client), film_workers()
         for count, started in ((3, 0), (12, 1)):
-            answer = send(client, plan_id, *photographs[:count]).json()
-            assert len(answer["poses"]) == count
+            assert len(send(client, plan_id, *photographs[:count]).json()["poses"]) == count
             assert len(film_workers() - others) == started

@@ -114,8 +114,7 @@ def test_json_file_equals_json_body(client: httpx.Client) -> None:
 def test_unknown_and_missing_parts_are_rejected(client: httpx.Client) -> None:
     file = ("flat.json", json.dumps(FLAT).encode())
     response = client.post("/floorplans", files={"file": file}, data={"colour": "2"})
-    extra = assert_problem(response, 422, "invalid-request")
-    (fault,) = extra["errors"]
+    (fault,) = assert_problem(response, 422, "invalid-request")["errors"]
     assert fault["field"] == "colour"
     assert fault["message"].startswith("unknown part; known: ceiling_height_m, crop, file, known_distance, layers")
     missing = assert_problem(client.post("/floorplans", files={"plan": file}), 422, "invalid-request")

@@ -217,8 +217,7 @@ def test_places_on_earth_need_an_anchor_and_no_key(
 ) -> None:
     refused = ask(client, sphere, media, floorplan_id=flat, **more)
     assert "has no anchor" in assert_problem(refused, 409, "floorplan-unanchored")["detail"]
-    keyed = ask(client, sphere, media, key="k", floorplan_id=placed, **more)
-    assert_problem(keyed, 422, "invalid-request")
+    assert_problem(ask(client, sphere, media, key="k", floorplan_id=placed, **more), 422, "invalid-request")
 
 
 def test_session_as_geoposes(client: httpx.Client, placed: str, flat: str, sphere: bytes) -> None:

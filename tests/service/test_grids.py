@@ -309,8 +309,7 @@ def test_non_finite_grid_fails(store: Store, make_grids: MakeGrids, bundle: Bund
     with pytest.raises(InvalidPoseError, match=r"no latents at camera_height_m 1\.5"):
         grids.compute(record, 1.5).result(30.0)
     assert grids.prepare(PLAN, "") is None
-    state = grids.states(store.plans.list_plans("default", limit=1))[0]
-    assert state.status == "failed"
+    assert grids.states(store.plans.list_plans("default", limit=1))[0].status == "failed"
 
 
 def test_lease_is_renewed_during_sampling(bundle: Bundle) -> None:

@@ -49,8 +49,7 @@ def test_levels_of_a_venue_are_counted(client: httpx.Client) -> None:
     *steps, last = send(client, "/venues", geojson())
     assert last["status"] == 201
     assert len(client.get(f"/venues/{last['answer']['id']}/plans").json()["plans"]) == 2
-    counted = {(line["done"], line["total"]) for line in steps if "total" in line}
-    assert counted <= {(0, 2), (1, 2)}
+    assert {(line["done"], line["total"]) for line in steps if "total" in line} <= {(0, 2), (1, 2)}
 
 
 def test_refusal_is_the_last_line(client: httpx.Client) -> None:

@@ -152,8 +152,7 @@ def test_heading_is_searched_within_its_tolerance(client: httpx.Client, flat: st
     assert headings().max() < 1e-2
     assert headings(heading_tolerance_deg=0).max() < 1e-2
     # The tiny model's ring has sectors of 22.5°.
-    searched = headings(heading_tolerance_deg=25)
-    assert 1.0 < searched.max() <= 45.01
+    assert 1.0 < headings(heading_tolerance_deg=25).max() <= 45.01
 
 
 def test_every_part_is_required(client: httpx.Client, flat: str, sphere: bytes) -> None:
@@ -271,8 +270,7 @@ def test_confidence_is_null_without_a_model(client: httpx.Client, flat: str, sph
 def test_posterior_is_included_on_request(client: httpx.Client, flat: str, sphere: bytes) -> None:
     answer = localise(client, flat, sphere, include="posterior", heading_deg=10.0).json()
     posterior = answer["posterior"]
-    step_m = client.get(f"/floorplans/{flat}").json()["grid"]["step_m"]
-    assert posterior["step_m"] == step_m
+    assert posterior["step_m"] == client.get(f"/floorplans/{flat}").json()["grid"]["step_m"]
     assert len(posterior["x_m"]) == len(posterior["y_m"]) == len(posterior["probability"]) > 0
     assert sum(posterior["probability"]) == pytest.approx(1.0, abs=1e-3)
     assert min(posterior["probability"]) > 0.0
@@ -311,8 +309,7 @@ def test_waiting_ends_at_the_deadline(
 
 def test_slow_query_ends_at_its_deadline(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
     with start_app(tmp_path, request_deadline_s=1e-6) as client:
-        response = localise(client, upload(client), sphere)
-        assert_problem(response, 504, "deadline-exceeded")
+        assert_problem(localise(client, upload(client), sphere), 504, "deadline-exceeded")
 
 
 @pytest.mark.slow

@@ -109,11 +109,9 @@ def _with_issuer(url: str) -> dict[str, Any]:
 def test_tokens_of_a_certified_issuer(start_app: StartApp, app_store: Store, tmp_path: Path) -> None:
     with node_issuer(free_port(), FIRST) as issuer, start_app(tmp_path, **_with_issuer(issuer.url)) as client:
         reader, admin = issuer.token("lalaloc:read"), issuer.token("lalaloc:admin", "lalaloc:write")
-        usage = client.get("/usage", headers=bearer(reader))
-        assert usage.json()["tenant"] == "acme"
+        assert client.get("/usage", headers=bearer(reader)).json()["tenant"] == "acme"
         response = client.post("/floorplans", json=FLAT, headers=bearer(reader))
-        refused = assert_problem(response, 403, "insufficient-scope")
-        assert "'write'; it has: read." in refused["detail"]
+        assert "'write'; it has: read." in assert_problem(response, 403, "insufficient-scope")["detail"]
         assert client.post("/floorplans", json=FLAT, headers=bearer(admin)).status_code == 201
         # Keys work beside tokens.
         assert client.get("/limits", headers=bearer(make_key(app_store))).status_code == 200
@@ -198,8 +196,7 @@ def _signed(key: Key, claims: dict[str, Any] | None = None, **header: Any) -> st
     now = int(time.time())
     valid = {"sub": "robot", "aud": AUDIENCE, "iat": now, "exp": now + 300, "tenant": "acme", "scope": "lalaloc:read"}
     values = {name: value for name, value in (valid | (claims or {})).items() if value is not None}
-    algorithm = header.pop("alg", "RS256")
-    all_headers = {"alg": algorithm, "kid": key.kid, "typ": "at+jwt"} | header
+    all_headers = {"alg": header.pop("alg", "RS256"), "kid": key.kid, "typ": "at+jwt"} | header
     shown = {name: value for name, value in all_headers.items() if value is not None}
     usable = _for_any_algorithm(key)
     return jwt.encode(shown, values, usable, registry=JWSRegistry(algorithms=oidc.ALGORITHMS), default_type=None)
@@ -232,8 +229,7 @@ def test_claims_give_tenant_and_scopes(issuer: AnyIssuer) -> None:
     assert holder({"aud": ["other", AUDIENCE], "scope": "openid read lalaloc:read lalaloc:fly"}).permissions == read
     assert holder({"scope": None}).permissions == frozenset()
     roles = {"access": {"roles": ["lalaloc:admin", "lalaloc:read", "admin", 7]}}
-    nested = holder(roles, oidc_scope_claim="access.roles")
-    assert nested.permissions == {Permission.ADMIN, Permission.READ}
+    assert holder(roles, oidc_scope_claim="access.roles").permissions == {Permission.ADMIN, Permission.READ}
     assert holder({"https://x.example/org": "b"}, oidc_tenant_claim="https://x.example/org").tenant == "b"
 
 

@@ -91,8 +91,7 @@ def test_sphere_is_read_as_before(client: httpx.Client, flat: str) -> None:
 def test_statements_are_used(
     client: httpx.Client, flat: str, fields: dict[str, str], projection: str, hfov_deg: float
 ) -> None:
-    answer = ask(client, flat, jpeg(shown(), PHONE), pitch_deg=2, roll_deg=-1, **fields).json()
-    view = answer["view"]
+    view = ask(client, flat, jpeg(shown(), PHONE), pitch_deg=2, roll_deg=-1, **fields).json()["view"]
     assert (view["projection"], view["hfov"]["source"]) == (projection, "given")
     assert view["hfov"]["value_deg"] == pytest.approx(hfov_deg, abs=3.0)
     tilt = {"std_deg": 0.5, "source": "given"}

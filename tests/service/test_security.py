@@ -196,8 +196,7 @@ def test_key_without_the_scope_is_refused(guarded: Guarded, method: str, path: s
     needed = NEEDED[method, path]
     scopes = tuple(permission for permission in EVERYTHING if permission != needed)
     response = guarded.send(method, path, make_key(guarded.store, scopes=scopes))
-    problem = assert_problem(response, 403, "insufficient-scope")
-    assert f"'{needed}'" in problem["detail"]
+    assert f"'{needed}'" in assert_problem(response, 403, "insufficient-scope")["detail"]
 
 
 @pytest.mark.parametrize(("method", "path"), OPERATIONS)
@@ -299,8 +298,7 @@ def test_invalid_keys_get_the_same_message(guarded: Guarded) -> None:
         "wrong secret": key_text(id_of(guarded.key), new_secret()),
         "the secret of another": key_text("f" * 32, guarded.key.split("_", 2)[2]),
     }
-    details = {guarded.send("GET", "/limits", key).json()["detail"] for key in keys.values()}
-    assert len(details) == 1
+    assert len({guarded.send("GET", "/limits", key).json()["detail"] for key in keys.values()}) == 1
 
 
 @pytest.mark.parametrize(
@@ -550,8 +548,7 @@ def test_key_is_cached_ten_minutes_without_database(cached: CachedKey) -> None:
     # The only connection is in use.
     with cached.store.database.reading():
         for cached.clock_s in (1004.0, 1006.0, 1300.0, 1600.0):
-            key = present(cached.find())
-            assert key.id == cached.key_id
+            assert present(cached.find()).id == cached.key_id
         cached.clock_s = 1606.0
         with pytest.raises(StoreUnavailableError):
             cached.find()
@@ -568,8 +565,7 @@ def test_busy_database_does_not_extend_the_key_cache(cached: CachedKey) -> None:
         with pytest.raises(StoreBusyError):
             cached.find()
     # A busy database is queried again at the next request.
-    again = present(cached.find())
-    assert again.id == cached.key_id
+    assert present(cached.find()).id == cached.key_id
 
 
 # --- Without keys -----------------------------------------------------------------------------------------------------

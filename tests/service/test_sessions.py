@@ -105,8 +105,7 @@ def test_impossible_motion_is_refused(
     client: httpx.Client, flat: str, sphere: bytes, fields: dict[str, Any], slug: str, message: str
 ) -> None:
     session_id = begin(client, flat)
-    problem = assert_problem(send(client, session_id, sphere, **fields), 422, slug)
-    assert message in json.dumps(problem)
+    assert message in json.dumps(assert_problem(send(client, session_id, sphere, **fields), 422, slug))
     # The session is free and unchanged.
     assert send(client, session_id, sphere, number=1).status_code == 200
 
@@ -146,8 +145,7 @@ def test_impossible_session_is_refused(client: httpx.Client, flat: str, fields: 
 
 
 def test_hint_is_the_prior_of_the_first_photograph(client: httpx.Client, flat: str, sphere: bytes) -> None:
-    session_id = begin(client, flat, rooms=["kitchen"])
-    assert send(client, session_id, sphere).json()["pose"]["room"] == "kitchen"
+    assert send(client, begin(client, flat, rooms=["kitchen"]), sphere).json()["pose"]["room"] == "kitchen"
 
 
 def test_replaced_plan_ends_its_sessions(client: httpx.Client, sphere: bytes) -> None:
@@ -250,8 +248,7 @@ def test_change_of_the_venue_ends_its_sessions(client: httpx.Client, sphere: byt
         assert_problem(send(client, session_id, sphere), 404, "unknown-session")
         assert client.get("/usage").json()["stored_bytes"]["by_kind"]["sessions"] < stored
         return
-    problem = assert_problem(send(client, session_id, sphere), 409, "session-outdated")
-    assert venue_id in problem["detail"]
+    assert venue_id in assert_problem(send(client, session_id, sphere), 409, "session-outdated")["detail"]
 
 
 def test_impossible_session_in_a_venue_is_refused(client: httpx.Client, flat: str) -> None:

@@ -224,8 +224,7 @@ def test_plan_is_parsed_outside_the_transaction(open_store: OpenStore) -> None:
 def test_warnings_are_stored_and_not_recomputed(open_store: OpenStore) -> None:
     plan = dataclasses.replace(PLAN, warnings=("as found at the upload",))
     open_store().plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
-    found = present(open_store().plans.get("default", "p"))
-    assert found.plan.warnings == plan.warnings
+    assert present(open_store().plans.get("default", "p")).plan.warnings == plan.warnings
 
 
 def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> None:
@@ -235,8 +234,7 @@ def test_plan_without_digest_is_validated_on_reading(open_store: OpenStore) -> N
     store.plans.add("default", "p", NewPlan(plan, Original(b"{}")), limit=10)
     with store.database.writing() as connection:
         connection.execute(update(REVISIONS).values(document_sha256=None, warnings=None))
-    found = present(open_store().plans.get("default", "p"))
-    assert found.plan.warnings == plan.warnings != ()
+    assert present(open_store().plans.get("default", "p")).plan.warnings == plan.warnings != ()
 
 
 @pytest.mark.parametrize("cut_off", [True, False])

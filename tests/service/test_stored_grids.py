@@ -72,8 +72,7 @@ def test_own_grid_is_never_dropped(store: Store) -> None:
     _put(store, _key(revision_id))
     for height_mm in (1600, 1620, 1640, 1660):
         _put(store, _key(revision_id, camera_height_mm=height_mm), keep=3)
-    heights = {height_mm for _, height_mm in store.grids.poses("m1", 0.5)}
-    assert heights == {1500, 1640, 1660}
+    assert {height_mm for _, height_mm in store.grids.poses("m1", 0.5)} == {1500, 1640, 1660}
 
 
 def test_grid_of_deleted_plan_is_not_stored(store: Store) -> None:

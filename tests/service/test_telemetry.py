@@ -93,11 +93,9 @@ def test_query_has_one_log_line(client: httpx.Client, log: Log, sphere: bytes) -
 
 def test_log_has_route_template_and_plan_id(client: httpx.Client, log: Log) -> None:
     plan_id = upload(client)
-    found = client.get(f"/floorplans/{plan_id}")
-    (line,) = log.of_request(found.headers["x-request-id"])
+    (line,) = log.of_request(client.get(f"/floorplans/{plan_id}").headers["x-request-id"])
     assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", plan_id)
-    response = client.get("/floorplans/not-an-id")
-    (line,) = log.of_request(response.headers["x-request-id"])
+    (line,) = log.of_request(client.get("/floorplans/not-an-id").headers["x-request-id"])
     assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", None)
 
 

@@ -113,8 +113,7 @@ def test_limits_in_memory_follow_the_database(store: Store) -> None:
 
 def test_stored_bytes_follow_every_change(store: Store) -> None:
     revision_id = _add(store, "a", "p" * 32)
-    plans = store.quota.account("a").used.plans
-    assert MIB < plans < 1.01 * MIB
+    assert MIB < store.quota.account("a").used.plans < 1.01 * MIB
     _add(store, "a", "q" * 32, 2 * MIB, grid=ComputedGrid(model_sha256="m1", grid=_grid()))
     key = GridKey(revision_id=revision_id, model_sha256="m1", step_m=0.5, camera_height_mm=1500)
     for height_mm in (1500, 1500, 1600, 1620, 1640):
@@ -205,8 +204,7 @@ def test_oldest_idempotent_answers_are_deleted_first(store: Store) -> None:
     for number in range(1, 150):
         _keep_answer(store, "a", str(number), 10_000)
         assert store.quota.account("a").used.idempotency <= MIB
-    repeated = store.idempotency_keys.begin("a", "POST /x", "149", "body")
-    assert repeated == StoredAnswer(200, {}, bytes(10_000))
+    assert store.idempotency_keys.begin("a", "POST /x", "149", "body") == StoredAnswer(200, {}, bytes(10_000))
     again = store.idempotency_keys.begin("a", "POST /x", "0", "body")
     assert isinstance(again, Claimed)
     assert again != first

@@ -76,8 +76,7 @@ def _has_certificate(port: int, root: Path) -> bool:
 @pytest.mark.one_replica
 def test_service_answers_over_tls(start_app: StartApp, sphere: bytes, tmp_path: Path) -> None:
     with start_app(tmp_path / "data") as app, caddy(tmp_path, urlsplit(str(app.base_url)).netloc) as proxy:
-        plan_id = upload(proxy.client)
-        answer = localise(proxy.client, plan_id, sphere, heading_deg=0)
+        answer = localise(proxy.client, upload(proxy.client), sphere, heading_deg=0)
         assert answer.status_code == 200, answer.text
         assert answer.headers["strict-transport-security"] == "max-age=31536000"
         assert "caddy" not in answer.headers.get("server", "").lower()

@@ -195,8 +195,7 @@ def _assert_works(client: httpx.Client, version: str, script: str, sphere: bytes
     assert plan["name"] == (f"Renamed in {version}" if parts(version) > (0, 1, 0) else f"Flat of {version}")
     address = f"/floorplans/{plan['id']}"
     wait_for(lambda: client.get(address).json()["status"] == "ready")
-    original = client.get(f"{address}/original")
-    assert original.json()["name"] == plan["name"]
+    assert client.get(f"{address}/original").json()["name"] == plan["name"]
     if parts(version) > (0, 1, 0):
         first = present(re.search(r"^INSERT INTO \"revisions\" VALUES\('(\w+)','\w+',1,", script, re.MULTILINE))
         assert client.get(f"{address}?revision={first[1]}").json()["name"] == f"Flat of {version}"

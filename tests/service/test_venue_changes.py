@@ -115,8 +115,7 @@ class Changes:
             connection.execute(update(TENANTS).values(values))
             own = FLOORPLANS.c.changed
             connection.execute(update(FLOORPLANS).where(own > before.changes).values(changed=0))
-            grown = {"grids_bytes": columns.grids_bytes + 512}
-            connection.execute(update(TENANTS).values(grown))
+            connection.execute(update(TENANTS).values({"grids_bytes": columns.grids_bytes + 512}))
 
     def _key(self, plan_id: str) -> GridKey:
         sha256, step_m = MODEL
@@ -214,14 +213,12 @@ def test_queries_are_right_while_plans_change(
 
         running = [threads.submit(answers) for _ in range(2)]
         for number, plan_id in enumerate(plan_ids[:4]):
-            change = {"remove": [plan_id]}
-            client.patch(f"/venues/{venue_id}", json=change).raise_for_status()
+            client.patch(f"/venues/{venue_id}", json={"remove": [plan_id]}).raise_for_status()
             client.put(f"/floorplans/{flat}", json={**FLAT, "name": f"flat {number}"}).raise_for_status()
             again = {"plans": [{"floorplan_id": plan_id, "level": number}]}
             client.patch(f"/venues/{venue_id}", json=again).raise_for_status()
         client.delete(f"/floorplans/{plan_ids[0]}").raise_for_status()
-        added = upload(client, FLAT)
-        member = {"plans": [{"floorplan_id": added, "level": 7}]}
+        member = {"plans": [{"floorplan_id": upload(client, FLAT), "level": 7}]}
         client.patch(f"/venues/{venue_id}", json=member).raise_for_status()
         ended.set()
         for response in (response for future in running for response in future.result()):

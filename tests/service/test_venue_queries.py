@@ -211,8 +211,7 @@ def test_sequence_needs_exactly_one_of_plan_and_venue(client: httpx.Client, sphe
     files = 2 * [("photo", ("p.jpg", sphere, "image/jpeg"))]
     for fields, kind in (({}, "is missing"), ({"venue_id": "0" * 32, "floorplan_id": "0" * 32}, "not both")):
         response = client.post("/localise/sequence", data=fields | {"motion": "turn"}, files=files)
-        problem = assert_problem(response, 422, "invalid-request")
-        assert kind in problem["detail"]
+        assert kind in assert_problem(response, 422, "invalid-request")["detail"]
     unknown = client.post("/localise/sequence", data={"venue_id": "0" * 32, "motion": "turn"}, files=files)
     assert_problem(unknown, 404, "unknown-venue")
 
@@ -250,8 +249,7 @@ def test_plans_that_are_not_ready_are_warned_about(
         assert answer["floorplan_id"] == ready
         assert answer["warnings"] == ["1 of the venue's 2 floor plans are preparing and were not searched"]
         waiting = ask(client, venue_of(client, hall), sphere, refine="none")
-        problem = assert_problem(waiting, 503, "venue-not-ready")
-        assert "none of the 1 floor plans" in problem["detail"]
+        assert "none of the 1 floor plans" in assert_problem(waiting, 503, "venue-not-ready")["detail"]
         assert int(waiting.headers["retry-after"]) >= 1
         go_on.set()
 

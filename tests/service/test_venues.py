@@ -126,8 +126,7 @@ def test_replaced_plan_stays_in_its_venues(client: httpx.Client) -> None:
     assert client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "rebuilt"}).status_code == 200
     [entry] = plans_of(client, venue["id"])
     assert (entry["name"], entry["level"]) == ("rebuilt", 4.0)
-    revision = client.get(f"/venues/{venue['id']}").json()["revision"]
-    assert revision == venue["revision"]
+    assert client.get(f"/venues/{venue['id']}").json()["revision"] == venue["revision"]
 
 
 BAD_VENUES: dict[str, tuple[Any, str, str]] = {
@@ -174,8 +173,7 @@ def test_invalid_change_changes_nothing(client: httpx.Client, plans: list[str]) 
         ({"plans": [member(plans[0])], "remove": [plans[0]]}, "which is also in plans"),
         ({"name": "x", "plans": [member("0" * 32)]}, "does not exist"),
     ):
-        problem = assert_problem(client.patch(path, json=change), 422, "invalid-request")
-        assert message in problem["detail"]
+        assert message in assert_problem(client.patch(path, json=change), 422, "invalid-request")["detail"]
     assert client.get(path).headers["etag"] == venue["etag"]
 
 
@@ -186,8 +184,7 @@ def test_repeated_request_creates_one_venue(client: httpx.Client, plans: list[st
     assert second.content == first.content
     assert second.headers["idempotency-replayed"] == "true"
     assert len(client.get("/venues", params={"name": body["name"]}).json()["venues"]) == 1
-    other = client.post("/venues", json={"name": "another"}, headers=key)
-    assert_problem(other, 422, "idempotency-key-reused")
+    assert_problem(client.post("/venues", json={"name": "another"}, headers=key), 422, "idempotency-key-reused")
 
 
 def test_venue_limits_are_reported(start_app: StartApp, tmp_path: Path) -> None:

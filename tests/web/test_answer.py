@@ -17,8 +17,7 @@ from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, visit, wait_
 
 
 def _marker(page: Page) -> tuple[float, float]:
-    transform = page.locator("#marker").get_attribute("transform") or ""
-    x, y = re.findall(r"-?[\d.]+", transform)
+    x, y = re.findall(r"-?[\d.]+", page.locator("#marker").get_attribute("transform") or "")
     return float(x), -float(y)
 
 

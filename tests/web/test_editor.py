@@ -65,8 +65,7 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     _click(page, 8, 2)
     page.locator("#known-distance").fill("4.5")
     page.get_by_role("button", name="Set the scale").click()
-    width = page.locator("#plan image").get_attribute("width")
-    assert float(width or 0) == pytest.approx(9.0, rel=1e-3)
+    assert float(page.locator("#plan image").get_attribute("width") or 0) == pytest.approx(9.0, rel=1e-3)
     page.locator("#tool-room").click()
     for corner in ((1.5, 1.5), (6, 1.5), (6, 4.5), (1.5, 4.5), (1.5, 1.5)):
         _click(page, *corner)
