@@ -300,8 +300,7 @@ class GridProvider:
         jobs = self._jobs.remote()
         if not jobs:
             return
-        revision_ids = [job.key.revision_id for job in jobs]
-        leased = self._store.leases.progress(*self.model, revision_ids)
+        leased = self._store.leases.progress(*self.model, [job.key.revision_id for job in jobs])
         for job in jobs:
             progress = leased.get((job.key.revision_id, job.key.camera_height_mm))
             if progress is None or job.cancelled.is_set():

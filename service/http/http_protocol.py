@@ -120,8 +120,7 @@ class PacedParser:
             self.close()
         elif self.events_left <= 0 and self._timer is None:
             self._transport.pause_reading()
-            loop = asyncio.get_running_loop()
-            self._timer = loop.call_later(EVENTS.wait_s(EVENTS_PER_TURN), self._go_on)
+            self._timer = asyncio.get_running_loop().call_later(EVENTS.wait_s(EVENTS_PER_TURN), self._go_on)
 
     def close(self) -> None:
         """Drop what waits."""

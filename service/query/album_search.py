@@ -79,8 +79,7 @@ class AlbumSearch:
         """Pin the photographs of an album."""
         context, document = query.context, query.document
         # Not on the event loop: the entries of 500 photographs have megabytes.
-        read = partial(self._read, query.photographs)
-        photographs = await self._threads.run(context.client, read)
+        photographs = await self._threads.run(context.client, partial(self._read, query.photographs))
         async with self._queries.wait_and_hold(context.client, context.deadline):
             site = await self._parts.grounds.site(where, document)
             await site.wait(context)

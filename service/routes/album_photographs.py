@@ -105,8 +105,7 @@ async def add_album_photographs(album_id: str, call: Call) -> Response:
     call.idempotent(NDJSON)
     album = await call.read(album_of, call, album_id)
     album.check_model(call.runtime.bundle.sha256)
-    most = call.settings.photographs.max_batch_photographs
-    repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
+    repeated = {PHOTO: Repeats(1, call.settings.photographs.max_batch_photographs, "max_batch_photographs")}
     _, parts, _ = await read_query(call, AlbumPhotographForm, "max_sequence_bytes", repeated=repeated)
     files = parts.named(PHOTO) or parts.named(FEATURES)
     await call.runtime.access_control.count_photographs(caller_of(call.request.scope), len(files))

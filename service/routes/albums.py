@@ -42,8 +42,7 @@ async def create_album(call: Call) -> Response:
     _ = document.stated_camera
     if not gives_features(manifest := call.runtime.bundle.manifest):
         raise errors.FeaturelessModelError(manifest.name)
-    place = await call.place(document.floorplan_id, document.venue_id)
-    await call.runtime.localiser.check(place, document)
+    await call.runtime.localiser.check(await call.place(document.floorplan_id, document.venue_id), document)
     new = NewAlbum(
         name=document.name,
         plan_id=document.floorplan_id,

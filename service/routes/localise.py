@@ -168,8 +168,7 @@ async def localise_batch(call: Call) -> Response:
     """
     call.idempotent(NDJSON)
     settings = call.settings
-    most = settings.photographs.max_batch_photographs
-    repeated = {PHOTO: Repeats(1, most, "max_batch_photographs")}
+    repeated = {PHOTO: Repeats(1, settings.photographs.max_batch_photographs, "max_batch_photographs")}
     form, parts, _ = await read_query(call, LocaliseForm, "max_sequence_bytes", repeated=repeated)
     files = parts.named(PHOTO) or parts.named(FEATURES)
     photographs = list(zip(files, photographs_of(parts, form, call), strict=True))

@@ -138,8 +138,7 @@ class AlbumJobs:
         if solution is not None:
             values["solution"] = solution
         own = ALBUMS.c.id == job.album.id, ALBUMS.c.owner == owner
-        columns = ALBUM_PHOTOGRAPHS.c
-        pinned = update(ALBUM_PHOTOGRAPHS).where(columns.id == bindparam("photograph_id"))
+        pinned = update(ALBUM_PHOTOGRAPHS).where(ALBUM_PHOTOGRAPHS.c.id == bindparam("photograph_id"))
         with self._database.writing(grows_by=sum(map(len, pins.values()))) as connection:
             if connection.execute(update(ALBUMS).where(*own).values(**values)).rowcount != 1:
                 return False
