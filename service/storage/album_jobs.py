@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 
 from sqlalchemy import bindparam, func, select, update
 
-from service.storage.album_rows import AlbumRecord, is_due, select_albums
+from service.storage.album_rows import NO_LEASE, AlbumRecord, is_due, select_albums
 from service.storage.database import Database
 from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS, TENANTS
 
@@ -104,8 +104,7 @@ class AlbumJobs:
         attempts = columns.attempts if failed else columns.attempts - 1
         own = columns.id == album_id, columns.owner == owner
         with self._database.writing() as connection:
-            values = {"owner": "", "lease_until_s": 0.0, "progress": 0.0, "attempts": attempts}
-            connection.execute(update(ALBUMS).where(*own).values(**values))
+            connection.execute(update(ALBUMS).where(*own).values(NO_LEASE | {"attempts": attempts}))
 
     def finish(
         self,
@@ -125,15 +124,11 @@ class AlbumJobs:
         Returns:
             False if the owner lost the lease, or the album was deleted.
         """
-        values = {
+        values = NO_LEASE | {
             "solved_number": job.album.number,
             "place_revision_id": place_revision_id,
             "place_change": job.place_change,
             "failure": failure,
-            "owner": "",
-            "lease_until_s": 0.0,
-            "progress": 0.0,
-            "attempts": 0,
         }
         if solution is not None:
             values["solution"] = solution

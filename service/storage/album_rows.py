@@ -19,6 +19,8 @@ AlbumState = Literal["empty", "solving", "solved", "failed", "outdated"]
 _PIN_BYTES, _SOLUTION_BYTES = 4096, 2048
 # Columns of `PhotographRecord`.
 _LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in ("album_id", "entry", "stored_bytes")]
+# Values of an album whose lease nobody holds.
+NO_LEASE: dict[str, Any] = {"owner": "", "lease_until_s": 0.0, "progress": 0.0, "attempts": 0}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from sqlalchemy import Connection, delete, func, select, update
 
 from service.errors import RevisionMismatchError, TooManyAlbumsError, TooManyPhotographsError
 from service.storage.album_rows import (
+    NO_LEASE,
     AlbumRecord,
     NewAlbum,
     NewPhotograph,
@@ -49,7 +50,7 @@ class Albums:
             if connection.scalar(select(ALBUMS.c.id).where(own, ALBUMS.c.id == album_id)) is not None:
                 return find_album(connection, tenant, album_id, now)
             freed = delete_albums(connection, own, ALBUMS.c.expires_at < now)
-            values = vars(new) | {
+            values = NO_LEASE | vars(new) | {
                 "id": album_id,
                 "tenant": tenant,
                 "folded_name": new.name.casefold(),
@@ -61,10 +62,6 @@ class Albums:
                 "photographs": 0,
                 "solved_number": 0,
                 "place_change": 0,
-                "owner": "",
-                "lease_until_s": 0.0,
-                "progress": 0.0,
-                "attempts": 0,
                 "stored_bytes": size,
             }
             connection.execute(ALBUMS.insert().values(values))
