@@ -119,7 +119,10 @@ class RenditionCache:
         return made
 
     async def _predicted(self, job: _PendingJob, plan_id: str, key: _Key, client: str) -> Rendition:
-        self._check_model()
+        try:
+            errors_of(self._bundle.manifest)
+        except InvalidInputError as error:
+            raise UnmeasuredModelError(str(error)) from error
         report = b""
         if key[1] in CONDITIONS:
             report = (await self.get(plan_id, key[0], "localisability", client)).content
@@ -133,12 +136,6 @@ class RenditionCache:
             return begun
         job.in_worker = begun
         return await self._converter.rendition(begun, key[1])
-
-    def _check_model(self) -> None:
-        try:
-            errors_of(self._bundle.manifest)
-        except InvalidInputError as error:
-            raise UnmeasuredModelError(str(error)) from error
 
     def _begin(self, job: _PendingJob, plan_id: str, key: _Key, client: str, report: bytes) -> Rendition | Future:
         """Read a plan; return the file of a small one, and the job of a worker for others."""

@@ -70,9 +70,12 @@ async def localise_sequence(call: Call) -> Response:
     """
     media = preferred(call.request, (JSON, *_ON_EARTH))
     idempotent = call.idempotent(media)
-    most = call.settings.photographs.max_sequence_photographs
+    limits = call.settings.photographs
+    most = limits.max_sequence_photographs
     repeated = {PHOTO: Repeats(_MIN_PHOTOGRAPHS, most, "max_sequence_photographs"), FILM: Repeats(1, 1)}
-    form, parts, context = await read_query(call, SequenceForm, _largest(call), repeated=repeated, film=True)
+    # The body can be a film or photographs.
+    largest: Settable = "max_film_bytes" if limits.max_film_bytes > limits.max_sequence_bytes else "max_sequence_bytes"
+    form, parts, context = await read_query(call, SequenceForm, largest, repeated=repeated, film=True)
     query = _query(parts, form, context, call)
 
     async def respond(_token: str) -> Response:
@@ -83,12 +86,6 @@ async def localise_sequence(call: Call) -> Response:
         return answer_as(found, media, _ON_EARTH)
 
     return await idempotent.run_async(parts, respond, call.runtime.reads)
-
-
-def _largest(call: ApiCall) -> Settable:
-    """Return the setting that limits the body: that of films or that of photographs."""
-    limits = call.settings.photographs
-    return "max_film_bytes" if limits.max_film_bytes > limits.max_sequence_bytes else "max_sequence_bytes"
 
 
 def _query(parts: Parts, form: SequenceForm, context: QueryContext, call: ApiCall) -> SequenceQuery:
