@@ -146,7 +146,6 @@ def test_legend_lies_below_areas_without_a_room():
 
 def test_debug_draws_a_drawing_that_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
     space = document.modelspace()
     for start, end in (((0, 0), (4, 0)), ((4, 0), (4, 3)), ((9, 0), (9, 3))):
         space.add_line(start, end, dxfattribs={"layer": "WALL"})

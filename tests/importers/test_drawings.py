@@ -71,8 +71,7 @@ def test_layers_option_selects_layers():
 
 def _german_walls(insunits: int = 4):
     """Draw both faces of walls in millimetres, a door with its swing, and a window of three lines."""
-    document = new_dxf()
-    document.header["$INSUNITS"] = insunits
+    document = new_dxf(units=insunits)
     space = document.modelspace()
     faces = [
         [(0, 0), (10000, 0), (10000, 6000), (0, 6000), (0, 0)],
@@ -105,8 +104,7 @@ def test_german_wall_lines_become_rooms():
 
 def _single_lines(leaves: str, layer: str):
     """Draw walls of single lines in millimetres, 3 rooms above a corridor, with half open doors and axes."""
-    document = new_dxf()
-    document.header["$INSUNITS"] = 4
+    document = new_dxf(units=4)
     space = document.modelspace()
     # The upper left corner stays open by 3 cm, the wall to the right of the first room by 12 cm.
     space.add_line((30, 6000), (12000, 6000))
@@ -163,7 +161,6 @@ def test_slanted_leaves_are_doors_and_not_walls(leaves: str, layer: str):
 
 def test_names_of_rooms_that_are_not_enclosed_are_warned_of():
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
     space = document.modelspace()
     # The room to the right has an opening of 2.5 m, wider than a door.
     corners = [(8, 4), (8, 0), (0, 0), (0, 4), (8, 4)]
@@ -180,7 +177,6 @@ def test_names_of_rooms_that_are_not_enclosed_are_warned_of():
 
 def test_drawing_without_rooms_names_layers_and_attempts():
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
     for x in range(5):
         document.modelspace().add_line((x, 0), (x, 9), dxfattribs={"layer": "WALL"})
     with pytest.raises(
@@ -224,7 +220,6 @@ def test_binary_dxf_is_read():
 
 def test_open_polyline_in_surveyed_coordinates_stays_open():
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
     space = document.modelspace()
     east, north = 500_000.0, 5_300_000.0
     outer = [(0, 0), (10, 0), (10, 8), (0, 8)]
@@ -248,8 +243,7 @@ def test_polyline_with_equal_ends_is_closed_at_any_coordinates():
 
 
 def test_french_polylines_and_blocks_in_feet():
-    document = new_dxf()
-    document.header["$INSUNITS"] = 2
+    document = new_dxf(units=2)
     space = document.modelspace()
     door = document.blocks.new("PORTE_90")
     door.add_line((0, 0), (0, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from typing import Any
 
@@ -15,6 +14,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
+from tests.importers.conftest import dxf_file
 from tests.importers.test_roomplan import _scan, _surface
 
 
@@ -35,7 +35,6 @@ def test_kind_of_a_fixture_by_name(name: str, kind: str | None) -> None:
 def two_rooms_dxf(*blocks: tuple[str, str, tuple[float, float], tuple[float, float]]) -> bytes:
     """Return two rooms, 4 m x 3 m, with blocks: name, layer, size and corner."""
     drawing = new_dxf("R2010")
-    drawing.header["$INSUNITS"] = 6
     space = drawing.modelspace()
     for x in (0.0, 4.1):
         space.add_lwpolyline([(x, 0), (x + 4, 0), (x + 4, 3), (x, 3)], close=True, dxfattribs={"layer": "ROOM"})
@@ -43,9 +42,7 @@ def two_rooms_dxf(*blocks: tuple[str, str, tuple[float, float], tuple[float, flo
         block = drawing.blocks.get(name) or drawing.blocks.new(name)
         block.add_lwpolyline([(0, 0), (width, 0), (width, depth), (0, depth)], close=True)
         space.add_blockref(name, corner, dxfattribs={"layer": layer})
-    text = io.StringIO()
-    drawing.write(text)
-    return text.getvalue().encode()
+    return dxf_file(drawing)
 
 
 def kinds_and_types(document: dict[str, Any]) -> tuple[list[str], list[str | None]]:

@@ -160,7 +160,6 @@ def test_likely_mistakes_are_warnings(client: httpx.Client) -> None:
 
 def test_y_axis_down_gives_a_warning(client: httpx.Client) -> None:
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
     document.header["$UCSYDIR"] = (0, -1, 0)
     room = document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], dxfattribs={"layer": "ROOM"})
     room.close()

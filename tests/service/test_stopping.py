@@ -91,7 +91,6 @@ def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> No
 @pytest.mark.slow
 def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
     document = new_dxf()
-    document.header["$INSUNITS"] = 6
     document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], close=True, dxfattribs={"layer": "ROOM"})
     content = dxf_file(document)
     # Requests in progress could take a minute of this.
