@@ -138,9 +138,8 @@ def test_picture_that_looks_like_a_photograph_is_read_with_is_plan(tmp_path: Pat
     assert "2 rooms" in capsys.readouterr().out
 
 
-def test_legend_lies_below_areas_without_a_room():
-    plan = FloorPlan.from_dict(json.loads(json.dumps(FLAT)))
-    drawn = plan_svg(plan, no_room=[[(2.0, -6.0), (7.0, -6.0), (7.0, -1.0), (2.0, -1.0)]])
+def test_legend_lies_below_areas_without_a_room(flat: FloorPlan):
+    drawn = plan_svg(flat, no_room=[[(2.0, -6.0), (7.0, -6.0), (7.0, -1.0), (2.0, -1.0)]])
     assert float(re.findall(r'class="key".*?<path d="M[-\d.]+ ([-\d.]+)h', drawn)[0]) > 6.0
 
 

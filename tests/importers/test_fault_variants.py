@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from ezdxf.enums import TextEntityAlignment
 from ezdxf.filemanagement import new as new_dxf
 from scipy import ndimage
@@ -18,9 +17,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, import_plan, import_plans
 from lalaloc_core.importers.common.geometry import find_floor
 from lalaloc_core.importers.drawing.drawing_scale import _AT_SHEET
-from tests.importers.conftest import dxf_file, lines, shapes, zip_file
+from tests.importers.conftest import dxf_file, lines, shapes
 from tests.importers.test_fault_files import FOLDER
-from tests.importers.test_ros_maps import SETTINGS, _picture
+from tests.importers.test_ros_maps import _map
 from tests.strategies import present
 
 _SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1200 900" data-metres-per-unit="0.01">{}</svg>'
@@ -209,7 +208,7 @@ def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple
     cells[100:118, 180:182] = 254
     cells[60 + rows[0] : 60 + rows[1], 319:321] = 205
     turned = ndimage.rotate(cells, turn_deg, order=0, cval=205, reshape=False)
-    plan = import_plan(zip_file({"map.yaml": yaml.safe_dump(SETTINGS), "map.pgm": _picture(turned)}))
+    plan = import_plan(_map(turned))
     assert len(shapes(plan.document)) == 2
     assert any("never seen" in line for line in plan.report.unsure)
 

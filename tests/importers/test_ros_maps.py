@@ -36,10 +36,6 @@ def _cells(content: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(_files(content)["map.pgm"])))
 
 
-def _picture(gray: np.ndarray, kind: str = "PPM") -> bytes:
-    return picture_file(gray, kind)
-
-
 def _scanned() -> np.ndarray:
     """Return a map of two rooms with walls of one cell, an open door between them, and specks, in unknown space."""
     cells = np.full((100, 160), 205, np.uint8)
@@ -52,7 +48,7 @@ def _scanned() -> np.ndarray:
 
 
 def _map(cells: np.ndarray, **settings: object) -> bytes:
-    return zip_file({"map.yaml": yaml.safe_dump(SETTINGS | settings), "map.pgm": _picture(cells)})
+    return zip_file({"map.yaml": yaml.safe_dump(SETTINGS | settings), "map.pgm": picture_file(cells, "PPM")})
 
 
 def _assert_same_rooms(document: dict, expected: list[shapely.Polygon], within_m: float) -> None:
@@ -167,13 +163,13 @@ def test_negated_and_transparent_pictures():
     cells = _scanned()
     assert len(import_plan(_map(255 - cells, negate=1)).document["rooms"]) == 2
     opaque = np.where(cells == 205, 0, 255).astype(np.uint8)
-    picture = _picture(np.dstack([cells, opaque]), "PNG")
+    picture = picture_file(np.dstack([cells, opaque]))
     settings = yaml.safe_dump(SETTINGS | {"image": "maps/map.png"})
     assert len(import_plan(zip_file({"a/b.yml": settings, "a/map.png": picture})).document["rooms"]) == 2
 
 
 def test_picture_alone_needs_a_scale():
-    picture = _picture(_scanned())
+    picture = picture_file(_scanned(), "PPM")
     assert detect_format(picture) == "ros"
     with pytest.raises(InvalidFloorPlanError, match="one zip archive, or the PGM picture with metres_per_pixel"):
         import_plan(picture)
@@ -216,7 +212,7 @@ def test_map_without_a_room_is_rejected():
 
 def test_command_reads_the_map_beside_its_yaml_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(SETTINGS | {"origin": [-3.0, 2.0, 0.0]}), encoding="utf-8")
-    (tmp_path / "map.pgm").write_bytes(_picture(_scanned()))
+    (tmp_path / "map.pgm").write_bytes(picture_file(_scanned(), "PPM"))
     plan, out = tmp_path / "plan.json", tmp_path / "out.zip"
     assert main(["plan", "import", str(tmp_path / "map.yaml"), "-o", str(plan)]) == 0
     assert len(json.loads(plan.read_text(encoding="utf-8"))["rooms"]) == 2

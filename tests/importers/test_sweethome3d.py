@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import zipfile
 
 import pytest
 
@@ -13,7 +11,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan, import_plans
 from lalaloc_core.importers.common.import_limits import ImportLimits
 from lalaloc_core.importers.common.plausibility import unit_by_parts
-from tests.importers.conftest import lines, shapes
+from tests.importers.conftest import lines, shapes, zip_file
 
 
 def wall(x0: float, y0: float, x1: float, y1: float, **more: object) -> str:
@@ -41,19 +39,10 @@ HOME = [
 ]  # fmt: skip
 
 
-def home(parts: list[str], **extra: bytes) -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("Home", b"\xac\xed\x00\x05")
-        archive.writestr(
-            "Home.xml",
-            f"<?xml version='1.0'?><home version='7000' name='Flat' wallHeight='260'>{''.join(parts)}</home>",
-        )
-        for index in range(400):
-            archive.writestr(f"{index}/model.obj", b"v 0 0 0")
-        for name, content in extra.items():
-            archive.writestr(name, content)
-    return stream.getvalue()  # fmt: skip
+def home(parts: list[str]) -> bytes:
+    xml = f"<?xml version='1.0'?><home version='7000' name='Flat' wallHeight='260'>{''.join(parts)}</home>"
+    models = {f"{index}/model.obj": b"v 0 0 0" for index in range(400)}
+    return zip_file({"Home": b"\xac\xed\x00\x05", "Home.xml": xml} | models)
 
 
 def test_home_becomes_rooms_openings_and_fixtures() -> None:
@@ -88,11 +77,8 @@ def test_drawn_rooms_without_walls_and_round_walls_are_read() -> None:
 
 
 def test_home_without_xml_or_rooms_is_rejected() -> None:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr("Home", b"\xac\xed")
     with pytest.raises(InvalidFloorPlanError, match=r"5\.3 or later"):
-        import_plan(stream.getvalue())
+        import_plan(zip_file({"Home": b"\xac\xed"}))
     with pytest.raises(InvalidFloorPlanError, match="no walls and no rooms"):
         import_plan(home([]))
 
@@ -122,11 +108,8 @@ def test_files_of_other_programs_are_named(content: bytes, words: str) -> None:
 
 
 def test_usdz_says_how_to_export_json() -> None:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr("Room.usdc", b"PXR-USDC")
     with pytest.raises(InvalidFloorPlanError, match=r"USDZ.*CapturedRoom.*JSON"):
-        import_plan(stream.getvalue())
+        import_plan(zip_file({"Room.usdc": b"PXR-USDC"}))
 
 
 @pytest.mark.parametrize(
