@@ -216,11 +216,9 @@ def test_import_above_the_time_limit():
         (b"<page></page>", "XML of no known kind: save a drawing as SVG or DXF, a map as OSM or IndoorGML"),
         (b"Rar!....", "a RAR archive, which cannot be read: unpack it"),
         (b"[1, 2]", "the JSON is a list"),
-        (b"%PDF-1.7 nothing", "cannot be read"),
         (b"ISO-10303-21; nothing", "truncated"),
         (b"ISO-10303-21; nothing END-ISO-10303-21;", "cannot be read|no IfcSpace|schema"),
         (b"  0\nSECTION\n nothing", "cannot be read|no lines"),
-        (b"PK\x03\x04 nothing", "damaged"),
         (b"\xff\xd8\xff nothing", "cannot be read"),
     ],
 )
