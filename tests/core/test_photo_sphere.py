@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph import open_photograph
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.spheres import NEUTRAL, level, read_sphere
+from tests.painted import picture_file
 
 HEIGHT, WIDTH = 64, 128
 FULL_HEIGHT, FULL_WIDTH = 512, 1024
@@ -92,8 +93,7 @@ def tilted(height: int, width: int, pitch_deg: float, roll_deg: float) -> np.nda
 
 def encoded(pixels: np.ndarray, kind: str = "PNG", packet: bytes | None = None) -> bytes:
     """Encode a picture with an XMP packet."""
-    buffer = io.BytesIO()
-    options: dict[str, object] = {"quality": 98, "subsampling": 0} if kind == "JPEG" else {}
+    options: dict[str, Any] = {"quality": 98, "subsampling": 0} if kind == "JPEG" else {}
     options |= {"lossless": True} if kind == "WEBP" else {}
     if packet is not None and kind == "PNG":
         info = PngInfo()
@@ -101,8 +101,7 @@ def encoded(pixels: np.ndarray, kind: str = "PNG", packet: bytes | None = None) 
         options["pnginfo"] = info
     elif packet is not None:
         options["xmp"] = packet
-    Image.fromarray(pixels).save(buffer, kind, **options)
-    return buffer.getvalue()
+    return picture_file(pixels, kind, **options)
 
 
 def opened(content: bytes) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import multiprocessing
 import os
@@ -24,7 +23,6 @@ import numpy as np
 import pytest
 import uvicorn
 from fastapi import FastAPI
-from PIL import Image
 
 from lalaloc_core.bundle import Bundle, default_bundle
 from service.app import create_app
@@ -34,6 +32,7 @@ from service.settings import CONSTANTS, Settings
 from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
 from tests.core.taken import EXAMPLES
+from tests.painted import picture_file
 from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
 from tests.service.ray_cluster import ray_cluster, serving
 
@@ -302,9 +301,7 @@ def encode_picture(width: int, height: int, picture_format: str, **options: Any)
     """Return a smooth picture as encoded bytes."""
     x, y = np.meshgrid(np.linspace(0.0, 6.28, width), np.linspace(0.0, 3.14, height))
     channels = [127.0 + 120.0 * np.sin(x + phase) * np.sin(y) for phase in (0.0, 2.0, 4.0)]
-    buffer = io.BytesIO()
-    Image.fromarray(np.stack(channels, axis=-1).astype(np.uint8)).save(buffer, picture_format, **options)
-    return buffer.getvalue()
+    return picture_file(np.stack(channels, axis=-1).astype(np.uint8), picture_format, **options)
 
 
 def tiled_plan(side: int, *, openings: bool = False) -> dict[str, Any]:
