@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -224,16 +225,12 @@ class TestStages:
     def test_number_of_refined_candidates_is_configured(
         self, flat: FloorPlan, encoders: PhotographEncoder, search: Search, query: Query
     ) -> None:
-        sizes: list[int] = []
-
-        def refiner(job: RefinementJob) -> None:
-            sizes.append(len(job.position_m))
-
+        refiner = Mock(return_value=None)
         config = LocaliseConfig(lpo_candidates=2, profile_candidates=3)
         by_profile = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
         for start in (query, by_profile):
             assert len(search(start, top_k=4, refiner=refiner, config=config).candidates) == 4
-        assert sizes == [2, 3]
+        assert [len(call.args[0].position_m) for call in refiner.call_args_list] == [2, 3]
 
     def test_candidates_that_meet_become_one(self, search: Search, query: Query) -> None:
         def refiner(job: RefinementJob) -> RefinementResult:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import cache
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -137,14 +138,10 @@ def thumbnail(pixels: np.ndarray) -> Thumbnail:
 def test_detectors_scale_few_pixels(ratio: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     width, height = ratio
     pixels = cv2.resize(small("kitchen"), (THUMBNAIL_SIDE * width // max(ratio), THUMBNAIL_SIDE * height // max(ratio)))
-    scaled, resize = [], cv2.resize
-
-    def counted(picture: np.ndarray, *args: object, **named: object) -> np.ndarray:
-        scaled.append(picture.shape[0] * picture.shape[1])
-        return resize(picture, *args, **named)  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-    monkeypatch.setattr(cv2, "resize", counted)
+    resize = Mock(wraps=cv2.resize)
+    monkeypatch.setattr(cv2, "resize", resize)
     assert find_sphere_format(Thumbnail(pixels)) is None
+    scaled = [math.prod(call.args[0].shape[:2]) for call in resize.call_args_list]
     assert sum(scaled) <= 4 * THUMBNAIL_SIDE**2, scaled
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -100,17 +101,9 @@ class LineStage(TrainingStage):
         return {"fit": (self.line(x)[:, 0] - x.sum(dim=1)).square().mean()}
 
 
-class StopAt:
-    """Validation that simulates a crash at its n-th call."""
-
-    def __init__(self, call: int) -> None:
-        self.left = call
-
-    def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
-        self.left -= 1
-        if self.left == 0:
-            raise KeyboardInterrupt
-        return {"val": 1.0}
+def stop_at(call: int) -> Mock:
+    """Return a validation that simulates a crash at its n-th call."""
+    return Mock(side_effect=[*({"val": 1.0} for _ in range(call - 1)), KeyboardInterrupt])
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -130,7 +123,7 @@ class TestLoop:
         straight = run_stage(LineStage(**settings), tmp_path / "straight", device=CPU)
         folder = tmp_path / "broken"
         with pytest.raises(KeyboardInterrupt):
-            run_stage(LineStage(**settings), folder, device=CPU, checkpoint_minutes=0.0, validate=StopAt(6))
+            run_stage(LineStage(**settings), folder, device=CPU, checkpoint_minutes=0.0, validate=stop_at(6))
         assert Checkpoint.load(folder / "line.pt").step == 5
         resumed = run_stage(LineStage(**settings), folder, device=CPU, resume=True)
         assert resumed.step == straight.step == 12
@@ -141,8 +134,8 @@ class TestLoop:
     def test_log_has_a_row_per_value_and_continues(self, tmp_path: Path) -> None:
         first = LineStage(40)
         with pytest.raises(KeyboardInterrupt):
-            run_stage(first, tmp_path, device=CPU, checkpoint_minutes=0.0, validate=StopAt(25))
-        run_stage(LineStage(40), tmp_path, device=CPU, resume=True, validate=StopAt(99))
+            run_stage(first, tmp_path, device=CPU, checkpoint_minutes=0.0, validate=stop_at(25))
+        run_stage(LineStage(40), tmp_path, device=CPU, resume=True, validate=stop_at(99))
         rows = rows_of(tmp_path / "line.csv")
         assert [row["step"] for row in rows if row["name"] == "fit"] == ["20", "40"]
         assert [row["step"] for row in rows if row["name"] == "val"][-1] == "40"
@@ -215,7 +208,7 @@ class TestLoop:
 
 class TestCheckpoint:
     def test_checkpoint_round_trip(self, tmp_path: Path) -> None:
-        saved = run_stage(LineStage(ema_decay=0.9), tmp_path, device=CPU, validate=StopAt(99))
+        saved = run_stage(LineStage(ema_decay=0.9), tmp_path, device=CPU, validate=stop_at(99))
         loaded = Checkpoint.load(tmp_path / "line.pt", stage="line")
         assert (loaded.config, loaded.step, loaded.metrics) == (saved.config, 12, {"val": 1.0})
         assert same_weights(loaded.weights, saved.weights)
@@ -481,10 +474,7 @@ class TestStages:
         assert terms["kd"].item() == pytest.approx(0.25 * np.mean(distilled), rel=1e-3)
 
     def test_disabled_losses_are_not_computed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def refused(*_: object) -> None:
-            raise AssertionError("the Chamfer distance was computed")
-
-        monkeypatch.setattr(layout_stage_module, "chamfer_to_anchors", refused)
+        monkeypatch.setattr(layout_stage_module, "chamfer_to_anchors", pytest.fail)
         stage = layout_stage(changed("layout", TINY, log_ratio_weight=0.0, scale_weight=0.0, decode_weight=1.0))
         assert set(stage.losses(next(layout_batches()))) == {"decode"}
         assert "neighbour_profile_m" not in next(image_stage(TINY, build_layout_encoder(TINY)).batches(0, 0))

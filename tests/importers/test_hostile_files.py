@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import pickle
@@ -13,6 +12,7 @@ from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -39,6 +39,7 @@ from lalaloc_core.importers.picture import lettering, wall_mask
 from lalaloc_core.importers.picture.ink import read_ink
 from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
 from tests.painted import picture_file
+from tests.strategies import present
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
@@ -270,15 +271,8 @@ def test_obstacles_are_compared_with_the_rooms_near_them(monkeypatch: pytest.Mon
 
 
 def test_gaps_and_rooms_are_compared_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    compared = []
-    intersection = shapely.intersection
-
-    def counted(first: shapely.Geometry, second: shapely.Geometry) -> shapely.Geometry:
-        if isinstance(second, shapely.Polygon):
-            compared.append(second)
-        return intersection(first, second)
-
-    monkeypatch.setattr(shapely, "intersection", counted)
+    intersection = Mock(wraps=shapely.intersection)
+    monkeypatch.setattr(shapely, "intersection", intersection)
     # Square rooms with a gap of 1 m in one wall.
     bodies = []
     for x in np.arange(30) * 6.0:
@@ -289,23 +283,17 @@ def test_gaps_and_rooms_are_compared_with_their_neighbours(monkeypatch: pytest.M
     found = enclose(bodies, [])
     assert (len(found.rooms), len(found.gaps)) == (30, 30)
     # Each gap is found from both sides.
-    assert len(compared) == 30
+    assert sum(isinstance(call.args[1], shapely.Polygon) for call in intersection.call_args_list) == 30
 
 
 def test_loose_ends_are_compared_with_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    compared = []
-    norm = np.linalg.norm
-
-    def counted(vectors: np.ndarray, axis: int | None = None) -> Any:
-        compared.append(vectors.size // 2)
-        return norm(vectors, axis=axis)
-
-    monkeypatch.setattr(np.linalg, "norm", counted)
+    norm = Mock(wraps=np.linalg.norm)
+    monkeypatch.setattr(np.linalg, "norm", norm)
     lines = [shapely.LineString([(0, y), (3, y)]) for k in range(50) for y in (2.0 * k, 2.0 * k + 0.2)]
     joints = enclosed_rooms._joints(lines, ROOM_BOUNDS.walls)
     # A jamb at both ends of each wall, found from both of its faces.
     assert [joint.length for joint in joints] == pytest.approx([0.2] * 200)
-    assert sum(compared) < 5 * 200
+    assert sum(call.args[0].size // 2 for call in norm.call_args_list) < 5 * 200
 
 
 # Pictures, and pages that are drawn, take seconds whatever they show; so do some others.
@@ -404,19 +392,13 @@ def test_svg_is_refused_before_its_library_multiplies_what_it_reads(
 
 
 def test_style_sheets_reach_the_library_without_what_does_not_end(monkeypatch: pytest.MonkeyPatch):
-    sheets = []
-    parse = svgelements.SVG.parse
-
-    def reading(stream: io.BytesIO, **options: Any) -> Any:
-        sheets.append(re.search(rb"<ns0:style>(.*)</ns0:style>", stream.getvalue()))
-        return parse(stream, **options)
-
-    monkeypatch.setattr(svgelements.SVG, "parse", reading)
+    parse = Mock(wraps=svgelements.SVG.parse)
+    monkeypatch.setattr(svgelements.SVG, "parse", parse)
     style = "/* a */ .a, .b { fill: red } // line\n}}} b {} c{d:e} aaaa /* no end"
     drawing = f'<style>{style}</style><rect class="Room b" width="500" height="500"/>'
     import_plans(SVG.format(drawing).encode(), ImportOptions(metres_per_pixel=0.01))
-    assert sheets[0] is not None
-    assert sheets[0][1] == b".a, .b{fill: red}c{d:e}"
+    sheet = re.search(rb"<ns0:style>(.*)</ns0:style>", parse.call_args_list[0].args[0].getvalue())
+    assert present(sheet)[1] == b".a, .b{fill: red}c{d:e}"
 
 
 def test_copies_of_blocks_are_bounded_by_the_size_of_the_file(monkeypatch: pytest.MonkeyPatch):
