@@ -12,12 +12,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 import pytest
 from sqlalchemy import update
 from sqlalchemy.exc import DBAPIError
-from starlette.types import Message, Receive, Scope, Send
 
 from service.cli.entry_point import main
 from service.http.middleware import AuthorisationMiddleware
@@ -376,16 +376,6 @@ def test_entries_wait_for_the_database(store: Store, monkeypatch: pytest.MonkeyP
 
 def test_change_without_an_answer_has_an_entry(store: Store) -> None:
     trail, access = AuditTrail(store.audit_log), AccessControl(store.keys, Settings())
-
-    async def leave(_scope: Scope, _receive: Receive, _send: Send) -> None:
-        """Return like the layers below when the client has disconnected."""
-
-    async def never() -> Message:
-        raise AssertionError("nothing is received")
-
-    async def nowhere(_message: Message) -> None:
-        raise AssertionError("nothing is sent")
-
     scope = {
         "type": "http",
         "method": "DELETE",
@@ -395,7 +385,9 @@ def test_change_without_an_answer_has_an_entry(store: Store) -> None:
         "server": ("127.0.0.1", 8000),
         "app": SimpleNamespace(state=SimpleNamespace(access_control=access, audit_trail=trail)),
     }
-    asyncio.run(AuthorisationMiddleware(leave)(scope, never, nowhere))
+    never = Mock(side_effect=AssertionError("something is received or sent"))
+    # The layers below return, as they do when the client has disconnected.
+    asyncio.run(AuthorisationMiddleware(AsyncMock())(scope, never, never))
     trail.close()
     access.close()
     (entry,) = store.audit_log.page(limit=9)

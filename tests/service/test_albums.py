@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pypdfium2
@@ -627,13 +628,10 @@ def test_solve_holds_up_no_other_tenant_and_its_expired_lease_is_taken_over(
 def test_album_that_cannot_be_solved_states_why(
     start_app: StartApp, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: Any, **__: Any) -> Any:
-        raise InvalidInputError("the album is impossible")
-
     with start_app(tmp_path) as client:
         album_id = create(client, upload(client, HOME))
         with monkeypatch.context() as patch:
-            patch.setattr(album_search, "solve_album", refuse)
+            patch.setattr(album_search, "solve_album", Mock(side_effect=InvalidInputError("the album is impossible")))
             add(client, album_id, pictures[:1])
             wait_for(lambda: client.get(f"/albums/{album_id}").json()["state"] == "failed")
             assert client.get(f"/albums/{album_id}").json()["reason"] == "the album is impossible"
@@ -681,13 +679,7 @@ def test_solve_of_a_deleted_album_does_not_fail(monkeypatch: pytest.MonkeyPatch)
 
 def test_heartbeat_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
-    renewals = iter([ValueError("damaged"), None])
-
-    def renew(*_: Any) -> bool:
-        if (error := next(renewals)) is not None:
-            raise error
-        return False
-
+    renew = Mock(side_effect=[ValueError("damaged"), False])
     job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
     progress = AlbumProgress()
     asyncio.run(asyncio.wait_for(solver_of(renew=renew)._renew(job, progress), 10.0))
@@ -696,11 +688,7 @@ def test_heartbeat_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, m
 
 
 def test_solver_goes_on_after_an_error() -> None:
-    looks = iter([ValueError("damaged"), asyncio.CancelledError()])
-
-    def due(*_: Any) -> Any:
-        raise next(looks)
-
+    due = Mock(side_effect=[ValueError("damaged"), asyncio.CancelledError()])
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(solver_of(due=due).run())
 

@@ -10,6 +10,7 @@ import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -164,11 +165,8 @@ def test_deletion_on_a_full_disk_uses_the_reserve(tmp_path: Path, monkeypatch: p
 
 
 def test_failed_reserve_leaves_no_file_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_self: Path, _mode: str) -> Any:
-        raise OSError(errno.ENOSPC, "full")
-
     reserve = disk_reserve.DiskReserve(str(tmp_path / "x"))
-    monkeypatch.setattr(Path, "open", fail)
+    monkeypatch.setattr(Path, "open", Mock(side_effect=OSError(errno.ENOSPC, "full")))
     assert not reserve.restore()
     assert not (tmp_path / "x-reserve").exists()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -86,10 +87,7 @@ def test_failed_refinement_has_no_result(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    def fail(*_arguments: object, **_keywords: object) -> None:
-        raise np.linalg.LinAlgError("singular matrix")
-
-    monkeypatch.setattr(executor, "refine_walls", fail)
+    monkeypatch.setattr(executor, "refine_walls", Mock(side_effect=np.linalg.LinAlgError("singular matrix")))
     assert runner_of(1).next(_search(job), None, lambda: 1e3) is None
     assert _missed(telemetry, "fault") == 1
     assert "pose refinement failed" in caplog.text

@@ -12,6 +12,7 @@ from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -197,12 +198,8 @@ def test_value_is_made_once_for_all_threads() -> None:
 
 def test_failed_call_fails_for_all_who_wait_and_is_made_again() -> None:
     cache: BoundedCache[str, int] = BoundedCache(100, lambda size: size)
-
-    def fail() -> int:
-        raise StoreUnavailableError
-
     with pytest.raises(StoreUnavailableError):
-        cache.get_or_make("a", fail)
+        cache.get_or_make("a", Mock(side_effect=StoreUnavailableError))
     assert cache.get_or_make("a", lambda: 3) == 3
 
 

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -221,11 +222,8 @@ def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp
 
 
 def test_stored_upload_is_confirmed_without_database(own: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unavailable(*_arguments: Any) -> NoReturn:
-        raise StoreUnavailableError()
-
     # Reading the state of the grid follows the commit.
-    monkeypatch.setattr(StoredGrids, "poses", unavailable)
+    monkeypatch.setattr(StoredGrids, "poses", Mock(side_effect=StoreUnavailableError))
     created = _post(own, "a")
     assert (created.status_code, created.json()["status"]) == (201, "ready")
     replaced = own.put(created.headers["location"], json=FLAT, headers={"If-Match": created.headers["etag"]})
@@ -274,9 +272,7 @@ def _poisoned() -> Exception:
     ],
 )
 def test_only_errors_of_the_request_are_kept(store: Store, refusal: Exception, kept: bool) -> None:
-    def refuse(_token: str) -> Response:
-        raise refusal
-
+    refuse = Mock(side_effect=refusal)
     if kept:
         first = _idempotent(store).run(NOTHING, refuse)
         assert _idempotent(store).run(NOTHING, lambda token: Response(token)).body == first.body
@@ -288,8 +284,7 @@ def test_only_errors_of_the_request_are_kept(store: Store, refusal: Exception, k
 
 @pytest.mark.parametrize("leaves", [True, False], ids=["disconnects", "retries later"])
 def test_request_that_left_keeps_no_claim(store: Store, leaves: bool) -> None:
-    async def never(_token: str) -> Response:
-        raise AssertionError("it has not begun")
+    never = Mock(side_effect=AssertionError("it has not begun"))
 
     async def ask() -> None:
         reads = BoundedReads(threads=1, max_pending=4, wait_s=30.0 if leaves else 0.2)

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from time import sleep
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import numpy as np
@@ -328,14 +329,11 @@ def test_repeated_request_moves_the_camera_once(client: httpx.Client, flat: str,
 def test_request_whose_answer_was_not_kept_moves_the_camera_once(
     start_app: StartApp, app_store: Store, tmp_path: Path, sphere: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_arguments: object) -> None:
-        raise StoreUnavailableError()
-
     with start_app(tmp_path) as client:
         session_id = begin(client, upload(client))
         photograph = partial(send, client, session_id, sphere, "key")
         with monkeypatch.context() as patch:
-            patch.setattr(IdempotencyKeys, "finish", fail)
+            patch.setattr(IdempotencyKeys, "finish", Mock(side_effect=StoreUnavailableError))
             first = photograph()
         assert first.status_code == 200
         assert_problem(photograph(), 409, "idempotency-in-progress")
