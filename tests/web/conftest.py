@@ -70,6 +70,11 @@ class Visit:
         expect(self.page.locator("#answer")).to_be_visible()
         return self.page
 
+    def stored(self, name: str) -> dict[str, Any]:
+        """Return the only stored plan of a name."""
+        (listed,) = self.client.get("/floorplans", params={"name": name}).json()["floorplans"]
+        return self.client.get(f"/floorplans/{listed['id']}").json()
+
 
 def wait_until(page: Page, condition: str, argument: object = None) -> None:
     """Wait until a function of the page returns true.
@@ -88,6 +93,14 @@ def choose_plan(page: Page, name: str) -> None:
     page.locator("#plan-list").get_by_role("button", name=name, exact=False).first.click()
     expect(page.locator("#plan-name")).to_have_text(name)
     expect(page.locator("#plan-list")).to_be_hidden()
+
+
+def drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> None:
+    """Press the mouse at a place of the screen, and release it at another."""
+    page.mouse.move(*begin)
+    page.mouse.down()
+    page.mouse.move(*end, steps=4)
+    page.mouse.up()
 
 
 # Not for the session: Playwright's event loop prevents other tests from running one.

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.service.conftest import FLAT, upload
 from tests.strategies import present
-from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, visit, wait_until
+from tests.web.conftest import EXAMPLES, PHONE, Visit, choose_plan, drag, visit, wait_until
 
 
 def _marker(page: Page) -> tuple[float, float]:
@@ -112,10 +112,7 @@ def test_dragged_marker_moves_the_layout(desktop: Visit) -> None:
     expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
     begin, state = _marker(page), page.locator("#fit-state").inner_text()
     grip = present(page.locator("#marker .dot").bounding_box())
-    page.mouse.move(grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2)
-    page.mouse.down()
-    page.mouse.move(grip["x"] + 25, grip["y"] + 18, steps=4)
-    page.mouse.up()
+    drag(page, (grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2), (grip["x"] + 25, grip["y"] + 18))
     assert _marker(page) != begin
     expect(page.locator("#fit-state")).not_to_have_text(state)
     page.locator("[data-rank='0']").click()

@@ -34,11 +34,6 @@ def _drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> N
     page.mouse.up()
 
 
-def _stored(visited: Visit, name: str) -> dict[str, Any]:
-    (listed,) = visited.client.get("/floorplans", params={"name": name}).json()["floorplans"]
-    return visited.client.get(f"/floorplans/{listed['id']}").json()
-
-
 def _editing(visited: Visit, name: str, **values: Any) -> Page:
     """Store a plan and open the editor on it."""
     upload(visited.client, FLAT | {"name": name} | values)
@@ -85,7 +80,7 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     _assert_accessible(page)
     page.get_by_role("button", name="Store the plan").click()
     expect(page.locator("#plan-facts")).to_contain_text("1 rooms")
-    plan = _stored(desktop, "New plan")["plan"]
+    plan = desktop.stored("New plan")["plan"]
     assert (plan["north_deg"], plan["anchor"]["latitude"]) == pytest.approx((90.0, 48.13722))
     (room,) = plan["rooms"]
     assert (room["name"], room["type"]) == ("Workshop", "garage")
@@ -115,9 +110,7 @@ def test_dragging_can_be_undone(desktop: Visit) -> None:
     page.keyboard.press("Control+Shift+z")
     page.get_by_role("button", name="Save as a new revision").click()
     expect(page.locator("#plan-facts")).to_contain_text("revision 2")
-    assert [4.4, 3.4] in [
-        pytest.approx(corner) for corner in _stored(desktop, "Dragged")["plan"]["rooms"][0]["polygon"]
-    ]
+    assert [4.4, 3.4] in [pytest.approx(corner) for corner in desktop.stored("Dragged")["plan"]["rooms"][0]["polygon"]]
 
 
 @pytest.mark.slow
@@ -155,7 +148,7 @@ def test_ceiling_of_the_plan_applies_to_all_rooms(desktop: Visit) -> None:
     expect(page.locator("#plan-form-own-ceilings")).to_have_count(0)
     page.locator("#save").click()
     expect(page.locator("#plan-facts")).to_contain_text("revision 2")
-    stored = _stored(desktop, "Ceilings")
+    stored = desktop.stored("Ceilings")
     assert [room["ceiling_height_m"] for room in stored["rooms"]] == [2.7, 2.7]
     assert (stored["plan"]["north_deg"], stored["plan"]["anchor"]["longitude"]) == (10.0, 11.57569)
 
@@ -174,7 +167,7 @@ def test_drawn_plan_says_that_its_ceiling_is_assumed(desktop: Visit) -> None:
     page.locator("#save").click()
     expect(page.locator("#toast")).to_contain_text("Types of rooms: Küche: kitchen")
     expect(page.locator("#plan-warnings")).to_contain_text("2.5 m is assumed")
-    assert _stored(desktop, "Drawn")["plan"].get("ceiling_height_m") is None
+    assert desktop.stored("Drawn")["plan"].get("ceiling_height_m") is None
 
 
 def _skewed_scan() -> bytes:
@@ -220,7 +213,7 @@ def test_plan_is_edited_with_the_keyboard_alone(desktop: Visit) -> None:
     page.locator("#save").focus()
     page.keyboard.press("Enter")
     expect(page.locator("#plan-facts")).to_contain_text("revision 2")
-    plan = _stored(desktop, "Typed")["plan"]
+    plan = desktop.stored("Typed")["plan"]
     assert [4.5, 0.05] in plan["rooms"][0]["polygon"]
     assert [opening["kind"] for opening in plan["openings"]] == ["window"]
 
@@ -229,18 +222,18 @@ def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> Non
     page = _editing(desktop, "Contended")
     page.locator("#plan-form-name").fill("Contended, mine")
     page.locator("#plan-form-name").press("Tab")
-    plan_id = _stored(desktop, "Contended")["id"]
+    plan_id = desktop.stored("Contended")["id"]
     desktop.client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "Contended, theirs"}).raise_for_status()
     page.locator("#save").click()
     expect(page.locator("#plan-error")).to_contain_text("Somebody changed this plan")
-    assert _stored(desktop, "Contended")["name"] == "Contended, theirs"
+    assert desktop.stored("Contended")["name"] == "Contended, theirs"
     page.locator("#look-at-theirs").click()
     expect(page.locator("#plan-form-name")).to_have_value("Contended, theirs")
     page.locator("#undo").click()
     expect(page.locator("#plan-form-name")).to_have_value("Contended, mine")
     page.locator("#save").click()
     expect(page.locator("#plan-facts")).to_contain_text("revision 3")
-    assert _stored(desktop, "Contended")["name"] == "Contended, mine"
+    assert desktop.stored("Contended")["name"] == "Contended, mine"
 
 
 @pytest.mark.slow
@@ -256,4 +249,4 @@ def test_leaving_with_changes_asks_first(desktop: Visit) -> None:
     page.locator("#stop").click()
     page.get_by_role("button", name="Discard my changes").click()
     expect(page.locator("#save")).to_have_count(0)
-    assert _stored(desktop, "Left")["revision_number"] == 1
+    assert desktop.stored("Left")["revision_number"] == 1

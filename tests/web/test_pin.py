@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 from lalaloc_core.bundle import default_bundle
 from tests.service.conftest import StartApp, upload
 from tests.strategies import present
-from tests.web.conftest import EXAMPLES, Visit, visit
+from tests.web.conftest import EXAMPLES, Visit, drag, visit
 from tests.web.test_answer import _assert_accessible
 from tests.web.test_on_device import SLOW_MS, recorded
 
@@ -130,20 +130,15 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     heading, reach = math.radians(float(re.findall(r"[\d.]+", before)[0])), 0.8 * circle["width"]
     centre = circle["x"] + circle["width"] / 2, circle["y"] + circle["height"] / 2
     # From the tip to the north.
-    page.mouse.move(centre[0] + reach * math.sin(heading), centre[1] - reach * math.cos(heading))
-    page.mouse.down()
-    page.mouse.move(centre[0], centre[1] - 60, steps=4)
-    page.mouse.up()
+    tip = centre[0] + reach * math.sin(heading), centre[1] - reach * math.cos(heading)
+    drag(page, tip, (centre[0], centre[1] - 60))
     expect(pin).to_have_class(re.compile("corrected"))
     turned = pin.locator(".arrow").get_attribute("transform") or ""
     assert turned != before
     angle = float(re.findall(r"[\d.]+", turned)[0])
     assert min(angle, 360.0 - angle) < 3.0
     place = pin.get_attribute("transform") or ""
-    page.mouse.move(*centre)
-    page.mouse.down()
-    page.mouse.move(centre[0] + 40, centre[1] + 20, steps=4)
-    page.mouse.up()
+    drag(page, centre, (centre[0] + 40, centre[1] + 20))
     expect(pin).not_to_have_attribute("transform", place)
     expect(page.locator("#pin-state")).to_contain_text("(solved)")
     moved = present(pin.locator("circle").bounding_box())
@@ -152,10 +147,7 @@ def test_arrow_is_turned_and_pin_is_dragged(desktop: Visit) -> None:
     # Outside of all rooms the pin goes back. The service rounds places, before or after the page is asked.
     place = re.sub(r"(\.\d)\d*", r"\1", pin.get_attribute("transform") or "")
     decimals = re.escape(place).replace(r"\ ", r"\d* ").replace(r"\)", r"\d*\)")
-    page.mouse.move(centre[0] + 40, centre[1] + 20)
-    page.mouse.down()
-    page.mouse.move(5, 5, steps=4)
-    page.mouse.up()
+    drag(page, (centre[0] + 40, centre[1] + 20), (5, 5))
     expect(page.locator("#pin-error")).to_contain_text("lies in no room")
     expect(pin).to_have_attribute("transform", re.compile(f"^{decimals}$"))
 

@@ -21,7 +21,7 @@ from tests.importers.test_pictures import open_hall
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import EVERYTHING, make_key
 from tests.strategies import present
-from tests.web.conftest import EXAMPLES, Visit, choose_plan, visit
+from tests.web.conftest import EXAMPLES, Visit, choose_plan, drag, visit
 from tests.web.test_answer import _assert_accessible
 
 
@@ -99,16 +99,17 @@ def _scan() -> Image.Image:
     return scan
 
 
+def _on_screen(page: Page, x: float, y: float) -> tuple[float, float]:
+    """Return the place of a pixel of the picture that is measured."""
+    script = """([x, y]) => { const point = new DOMPoint(x, y).matrixTransform(
+        document.querySelector('svg.picture').getScreenCTM()); return [point.x, point.y]; }"""
+    return page.evaluate(script, [x, y])
+
+
 def _drag_end(page: Page, index: int, x: float, y: float) -> None:
     """Move an end of the line that measures a picture to a pixel."""
     end = present(page.locator(".measured circle").nth(index).bounding_box())
-    script = """([x, y]) => { const point = new DOMPoint(x, y).matrixTransform(
-        document.querySelector('svg.picture').getScreenCTM()); return [point.x, point.y]; }"""
-    to_x, to_y = page.evaluate(script, [x, y])
-    page.mouse.move(end["x"] + end["width"] / 2, end["y"] + end["height"] / 2)
-    page.mouse.down()
-    page.mouse.move(to_x, to_y, steps=3)
-    page.mouse.up()
+    drag(page, (end["x"] + end["width"] / 2, end["y"] + end["height"] / 2), _on_screen(page, x, y))
 
 
 @pytest.mark.slow
@@ -139,8 +140,7 @@ def test_imported_picture_is_scaled_and_corrected(desktop: Visit, tmp_path: Path
     doors.check()
     page.get_by_role("button", name="Save as a new revision").click()
     expect(page.locator("#plan-facts")).to_contain_text("revision 2")
-    (listed,) = desktop.client.get("/floorplans", params={"name": "scan"}).json()["floorplans"]
-    plan = desktop.client.get(f"/floorplans/{listed['id']}").json()["plan"]
+    plan = desktop.stored("scan")["plan"]
     assert plan["opening_kinds"] == ["door"]
     assert [opening["kind"] for opening in plan["openings"]] == ["door"]
 
@@ -153,9 +153,7 @@ def test_printed_dimensions_give_the_scale_of_a_picture(desktop: Visit, tmp_path
     page.get_by_role("button", name="Read the picture").click()
     expect(page.locator("#plan-facts")).to_contain_text(re.compile(r"3 rooms, 5[012]\."), timeout=120_000)
     expect(page.locator("#picture-metres-error")).to_be_hidden()
-    (listed,) = desktop.client.get("/floorplans", params={"name": "printed"}).json()["floorplans"]
-    plan = desktop.client.get(f"/floorplans/{listed['id']}").json()["plan"]
-    assert {room["name"] for room in plan["rooms"]} == set(AREAS_M2)
+    assert {room["name"] for room in desktop.stored("printed")["plan"]["rooms"]} == set(AREAS_M2)
 
 
 def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> None:
@@ -450,12 +448,7 @@ def test_part_of_a_picture_is_read_in_a_frame(desktop: Visit, tmp_path: Path) ->
     page.get_by_text("Other ways to state the scale").click()
     page.get_by_label("Metres per pixel").fill("0.01")
     page.get_by_label("Drag a frame around the part to read").check()
-    script = """([x, y]) => { const point = new DOMPoint(x, y).matrixTransform(
-        document.querySelector('svg.picture').getScreenCTM()); return [point.x, point.y]; }"""
-    page.mouse.move(*page.evaluate(script, [60, 60]))
-    page.mouse.down()
-    page.mouse.move(*page.evaluate(script, [840, 640]), steps=3)
-    page.mouse.up()
+    drag(page, _on_screen(page, 60, 60), _on_screen(page, 840, 640))
     expect(page.locator(".measured .frame")).to_have_count(1)
     page.get_by_role("button", name="Read the picture").click()
     expect(page.locator("#plan-facts")).to_contain_text("2 rooms")
