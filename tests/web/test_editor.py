@@ -34,6 +34,11 @@ def _drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> N
     page.mouse.up()
 
 
+def _enter(page: Page, field: str, value: str) -> None:
+    page.locator(field).fill(value)
+    page.locator(field).press("Tab")
+
+
 def _editing(visited: Visit, name: str, **values: Any) -> Page:
     """Store a plan and open the editor on it."""
     upload(visited.client, FLAT | {"name": name} | values)
@@ -53,8 +58,7 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     )
     expect(page.get_by_text("Set the scale next")).to_be_attached()
     # Of two points, which are scaled with the plan, the second lies to the right in it and 4.45 m north on Earth.
-    page.locator("#plan-form-anchor").fill("0, 0, 48.13722, 11.57569; 6 0 48.13726 11.57569")
-    page.locator("#plan-form-anchor").press("Tab")
+    _enter(page, "#plan-form-anchor", "0, 0, 48.13722, 11.57569; 6 0 48.13726 11.57569")
     # 600 pixels are 12 m by default, so the rectangle is 6 m wide; its real width is 4.5 m.
     _click(page, 2, 2)
     _click(page, 8, 2)
@@ -65,8 +69,7 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     for corner in ((1.5, 1.5), (6, 1.5), (6, 4.5), (1.5, 4.5), (1.5, 1.5)):
         _click(page, *corner)
     expect(page.locator("#plan .room")).to_have_count(1)
-    page.locator("#room-form-name").fill("Workshop")
-    page.locator("#room-form-name").press("Tab")
+    _enter(page, "#room-form-name", "Workshop")
     page.locator("#room-form-type").select_option("garage")
     page.locator("#tool-door").click()
     _click(page, 3, 1.5)
@@ -75,8 +78,7 @@ def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     expect(page.locator("#toast")).to_contain_text("door 2 would overlap door 1")
     page.locator("#tool-window").click()
     _click(page, 6, 3)
-    page.locator("#opening-form-sill").fill("1.1")
-    page.locator("#opening-form-sill").press("Tab")
+    _enter(page, "#opening-form-sill", "1.1")
     _assert_accessible(page)
     page.get_by_role("button", name="Store the plan").click()
     expect(page.locator("#plan-facts")).to_contain_text("1 rooms")
@@ -142,8 +144,7 @@ def test_ceiling_of_the_plan_applies_to_all_rooms(desktop: Visit) -> None:
         "1 of 2 rooms have ceilings of their own: kitchen 2.40 m"
     )
     for name, value in (("ceiling", "2.7"), ("north", "10"), ("anchor", "48.13722, 11.57569")):
-        page.locator(f"#plan-form-{name}").fill(value)
-        page.locator(f"#plan-form-{name}").press("Tab")
+        _enter(page, f"#plan-form-{name}", value)
     page.locator("#one-ceiling").click()
     expect(page.locator("#plan-form-own-ceilings")).to_have_count(0)
     page.locator("#save").click()
@@ -158,12 +159,10 @@ def test_drawn_plan_says_that_its_ceiling_is_assumed(desktop: Visit) -> None:
     page = desktop.open()
     page.get_by_role("button", name="Draw", exact=True).click()
     page.locator("#add-room").click()
-    page.locator("#room-form-name").fill("Küche")
-    page.locator("#room-form-name").press("Tab")
+    _enter(page, "#room-form-name", "Küche")
     page.locator("#whole-plan").click()
     expect(page.locator("#plan-form-ceiling")).to_have_value("")
-    page.locator("#plan-form-name").fill("Drawn")
-    page.locator("#plan-form-name").press("Tab")
+    _enter(page, "#plan-form-name", "Drawn")
     page.locator("#save").click()
     expect(page.locator("#toast")).to_contain_text("Types of rooms: Küche: kitchen")
     expect(page.locator("#plan-warnings")).to_contain_text("2.5 m is assumed")
@@ -189,8 +188,7 @@ def test_picture_of_a_plan_lies_below_it_again(desktop: Visit) -> None:
     # The picture was straightened, so it is turned to lie below the rooms.
     picture = page.locator("#plan image")
     expect(picture).to_have_attribute("transform", re.compile(r"rotate\(1\.[45]"))
-    page.locator("#plan-form-name").fill("Straight")
-    page.locator("#plan-form-name").press("Tab")
+    _enter(page, "#plan-form-name", "Straight")
     page.locator("#save").click()
     expect(page.locator("#plan-facts")).to_contain_text("revision 2")
     # The revision of the editor has no picture of its own.
@@ -220,8 +218,7 @@ def test_plan_is_edited_with_the_keyboard_alone(desktop: Visit) -> None:
 
 def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> None:
     page = _editing(desktop, "Contended")
-    page.locator("#plan-form-name").fill("Contended, mine")
-    page.locator("#plan-form-name").press("Tab")
+    _enter(page, "#plan-form-name", "Contended, mine")
     plan_id = desktop.stored("Contended")["id"]
     desktop.client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "Contended, theirs"}).raise_for_status()
     page.locator("#save").click()
@@ -239,8 +236,7 @@ def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> Non
 @pytest.mark.slow
 def test_leaving_with_changes_asks_first(desktop: Visit) -> None:
     page = _editing(desktop, "Left")
-    page.locator("#plan-form-ceiling").fill("-1")
-    page.locator("#plan-form-ceiling").press("Tab")
+    _enter(page, "#plan-form-ceiling", "-1")
     page.locator("#save").click()
     expect(page.locator("#plan-error")).to_contain_text("“Ceiling” is -1")
     page.locator("#stop").click()
