@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -157,17 +158,10 @@ def test_plan_limit_is_per_tenant(store: Store) -> None:
 def test_plan_limit_holds_under_concurrency(open_store: OpenStore, monkeypatch: pytest.MonkeyPatch) -> None:
     # SQLite polls for its lock, so on a busy machine a writer can wait long for its turn.
     monkeypatch.setattr(database, "_SQLITE_WAIT_MS", 120_000)
-    stores = [open_store(), open_store()]
-
-    def add(number: int) -> bool:
-        try:
-            stores[number % 2].plans.add("default", f"p{number}", NewPlan(PLAN, Original(b"{}")), limit=5)
-        except TooManyFloorPlansError:
-            return False
-        return True
-
+    stores, plan = [open_store(), open_store()], NewPlan(PLAN, Original(b"{}"))
     with ThreadPoolExecutor(8) as threads:
-        assert sum(threads.map(add, range(20))) == 5
+        adding = [threads.submit(stores[n % 2].plans.add, "default", f"p{n}", plan, limit=5) for n in range(20)]
+    assert Counter(type(added.exception()) for added in adding) == {type(None): 5, TooManyFloorPlansError: 15}
     assert len(stores[0].plans.list_plans("default", limit=10)) == 5
 
 
@@ -279,18 +273,11 @@ def test_repeated_upload_is_stored_once(store: Store) -> None:
 
 
 def test_one_of_two_concurrent_revisions_is_rejected(open_store: OpenStore) -> None:
-    stores = [open_store(), open_store()]
+    stores, plan = [open_store(), open_store()], NewPlan(PLAN, Original(b"x"))
     old = _add(stores[0], "p")
-
-    def add(store: Store) -> bool:
-        try:
-            store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"x")), keep=5, expected=old)
-        except RevisionMismatchError:
-            return False
-        return True
-
     with ThreadPoolExecutor(2) as threads:
-        assert sorted(threads.map(add, stores)) == [False, True]
+        adding = [threads.submit(one.plans.add_revision, "default", "p", plan, keep=5, expected=old) for one in stores]
+    assert Counter(type(added.exception()) for added in adding) == {type(None): 1, RevisionMismatchError: 1}
 
 
 def test_revisions_and_grids_are_limited(store: Store) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -184,16 +185,9 @@ def test_room_for_the_grid_is_needed_at_the_upload(store: Store) -> None:
 
 def test_concurrent_uploads_do_not_exceed_the_quota(store: Store, url: str) -> None:
     stores = [store, Store(url, stored_bytes=10 * MIB)]
-
-    def add(number: int) -> bool:
-        try:
-            _add(stores[number % 2], "a", f"p{number}", 2 * MIB)
-        except StorageQuotaError:
-            return False
-        return True
-
     with ThreadPoolExecutor(8) as threads:
-        assert sum(threads.map(add, range(16))) == 4
+        adding = [threads.submit(_add, stores[number % 2], "a", f"p{number}", 2 * MIB) for number in range(16)]
+    assert Counter(type(added.exception()) for added in adding) == {type(None): 4, StorageQuotaError: 12}
     assert store.quota.account("a").used.total <= 10 * MIB
     _recounted(store, "a")
     stores[1].close()
