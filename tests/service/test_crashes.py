@@ -52,24 +52,19 @@ def test_photograph_in_work_at_a_kill_did_not_move_the_camera(
         before = service.client.get(f"/sessions/{session_id}").json()
         for decoder in children(service.process.pid):
             os.kill(decoder, signal.SIGSTOP)
-        lost: list[httpx.TransportError] = []
 
-        def send_second() -> None:
+        def send_second() -> httpx.Response:
             with httpx.Client(base_url=service.client.base_url, timeout=120.0) as client:
-                try:
-                    send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
-                except httpx.TransportError as error:
-                    lost.append(error)
+                return send(client, session_id, sphere, number=2, forward_m=0, turn_deg=0)
 
-        sender = threading.Thread(target=send_second)
-        sender.start()
-        # A number out of order claims nothing, and is refused differently while the photograph holds the claim.
-        probe = partial(send, service.client, session_id, sphere, number=9)
-        wait_for(lambda: probe().json()["type"] == "urn:lalaloc:problem:session-busy")
-        service.process.kill()
-        service.process.wait(60.0)
-        sender.join(60.0)
-        assert lost
+        with ThreadPoolExecutor(1) as threads:
+            sending = threads.submit(send_second)
+            # A number out of order claims nothing, and is refused differently while the photograph holds the claim.
+            probe = partial(send, service.client, session_id, sphere, number=9)
+            wait_for(lambda: probe().json()["type"] == "urn:lalaloc:problem:session-busy")
+            service.process.kill()
+            service.process.wait(60.0)
+            assert isinstance(sending.exception(60.0), httpx.TransportError)
     with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
         assert service.client.get(f"/sessions/{session_id}").json() == before
         # The claim of the killed process ends with its lease.

@@ -366,13 +366,11 @@ def test_uploads_do_not_block_queries(start_app: StartApp, tmp_path: Path, spher
 
 def test_deleting_a_plan_ends_waiting_queries(client: httpx.Client, sphere: bytes) -> None:
     plan_id = upload(client, HALL, wait=False)
-    responses: list[httpx.Response] = []
-    waiting = threading.Thread(target=lambda: responses.append(localise(client, plan_id, sphere, refine="none")))
-    waiting.start()
-    wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
-    assert client.delete(f"/floorplans/{plan_id}").status_code == 204
-    waiting.join()
-    assert_problem(responses[0], 404, "unknown-floorplan")
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(localise, client, plan_id, sphere, refine="none")
+        wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
+        assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+    assert_problem(waiting.result(), 404, "unknown-floorplan")
 
 
 def test_event_loop_stays_free_during_queries(client: httpx.Client, flat: str) -> None:
