@@ -11,7 +11,7 @@ from __future__ import annotations
 import ipaddress
 import math
 import time
-from collections.abc import Sequence, Set
+from collections.abc import Set
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -19,14 +19,12 @@ from urllib.parse import urlsplit
 from limits import RateLimitItem, RateLimitItemPerMinute, RateLimitItemPerSecond
 from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
-from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.types import Scope
 
 from lalaloc_core.errors import ConfigError
 from service import errors
-from service.errors import ExposedWithoutKeysError, InvalidRequestError, RateLimitedError, TooManyRefusedKeysError
 from service.security.keys import KeyCache, PresentedKey, parse_authorization, parse_token
 from service.security.permissions import Caller, Identity, Permission, anyone, is_page, network_of, permissions_needed
 from service.settings import Settings
@@ -78,7 +76,7 @@ class AccessControl:
     async def authorise(self, request: Request) -> Caller:
         """Return the caller of a request."""
         if not self._needs_keys:
-            self._check_local(request, request.method)
+            self._check_local(request)
             if Permission.ADMIN in permissions_needed(routed_path(request.scope)).values():
                 # A key that is created while keys are off would outlast this state.
                 raise errors.InsufficientScopeError(Permission.ADMIN, None)
@@ -106,7 +104,7 @@ class AccessControl:
 
     async def still_authorised(self, request: Request) -> bool:
         """Return True while the key or token of an accepted request is valid, or keys are off."""
-        values = Headers(scope=request.scope).getlist("authorization")
+        values = request.headers.getlist("authorization")
         presented, token = parse_authorization(values), parse_token(values)
         if not self._needs_keys or (presented is None and token is None):
             return not self._needs_keys
@@ -117,18 +115,17 @@ class AccessControl:
         except (errors.StoreUnavailableError, errors.IssuerUnavailableError, errors.UnauthenticatedError):
             return False
 
-    def _check_local(self, request: Request, method: str) -> None:
+    def _check_local(self, request: Request) -> None:
         """Refuse requests from other machines and from pages of other sites."""
         server = request.scope.get("server")
         if not self._allow_anonymous and not is_local(server):
             raise errors.ExposedWithoutKeysError("over a loopback address", "" if server is None else str(server[0]))
         # Only proxies use Unix sockets, and they pass on the host name that their clients use.
         if server is not None and server[1] is not None:
-            headers = Headers(scope=request.scope)
-            check_origin(method, headers.getlist("host"), headers.getlist("origin"), self._hosts, self._pages)
+            _check_origin(request, self._hosts, self._pages)
 
     async def _identity_of(self, request: Request) -> Identity:
-        values = Headers(scope=request.scope).getlist("authorization")
+        values = request.headers.getlist("authorization")
         if not values:
             raise errors.UnauthenticatedError(_NO_KEY + self._or_token)
         client = _client_of(request)
@@ -211,7 +208,7 @@ class RateLimits:
             return
         if photographs > limit.amount:
             fault = f"is given {photographs} times; the rate limit is {limit.amount} per minute: send fewer"
-            raise InvalidRequestError([("photo", fault)])
+            raise errors.InvalidRequestError([("photo", fault)])
         await self._count(limit, caller.id, "minute", cost=photographs - 1)
 
     async def charge(self, caller: Identity, sent_bytes: int) -> None:
@@ -225,7 +222,7 @@ class RateLimits:
         """Count an invalid key of a client address."""
         if not await self._limiter.hit(self._refused, _counter_of(client)):
             retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
-            raise TooManyRefusedKeysError(self._refused.amount, retry_after_s=retry_after_s)
+            raise errors.TooManyRefusedKeysError(self._refused.amount, retry_after_s=retry_after_s)
 
     def _limit_of(self, caller: Identity) -> RateLimitItem | None:
         per_minute = self._per_minute if caller.rate_per_minute is None else caller.rate_per_minute
@@ -233,7 +230,7 @@ class RateLimits:
 
     async def _count(self, limit: RateLimitItem, key_id: str, period: str, cost: int = 1) -> None:
         if not await self._limiter.hit(limit, key_id, cost=cost):
-            raise RateLimitedError(limit.amount, period, retry_after_s=await self._retry_after_s(limit, key_id))
+            raise errors.RateLimitedError(limit.amount, period, retry_after_s=await self._retry_after_s(limit, key_id))
 
     async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
         """Return the whole seconds until the count drops."""
@@ -274,25 +271,19 @@ def is_allowed_host(authority: str, allowed: Set[str] = frozenset()) -> bool:
     return host == "localhost" or is_local((host, 0)) or host in allowed or "*" in allowed
 
 
-def check_origin(
-    method: str,
-    hosts: Sequence[str],
-    origins: Sequence[str],
-    allowed: Set[str] = frozenset(),
-    pages: Set[str] = frozenset(),
-) -> None:
+def _check_origin(request: Request, allowed: Set[str], pages: Set[str]) -> None:
     """Refuse requests that a page of another site makes a browser send.
 
     Hosts are `allowed` besides those of this machine (`*`: any), and origins if they are of the `pages`. Browsers send
     `Host` always, and `Origin` with changes.
     """
-    for host in hosts:
+    for host in request.headers.getlist("host"):
         if not is_allowed_host(host, allowed):
-            raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)", host)
-    foreign = [origin for origin in origins if origin.lower() not in pages]
-    for origin in foreign if method in _CHANGING else ():
+            raise errors.ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)", host)
+    foreign = [origin for origin in request.headers.getlist("origin") if origin.lower() not in pages]
+    for origin in foreign if request.method in _CHANGING else ():
         if not is_allowed_host(origin.partition("://")[2], allowed):
-            raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)", origin)
+            raise errors.ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)", origin)
 
 
 def check_address(host: str, settings: Settings) -> None:
