@@ -299,10 +299,15 @@ def test_revisions_and_grids_are_limited(store: Store) -> None:
 ANSWER = StoredAnswer(200, {"etag": '"x"'}, b'{"id": "x"}')
 
 
+def _claimed(keys: IdempotencyKeys, tenant: str, route: str, key: str) -> Claimed:
+    claim = keys.begin(tenant, route, key, "body")
+    assert isinstance(claim, Claimed)
+    return claim
+
+
 def test_idempotent_request_is_carried_out_once(open_store: OpenStore) -> None:
     first, second = open_store(), open_store()
-    claim = first.idempotency_keys.begin("t", "POST /floorplans", "k", "body")
-    assert isinstance(claim, Claimed)
+    claim = _claimed(first.idempotency_keys, "t", "POST /floorplans", "k")
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "body") == InProgress()
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "another") == Conflict()
     first.idempotency_keys.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
@@ -313,8 +318,7 @@ def test_idempotent_request_is_carried_out_once(open_store: OpenStore) -> None:
 
 
 def test_abandoned_request_can_be_claimed_again(store: Store) -> None:
-    claim = store.idempotency_keys.begin("t", "r", "k", "body")
-    assert isinstance(claim, Claimed)
+    claim = _claimed(store.idempotency_keys, "t", "r", "k")
     store.idempotency_keys.abandon("t", "r", "k", "not the token")
     assert store.idempotency_keys.begin("t", "r", "k", "body") == InProgress()
     store.idempotency_keys.abandon("t", "r", "k", claim.token)
@@ -329,8 +333,7 @@ def test_abandoned_request_can_be_claimed_again(store: Store) -> None:
 
 def test_expired_claim_is_taken_over_with_its_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
-    dead = IdempotencyKeys(stores[0].database, stores[0].quota, lease_s=0.2).begin("t", "r", "k", "body")
-    assert isinstance(dead, Claimed)
+    dead = _claimed(IdempotencyKeys(stores[0].database, stores[0].quota, lease_s=0.2), "t", "r", "k")
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
         claims = list(threads.map(lambda n: stores[n % 2].idempotency_keys.begin("t", "r", "k", "body"), range(4)))
@@ -343,8 +346,7 @@ def test_expired_claim_is_taken_over_with_its_token(open_store: OpenStore) -> No
 
 def test_idempotency_keys_expire_after_a_day(store: Store) -> None:
     for key in ("old", "new"):
-        claim = store.idempotency_keys.begin("t", "r", key, "body")
-        assert isinstance(claim, Claimed)
+        claim = _claimed(store.idempotency_keys, "t", "r", key)
         store.idempotency_keys.finish("t", "r", key, claim.token, ANSWER)
     with store.database.writing() as connection:
         yesterday = datetime.now(UTC) - KEPT_FOR - timedelta(minutes=1)
@@ -358,8 +360,7 @@ def test_idempotency_keys_expire_after_a_day(store: Store) -> None:
 
 
 def test_claim_of_a_fast_clock_is_expired(store: Store) -> None:
-    claim = store.idempotency_keys.begin("t", "r", "k", "body")
-    assert isinstance(claim, Claimed)
+    claim = _claimed(store.idempotency_keys, "t", "r", "k")
     assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
     with store.database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).values(lease_until_s=IDEMPOTENCY.c.lease_until_s + 48 * 3600.0))

@@ -33,7 +33,7 @@ from service.storage.records import (
 from service.storage.store import Store
 from service.storage.tables import AUDIT_LOG, IDEMPOTENCY, METADATA, TENANTS
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
-from tests.service.test_store import _grid
+from tests.service.test_store import _claimed, _grid
 
 PLAN = FloorPlan.from_dict(FLAT)
 MIB = 2**20
@@ -52,8 +52,7 @@ def _add(store: Store, tenant: str, plan_id: str, size: int = MIB, **options: ob
 
 
 def _keep_answer(store: Store, tenant: str, key: str, size: int) -> Claimed:
-    claim = store.idempotency_keys.begin(tenant, "POST /x", key, "body")
-    assert isinstance(claim, Claimed)
+    claim = _claimed(store.idempotency_keys, tenant, "POST /x", key)
     store.idempotency_keys.finish(tenant, "POST /x", key, claim.token, StoredAnswer(200, {}, bytes(size)))
     return claim
 
@@ -199,24 +198,20 @@ def test_oldest_idempotent_answers_are_deleted_first(store: Store) -> None:
         _keep_answer(store, "a", str(number), 10_000)
         assert store.quota.account("a").used.idempotency <= MIB
     assert store.idempotency_keys.begin("a", "POST /x", "149", "body") == StoredAnswer(200, {}, bytes(10_000))
-    again = store.idempotency_keys.begin("a", "POST /x", "0", "body")
-    assert isinstance(again, Claimed)
-    assert again != first
+    assert _claimed(store.idempotency_keys, "a", "POST /x", "0") != first
     _recounted(store, "a")
 
 
 def test_idempotent_answer_beyond_the_quota_is_not_kept(store: Store) -> None:
     _add(store, "a", "p", 10 * MIB - 10_000)
-    claim = store.idempotency_keys.begin("a", "POST /x", "k", "body")
-    assert isinstance(claim, Claimed)
+    claim = _claimed(store.idempotency_keys, "a", "POST /x", "k")
     with pytest.raises(StorageQuotaError):
         store.idempotency_keys.finish("a", "POST /x", "k", claim.token, StoredAnswer(200, {}, bytes(20_000)))
     store.idempotency_keys.abandon("a", "POST /x", "k", claim.token)
     # The next attempt works under the same token, so nothing is stored twice.
     assert store.idempotency_keys.begin("a", "POST /x", "k", "body") == claim
     for number in range(100):
-        unfinished = store.idempotency_keys.begin("a", "POST /x", f"k{number}", "body")
-        assert isinstance(unfinished, Claimed)
+        unfinished = _claimed(store.idempotency_keys, "a", "POST /x", f"k{number}")
         store.idempotency_keys.abandon("a", "POST /x", f"k{number}", unfinished.token)
     with store.database.reading() as connection:
         assert (connection.scalar(select(func.count()).select_from(IDEMPOTENCY)) or 0) < 30
