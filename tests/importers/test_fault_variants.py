@@ -67,8 +67,7 @@ def test_layers_named_by_use_are_rooms_in_other_languages(layers: tuple[str, ...
 def test_outlines_of_separate_lines_on_a_layer_of_rooms_are_rooms():
     document: Any = new_dxf("R2010", units=6)
     for x in (0.0, 4.2):
-        ring = [(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0), (x, 0.0)]
-        for start, end in pairwise(ring):
+        for start, end in pairwise([(x, 0.0), (x + 4.0, 0.0), (x + 4.0, 3.0), (x, 3.0), (x, 0.0)]):
             document.modelspace().add_line(start, end, dxfattribs={"layer": "Rooms"})
     assert _areas(import_plan(dxf_file(document))) == [12.0, 12.0]
 

@@ -168,8 +168,7 @@ def test_expired_key_on_the_command_line(store: Store, capsys: pytest.CaptureFix
 
 def test_limits_of_tenants_are_set(admin: httpx.Client) -> None:
     upload(admin)
-    changed = admin.patch("/admin/tenants/acme", json={"stored_bytes": 1000, "cpu_share": 0.5})
-    assert changed.json() == {
+    assert admin.patch("/admin/tenants/acme", json={"stored_bytes": 1000, "cpu_share": 0.5}).json() == {
         "tenant": "acme", "used_bytes": 0, "stored_bytes": 1000, "bytes_in_flight": None, "cpu_share": 0.5
     }  # fmt: skip
     reset = admin.patch("/admin/tenants/acme", json={"cpu_share": None}).json()

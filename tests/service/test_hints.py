@@ -60,8 +60,7 @@ def test_strict_rooms_exclude_others(
 
 def test_strict_point_bounds_all_candidates(client: httpx.Client, plan_id: str, sphere: bytes) -> None:
     fields = {"near": json.dumps({"x_m": 6.0, "y_m": 1.0}), "radius_m": 1.2}
-    answer = localise(client, plan_id, sphere, strict="true", **fields).json()
-    for candidate in answer["candidates"]:
+    for candidate in localise(client, plan_id, sphere, strict="true", **fields).json()["candidates"]:
         assert np.hypot(candidate["position"]["x_m"] - 6.0, candidate["position"]["y_m"] - 1.0) <= 1.2 + 1e-3
 
 
@@ -120,8 +119,7 @@ def test_contradicted_hints_are_warned_about() -> None:
         id="p", revision_id="r", revision=1, created_at=now, updated_at=now, tenant="t", plan=plan, failure=None
     )
     grid = PoseGrid(PoseSet(np.zeros((1, 2)), np.zeros(1, int)), None, np.ones((1, 8)), 1.0, 1.5)
-    ground = Ground.of_plan(record, grid, hints)
-    assert ground.hint_warnings(found) == [
+    assert Ground.of_plan(record, grid, hints).hint_warnings(found) == [
         "near is within 3 m of (6, 4.5), which the photograph contradicts: the answer is 5.0 m from there",
         "rooms is 'bedroom', 'bedroom-2', which the photograph contradicts: the answer lies in room 'hall'",
     ]

@@ -32,8 +32,7 @@ _LONG_S = 120.0
 
 @contextmanager
 def _pool(bundle: Bundle, *, by_latents: bool = True, **overrides: Any) -> Iterator[LpoPool]:
-    changed = {name: overrides.pop(name) for name in CONSTANTS if name in overrides}
-    with constants(changed):
+    with constants({name: overrides.pop(name) for name in CONSTANTS if name in overrides}):
         pool = LpoPool(bundle, Settings(**overrides), Telemetry(), FairSemaphore(100, CpuAccounts()), by_latents)
         pool.start()
         try:

@@ -39,11 +39,10 @@ def test_answers_are_rounded(client: httpx.Client, sphere: bytes) -> None:
 
 @given(st.floats(0.0, 360.0, exclude_max=True), st.floats(-1e4, 1e4))
 def test_rounding_stays_within_the_limits(heading_deg: float, x_m: float) -> None:
-    position = Position(x_m=x_m, y_m=-1e-9)
     made = CandidateAnswer(
         floorplan_id="0" * 32,
         level=None,
-        position=position,
+        position=Position(x_m=x_m, y_m=-1e-9),
         heading_deg=heading_deg,
         room="x",
         room_id="x",

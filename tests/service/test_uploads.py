@@ -182,8 +182,7 @@ def test_one_client_leaves_room_for_others() -> None:
 
 
 def test_announced_body_takes_its_length_before_it_is_read(start_app: StartApp, tmp_path: Path) -> None:
-    limits = {"upload_tenant_bytes": 150_000, "upload_total_bytes": 10**6}
-    with start_app(tmp_path, **limits) as client:
+    with start_app(tmp_path, upload_tenant_bytes=150_000, upload_total_bytes=10**6) as client:
         with open_body(client):
             wait_for(lambda: metric(client, IN_FLIGHT) == 100_000)
             response = client.post("/floorplans", json=FLAT | {"name": "n" * 60_000})
