@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -26,16 +25,21 @@ RNG = np.random.default_rng(49)
 COVARIANCE = ((0.04, 0.01, 0.3), (0.01, 0.09, -0.2), (0.3, -0.2, 9.0))
 
 
-@dataclass(frozen=True)
-class Answer:
-    """Pose of an answer."""
-
-    position: Position
-    heading_deg: float
-
-
-def answer(x: float, y: float, heading_deg: float) -> Answer:
-    return Answer(Position(x, y), heading_deg)
+def tracked(x: float, y: float, heading_deg: float) -> TrackedPose:
+    return TrackedPose(
+        number=1,
+        position=Position(x, y),
+        heading_deg=heading_deg,
+        room="",
+        room_id="",
+        covariance=COVARIANCE,
+        probability=1.0,
+        camera_height_m=1.5,
+        candidates=(),
+        motion_contradicted=(),
+        warnings=(),
+        timings_ms={},
+    )
 
 
 def random_transform() -> FloorTransform:
@@ -63,7 +67,7 @@ def test_transforms_compose_like_matrices() -> None:
 
 def test_base_of_a_robot_is_behind_its_camera() -> None:
     # The camera is 0.3 m ahead of the base and looks to its left; the photograph looks along the plan's +y.
-    base = map_from_base(answer(2.0, 5.0, 0.0), FloorTransform(0.3, 0.0, math.pi / 2))
+    base = map_from_base(tracked(2.0, 5.0, 0.0), FloorTransform(0.3, 0.0, math.pi / 2))
     # So the base looks along +x, 0.3 m behind the camera.
     assert same(base, FloorTransform(1.7, 5.0, 0.0))
 
@@ -72,7 +76,7 @@ def test_map_to_odom_puts_odometry_at_the_answer() -> None:
     for _ in range(20):
         odom_from_base, mount = random_transform(), random_transform()
         x, y = RNG.uniform(0, 9, 2)
-        pose = answer(x, y, float(RNG.uniform(0, 360)))
+        pose = tracked(x, y, float(RNG.uniform(0, 360)))
         correction = map_from_odom(pose, mount, odom_from_base)
         assert same(correction @ odom_from_base @ mount, of_answer(pose))
         # A robot that then drives on by odometry is where it drove to.
@@ -85,9 +89,9 @@ def test_covariance_of_the_base_is_that_of_many_answers() -> None:
     mean = np.array([3.0, 4.0, 70.0])
     small = np.array(COVARIANCE) * 0.01
     drawn = RNG.multivariate_normal(mean, small, 20_000)
-    bases = [map_from_base(answer(*row), mount) for row in drawn]
+    bases = [map_from_base(tracked(*row), mount) for row in drawn]
     found = np.cov([[base.x_m, base.y_m, -math.degrees(base.yaw)] for base in bases], rowvar=False)
-    stated = base_covariance(tuple(map(tuple, small)), answer(*mean), mount)  # pyright: ignore[reportArgumentType]
+    stated = base_covariance(tuple(map(tuple, small)), tracked(*mean), mount)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(stated, found, atol=0.03 * float(small.max()), rtol=0.1)
 
 
@@ -105,23 +109,6 @@ def test_motion_is_that_of_the_camera() -> None:
 def test_poses_that_are_not_on_the_floor_are_refused(quaternion: tuple, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         of_ros(0.0, 0.0, quaternion)
-
-
-def tracked(x: float, y: float, heading_deg: float) -> TrackedPose:
-    return TrackedPose(
-        number=1,
-        position=Position(x, y),
-        heading_deg=heading_deg,
-        room="",
-        room_id="",
-        covariance=COVARIANCE,
-        probability=1.0,
-        camera_height_m=1.5,
-        candidates=(),
-        motion_contradicted=(),
-        warnings=(),
-        timings_ms={},
-    )
 
 
 def device_world(convention: Convention) -> np.ndarray:
