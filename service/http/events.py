@@ -56,6 +56,7 @@ class EventStream(StreamingResponse):
         self._events, self._max_s = events, max_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the stream."""
         try:
             with suppress(TimeoutError):
                 async with asyncio.timeout(self._max_s + _LAST_BYTES_S):

@@ -72,6 +72,7 @@ class PartsResponse(Response):
         self._parts = parts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the answer."""
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
         async for part in _in_order(self._parts):
             for first in range(0, len(part), _PIECE_BYTES):
@@ -105,6 +106,7 @@ class LinesResponse(Response):
         self._lines, self._patience_s = lines, patience_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the answer."""
         gone = asyncio.ensure_future(_disconnect(receive))
         try:
             await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})

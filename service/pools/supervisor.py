@@ -245,6 +245,7 @@ class Watchdog:
     """
 
     def __init__(self, process: BaseProcess, limit_s: float) -> None:
+        """Prepare the timer of a process, in seconds."""
         self.verdict: Literal["stalled", "stopped"] | None = None
         self.cpu_s: float | None = None
         self._process, self._limit_s = process, limit_s
@@ -252,12 +253,14 @@ class Watchdog:
         self._ended = False
 
     def __enter__(self) -> Watchdog:
+        """Start the timer."""
         self._begin = self._progress = monotonic()
         self._used_before = self._used = _cpu_s(self._process)
         self._arm(self._limit_s / _LOOKS)
         return self
 
     def __exit__(self, *_error: object) -> None:
+        """Cancel the timer."""
         with self._lock:
             self._ended = True
             self._timer.cancel()

@@ -50,7 +50,7 @@ class Albums:
             if connection.scalar(select(ALBUMS.c.id).where(own, ALBUMS.c.id == album_id)) is not None:
                 return find_album(connection, tenant, album_id, now)
             freed = delete_albums(connection, own, ALBUMS.c.expires_at < now)
-            values = NO_LEASE | vars(new) | {
+            values = vars(new) | {
                 "id": album_id,
                 "tenant": tenant,
                 "folded_name": new.name.casefold(),
@@ -63,6 +63,7 @@ class Albums:
                 "solved_number": 0,
                 "place_change": 0,
                 "stored_bytes": size,
+                **NO_LEASE,
             }
             connection.execute(ALBUMS.insert().values(values))
             # Counted after it: `settle` locks the tenant, so that the number is exact.

@@ -365,6 +365,7 @@ class CircuitBreaker:
     """Switch that is open for a moment after the database failed; safe to share between threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Create a closed circuit breaker with a clock (s)."""
         self._clock = clock
         self._open_until_s = -float("inf")
 

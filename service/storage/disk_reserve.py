@@ -35,6 +35,7 @@ class DiskReserve:
     """Reserve beside an SQLite file, for all processes that use the file."""
 
     def __init__(self, database: str) -> None:
+        """Name the reserve of a database; `restore` creates it."""
         self._database = Path(database)
         self._folder = self._database.absolute().parent
         self._file = Path(f"{database}-reserve")

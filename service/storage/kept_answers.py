@@ -24,8 +24,7 @@ _BATCH_SIZE = 100
 _KEYS, _ANSWERS = IDEMPOTENCY.c, KEPT_ANSWERS.c
 # Answers about something that was stored, under the request's token, and deleted since: the request is executed again.
 _IS_GONE = and_(
-    _KEYS.status == 201,
-    *(~exists().where(made.c.id == _KEYS.token) for made in (FLOORPLANS, VENUES, SESSIONS, ALBUMS)),
+    _KEYS.status == 201, *(~exists().where(made.c.id == _KEYS.token) for made in (FLOORPLANS, VENUES, SESSIONS, ALBUMS))
 )
 
 

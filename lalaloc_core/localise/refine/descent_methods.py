@@ -24,7 +24,6 @@ from lalaloc_core.localise.refine.refinement_problem import (
     diagonal,
 )
 
-
 # Refined poses and their evaluation; None if they are not wanted any more.
 _Descent = tuple[Float[Array, "k p"], Evaluation] | None
 

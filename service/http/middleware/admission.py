@@ -43,6 +43,7 @@ class AdmissionMiddleware:
         self._declared = [(route, declared) for route, declared in classes if declared is not None]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
         # An app without its lifespan has no slots.
         admission: Admission | None = getattr(scope["app"].state, "admission", None)
         if scope["type"] != "http" or admission is None:

@@ -20,6 +20,7 @@ class AuthorisationMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
         # An app without its lifespan has no access control.
         access: AccessControl | None = getattr(scope["app"].state, "access_control", None)
         if scope["type"] != "http" or access is None or routed_path(scope) in OPEN_PATHS:

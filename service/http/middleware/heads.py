@@ -22,6 +22,7 @@ class FramingMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
         both = {b"content-length", b"transfer-encoding"}
         if scope["type"] != "http" or not both <= {name for name, _ in scope["headers"]}:
             await self._app(scope, receive, send)
@@ -40,6 +41,7 @@ class HeadMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
         if scope["type"] != "http" or scope["method"] != "HEAD":
             await self._app(scope, receive, send)
             return
@@ -81,6 +83,7 @@ class CorsMiddleware:
         self._cors: tuple[frozenset[str], CORSMiddleware] | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
         origins: frozenset[str] = getattr(scope["app"].state, "cors_origins", frozenset())
         if scope["type"] != "http" or not origins:
             await self._app(scope, receive, send)
@@ -119,6 +122,8 @@ class SecurityHeadersMiddleware:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
