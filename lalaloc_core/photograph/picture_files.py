@@ -149,7 +149,8 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
         kind=image.format,
         size=size,
         exif=exif,
-        packets=packets or [packet for packet in [image.info.get("xmp")] if packet],
+        # A PNG can have a text of this name.
+        packets=packets or [packet for packet in [image.info.get("xmp")] if packet and isinstance(packet, bytes)],
         is_upright=was_turned,
         is_cut=is_cut,
         warnings=[text for text, applies in faults.items() if applies],

@@ -291,6 +291,11 @@ class TestMetadata:
     def test_properties_of_malformed_packets_are_read(self, packet: bytes) -> None:
         assert read_photo_sphere([packet], width=1024, height=512).pitch == pytest.approx(math.radians(45.0))
 
+    def test_text_that_is_named_xmp_is_no_packet(self) -> None:
+        info = PngInfo()
+        info.add_text("xmp", xmp(PosePitchDegrees=45).decode())
+        np.testing.assert_array_equal(opened(picture_file(FULL, pnginfo=info)), opened(encoded(FULL)))
+
     def test_first_packet_with_a_property_counts(self) -> None:
         packets = [xmp(PosePitchDegrees=10), xmp(), xmp(PosePitchDegrees=20, PoseRollDegrees=5)]
         found = read_photo_sphere(packets, width=1024, height=512)
