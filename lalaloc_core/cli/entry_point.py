@@ -74,9 +74,12 @@ def main(argv: list[str] | None = None) -> int:
 def _check_written(values: Mapping[str, object]) -> None:
     """Refuse to write over a file that is read."""
     given = [(name, path) for name, value in values.items() for path in (value if isinstance(value, list) else [value])]
-    paths = [(name in _WRITTEN, path) for name, path in given if isinstance(path, Path) and os.path.isfile(path)]
-    for out in (path for is_written, path in paths if is_written):
-        if any(not is_written and out.samefile(path) for is_written, path in paths):
+    paths = [(name, path) for name, path in given if isinstance(path, Path) and os.path.exists(path)]
+    read = [path for name, path in paths if name not in (*_WRITTEN, "bundle")]
+    for out in (path for name, path in paths if name in _WRITTEN and os.path.isfile(path)):
+        # Of a folder, the pictures are read.
+        folder = out.parent if out.suffix.lower() == ".png" else out
+        if any(path.samefile(out) or path.samefile(folder) for path in read):
             raise InvalidInputError(f"'{out}' is read and never changed; write another file")
 
 

@@ -44,6 +44,9 @@ def test_warning_names_the_photographs_of_a_turn_once(tmp_path: Path, capsys: py
         (tmp_path / f"{index}.jpg").write_bytes(jpeg(frame))
     assert main(["localise", PLAN, "--turn", str(tmp_path)]) == 0
     assert f"warning: {tmp_path / '0.jpg'} and 1 more: the field of view of" in capsys.readouterr().err
+    (tmp_path / "8.png").touch()
+    assert main(["localise", PLAN, "--turn", str(tmp_path), "--out", f"{tmp_path}/8.png"]) == 2
+    assert "8.png' is read and never changed" in capsys.readouterr().err
 
 
 @pytest.mark.slow
