@@ -73,8 +73,8 @@ class _Taken(NamedTuple):
 def calibrate_turns(folder: Path, settings: CalibrationConfig) -> Bundle:
     """Fit the confidence of turns, and store it in the bundle's manifest with its validation figures.
 
-    Turns are localised in their own plans, disturbed, and in plans of other buildings. Of the settings, those of the
-    homes count.
+    Turns are localised in their own plans, disturbed, and in plans of other buildings. `homes`, `seed` and `textures`
+    are the settings that count.
     """
     bundle = Bundle.open(folder)
     manifest, view = bundle.manifest, bundle.manifest.view
