@@ -65,6 +65,11 @@ class BoundedCache(Generic[K, V]):
         with self._lock:
             return self._values.get(key)
 
+    def pop(self, key: K) -> V | None:
+        """Remove a value and return it."""
+        with self._lock:
+            return self._values.pop(key, None)
+
     def put(self, key: K, value: V) -> int:
         """Store a value, unless it is larger than the whole cache; return the number of evictions."""
         with self._lock:

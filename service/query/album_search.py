@@ -109,7 +109,7 @@ class AlbumSearch:
                 stated.append(entry)
             else:
                 stated.append(replace(entry, correction=correction))
-        memory = self._take(query.album_id)
+        memory = self._memories.pop(query.album_id) or AlbumMemory()
         hold = partial(self._cores.hold, query.context.client)
 
         def progress(done: int) -> None:
@@ -133,11 +133,6 @@ class AlbumSearch:
         return compose_outcome(
             album, ground, before, dropped, places.plan.camera_height_m, is_same_place=query.is_same_place
         )
-
-    def _take(self, album_id: str) -> AlbumMemory:
-        memory = self._memories.get(album_id) or AlbumMemory()
-        self._memories.drop(lambda key, _: key == album_id)
-        return memory
 
     def close(self) -> None:
         """Wait for the solves in progress."""
