@@ -156,8 +156,10 @@ class QueryComponents:
             ),
             executor=executor,
         )
-        albums = Threads("albums", AT_A_TIME, self.telemetry.cpu_accounts)
-        return LocalLocaliser(parts, queries, albums, self.cores)
+        accounts = self.telemetry.cpu_accounts
+        # Albums take turns on half the cores, which leaves the others to queries.
+        turns = FairSemaphore(max(usable_cores() // 2, 1), accounts)
+        return LocalLocaliser(parts, queries, Threads("albums", AT_A_TIME, accounts), [turns, self.cores])
 
     def build_venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""

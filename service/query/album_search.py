@@ -44,9 +44,12 @@ class _Stopped(Exception):
 
 
 class AlbumSearch:
-    """Solver of albums, on threads of its own: a solve can take longer than queries may wait."""
+    """Solver of albums, on threads of its own: a solve can take longer than queries may wait.
 
-    def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, cores: FairSemaphore) -> None:
+    A solve holds a permit of each of the `cores` while it computes, and passes them on after each photograph.
+    """
+
+    def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, cores: Sequence[FairSemaphore]) -> None:
         self._parts, self._queries, self._threads, self._cores = parts, queries, threads, cores
         # Found by an earlier solve of the same album; a solve takes it out, as two must not share it.
         self._memories = BoundedCache[str, AlbumMemory](_MEMORY_BYTES, _size_of)
@@ -110,21 +113,25 @@ class AlbumSearch:
             else:
                 stated.append(replace(entry, correction=correction))
         memory = self._memories.pop(query.album_id) or AlbumMemory()
-        hold = partial(self._cores.hold, query.context.client)
+
+        def hold() -> None:
+            for semaphore in self._cores:
+                held.enter_context(semaphore.hold(query.context.client))
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
 
         def pause() -> None:
-            if query.progress.stopped:
-                raise _Stopped
             # Others that wait for the core compute in between.
             held.close()
-            held.enter_context(hold())
+            hold()
+            # Looked at last: of several solves that stop and wait for each other, none computes any more.
+            if query.progress.stopped:
+                raise _Stopped
 
         try:
             with ExitStack() as held:
-                held.enter_context(hold())
+                hold()
                 album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
         finally:
             # The next attempt goes on from here.
