@@ -1,8 +1,9 @@
 """`Idempotency-Key`: a request that is sent twice is executed once, and both attempts get the same answer.
 
-Answers and permanent errors are kept for a day. After an error that may be temporary, the next attempt executes the
-request again under the same token. While an attempt is running, others are refused. If its process dies, the next
-attempt takes over under the same token once the lease has expired.
+Answers and permanent errors are kept for a day, an answer about something that was stored until that is deleted. After
+an error that may be temporary, the next attempt executes the request again under the same token. While an attempt is
+running, others are refused. If its process dies, the next attempt takes over under the same token once the lease has
+expired.
 """
 
 from __future__ import annotations
