@@ -198,7 +198,7 @@ class Originals:
 
 
 class PlanCache:
-    """Plans by tenant and id, of about `limit_bytes`; safe to share between threads."""
+    """Plans by tenant and id, of about `limit_bytes` (0: none); safe to share between threads."""
 
     def __init__(self, limit_bytes: int) -> None:
         self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
