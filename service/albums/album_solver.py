@@ -199,7 +199,9 @@ class AlbumSolver:
                 # During an outage no other replica can take the lease either.
                 with suppress(errors.StoreUnavailableError):
                     share = min(max(progress.share, 0.0), 1.0)
-                    if not await self._reads.run(album.tenant, renew, album.id, self._owner, lease_s, share):
+                    # The thread that solves goes on adding to it.
+                    found = dict(progress.found.popitem() for _ in range(len(progress.found)))
+                    if not await self._reads.run(album.tenant, renew, album.id, self._owner, lease_s, share, found):
                         progress.stopped = True
             except Exception:
                 # The next renewal may succeed, and nobody sees the end of this task.

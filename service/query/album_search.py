@@ -112,7 +112,8 @@ class AlbumSearch:
                 stated.append(entry)
             else:
                 stated.append(replace(entry, correction=correction))
-        memory = self._memories.pop(query.album_id) or AlbumMemory()
+        stored = {part.id: part.evidence for part in query.photographs if part.evidence is not None}
+        memory = self._memories.pop(query.album_id) or AlbumMemory(stored=stored)
 
         def hold() -> None:
             for semaphore in self._cores:
@@ -120,6 +121,8 @@ class AlbumSearch:
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
+            newest = next(reversed(memory.evidence))
+            query.progress.found[newest] = memory.to_bytes(newest)
 
         def pause() -> None:
             # Others that wait for the core compute in between.

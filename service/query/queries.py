@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from lalaloc_core.draw.answer import Picture
@@ -122,9 +122,13 @@ class AlbumPhotographQuery(AnyQuery[AlbumEntry]):
 
 @dataclass(eq=False)
 class AlbumProgress:
-    """Progress of a solve, 0 to 1, which the caller can stop; between processes it is not shared."""
+    """Progress of a solve, 0 to 1, which the caller can stop; between processes it is not shared.
+
+    `found` has the evidence of photographs that were compared since the caller took it out, by id.
+    """
 
     share: float = 0.0
+    found: dict[str, bytes] = field(default_factory=dict)
     stopped: bool = False
 
 

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from sqlalchemy import bindparam, func, select, update
+from sqlalchemy import Connection, bindparam, func, select, update
 
 from service.storage.album_rows import NO_LEASE, AlbumRecord, is_due, select_albums
 from service.storage.database import Database
@@ -24,12 +24,14 @@ class AlbumPart:
     Attributes:
         entry: its features.
         correction, pin: as JSON; None without.
+        evidence: what an attempt that did not end found about it; None without.
     """
 
     id: str
     entry: bytes
     correction: str | None
     pin: str | None
+    evidence: bytes | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,12 +93,19 @@ class AlbumJobs:
             photographs = [AlbumPart(**row._mapping) for row in rows]
         return AlbumJob(album=album, photographs=photographs, place_change=changes or 0, attempts=attempts)
 
-    def renew(self, album_id: str, owner: str, lease_s: float, progress: float) -> bool:
-        """Renew a lease and store the progress; False if the owner lost it, or the album was deleted."""
+    def renew(self, album_id: str, owner: str, lease_s: float, progress: float, found: Mapping[str, bytes]) -> bool:
+        """Renew a lease and store the progress and the evidence of photographs that was found since, by id.
+
+        Returns:
+            False if the owner lost the lease, or the album was deleted.
+        """
         values = {"lease_until_s": self._database.now_s() + lease_s, "lease_s": lease_s, "progress": progress}
         own = ALBUMS.c.id == album_id, ALBUMS.c.owner == owner
-        with self._database.writing() as connection:
-            return connection.execute(update(ALBUMS).where(*own).values(**values)).rowcount == 1
+        with self._database.writing(grows_by=sum(map(len, found.values()))) as connection:
+            if connection.execute(update(ALBUMS).where(*own).values(**values)).rowcount != 1:
+                return False
+            _fill(connection, "evidence", found)
+        return True
 
     def release(self, album_id: str, owner: str, *, failed: bool = False) -> None:
         """Release a lease without a solution; the attempt does not count unless it `failed`."""
@@ -133,11 +142,19 @@ class AlbumJobs:
         if solution is not None:
             values["solution"] = solution
         own = ALBUMS.c.id == job.album.id, ALBUMS.c.owner == owner
-        pinned = update(ALBUM_PHOTOGRAPHS).where(ALBUM_PHOTOGRAPHS.c.id == bindparam("photograph_id"))
+        parts = ALBUM_PHOTOGRAPHS.c
+        found = parts.album_id == job.album.id, parts.evidence.is_not(None)
         with self._database.writing(grows_by=sum(map(len, pins.values()))) as connection:
             if connection.execute(update(ALBUMS).where(*own).values(**values)).rowcount != 1:
                 return False
-            if pins:
-                rows = [{"photograph_id": key, "new_pin": pin} for key, pin in pins.items()]
-                connection.execute(pinned.values(pin=bindparam("new_pin")), rows)
+            _fill(connection, "pin", pins)
+            connection.execute(update(ALBUM_PHOTOGRAPHS).where(*found).values(evidence=None))
         return True
+
+
+def _fill(connection: Connection, column: str, values: Mapping[str, str] | Mapping[str, bytes]) -> None:
+    """Set a column of photographs, by id, of which some may be deleted."""
+    if values:
+        one = update(ALBUM_PHOTOGRAPHS).where(ALBUM_PHOTOGRAPHS.c.id == bindparam("photograph_id"))
+        rows = [{"photograph_id": key, "value": value} for key, value in values.items()]
+        connection.execute(one.values({column: bindparam("value")}), rows)

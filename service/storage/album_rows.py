@@ -18,7 +18,8 @@ AlbumState = Literal["empty", "solving", "solved", "failed", "outdated"]
 # solution, whatever their size: a solve changes nothing that counts.
 _PIN_BYTES, _SOLUTION_BYTES = 4096, 2048
 # Columns of `PhotographRecord`.
-_LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in ("album_id", "entry", "stored_bytes")]
+_UNLISTED = ("album_id", "entry", "evidence", "stored_bytes")
+_LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in _UNLISTED]
 # Values of an album whose lease nobody holds.
 NO_LEASE: dict[str, Any] = {"owner": "", "lease_until_s": 0.0, "progress": 0.0, "attempts": 0}
 

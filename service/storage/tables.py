@@ -349,6 +349,8 @@ ALBUM_PHOTOGRAPHS = Table(
     Column("entry", LargeBinary, nullable=False),
     Column("correction", Text),
     Column("pin", Text),
+    # What an attempt to solve the album found about it, until one ends.
+    Column("evidence", LargeBinary),
     _stored_bytes(),
     UniqueConstraint("album_id", "sha256", name="photographs_of_album"),
     Index("album_photographs_by_number", "album_id", "number"),

@@ -127,6 +127,11 @@ def test_memory_gives_the_same_pins(ground: AlbumGround, photographs: list[Album
     again = solve_album(ground, encoder(), photographs, memory=memory, progress=seen.append)
     assert seen == []
     assert again.pins == album.pins
+    # What is stored is not found again, but for what is damaged.
+    stored = {each.id: memory.to_bytes(each.id) for each in photographs} | {photographs[0].id: b"damaged"}
+    again = solve_album(ground, encoder(), photographs, memory=AlbumMemory(stored=stored), progress=seen.append)
+    assert seen == [len(photographs)]
+    assert again.pins == album.pins
 
 
 @pytest.mark.slow

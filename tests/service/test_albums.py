@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import threading
+import time
 import zipfile
 from contextlib import nullcontext
 from functools import partial
@@ -20,10 +21,11 @@ import httpx
 import pypdfium2
 import pytest
 from PIL import ExifTags, Image
-from sqlalchemy import update
+from sqlalchemy import func, select, update
 
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.album import solve as album_solve
 from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, Suggestion
 from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
@@ -37,7 +39,7 @@ from service.schemas.albums import PinAnswer
 from service.storage.album_rows import NewPhotograph
 from service.storage.store import Store
 from service.storage.stored_bytes import ROW_BYTES
-from service.storage.tables import ALBUMS
+from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS
 from service.telemetry import LOGGER_NAME
 from tests.core.taken import EXAMPLES
 from tests.painted import picture_file
@@ -622,6 +624,38 @@ def test_solve_holds_up_no_other_tenant_and_its_expired_lease_is_taken_over(
         assert not app_store.album_jobs.finish(job, "third", "0" * 32, pins=pins, solution=None)
         app_store.album_jobs.release(album_id, "other")
         wait_until_solved(client, album_id)
+
+
+@pytest.mark.slow
+@pytest.mark.one_replica
+def test_solve_goes_on_after_the_service_was_killed(
+    start_app: StartApp, app_store: Store, tmp_path: Path, pictures: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve = album_search.solve_album
+
+    def stops_after_one(*args: Any, **options: Any) -> Any:
+        def pause() -> None:
+            while True:
+                options["pause"]()
+                time.sleep(0.05)
+
+        return solve(*args, **options | {"pause": pause})
+
+    def stored() -> int:
+        found = ALBUM_PHOTOGRAPHS.c.evidence.is_not(None)
+        return app_store.database.value(select(func.count()).where(found)) or 0
+
+    with monkeypatch.context() as patch, start_app(tmp_path) as client:
+        patch.setattr(album_search, "solve_album", stops_after_one)
+        album_id = create(client, upload(client, HOME))
+        add(client, album_id, pictures[:2])
+        wait_for(lambda: stored() == 1)
+    compared = Mock(wraps=album_solve.single_evidence)
+    monkeypatch.setattr(album_solve, "single_evidence", compared)
+    with start_app(tmp_path) as client:
+        wait_until_solved(client, album_id)
+    assert compared.call_count == 1
+    assert stored() == 0
 
 
 @pytest.mark.slow

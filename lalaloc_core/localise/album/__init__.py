@@ -10,7 +10,7 @@ returns an `Album` of pins (`pins.py`). The contract:
   `read_correction`). They are certain; a pin with one is "corrected".
 * `AlbumMemory` has what is slow and does not depend on corrections: the posterior of each photograph alone, and the
   links between photographs that overlap. Pass the same object again and only new photographs are compared. It belongs
-  to one ground and model; another's is dropped.
+  to one ground and model; another's is dropped. `to_bytes` gives the evidence of a photograph to store (`stored`).
 * Every photograph gets a pin, in the order given. The result does not depend on the order in which photographs were
   added: they are ordered by the time they were taken.
 * `moved_pins` lists what changed between two solves, such as after a new revision of a plan.

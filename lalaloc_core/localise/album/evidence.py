@@ -7,8 +7,10 @@ the scale of the plan are the same for many photographs.
 from __future__ import annotations
 
 import hashlib
+import io
 import math
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,11 +38,12 @@ _OFFSETS = np.linspace(-0.36, 0.36, 9)
 _USUAL_HEIGHT_M, _USUAL_LOG_SD, _USUAL_CEILING_M = 1.5, 0.15, 2.5
 # States that are kept: of every room, at least so many, and of all.
 _PER_ROOM, _MAX_STATES = 96, 8192
-# Every so many of the poses of other homes are compared; poses at a time.
-_EVERY, _PART = 4, 4096
+# Every so many of the poses of other homes are compared; poses at a time; version of stored evidence.
+_EVERY, _PART, _VERSION = 4, 4096, 3
 _CONFIG = MatchingConfig()
 # Arrays of one photograph by name.
 Arrays = dict[str, np.ndarray]
+_DAMAGE = (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile)
 # Standard deviation of the scale of a plan; of the log height from one photograph to the next; and of a median over
 # that of a mean. Errors of fields of view by lines are alike, so the error of many is not less than `_LINES_SD`.
 _SCALE_SD, _HAND_SD, _MEDIAN, _LINES_SD = 0.05, 0.05, 1.25, 0.03
@@ -57,26 +60,48 @@ class AlbumMemory:
     Attributes:
         key: digest of ground and model; empty for a new memory.
         evidence: arrays of each photograph, by id.
+        stored: evidence as `to_bytes` wrote it, by id, which the next solve uses.
         links: matches and turn by pair of ids; None for pairs that do not overlap.
     """
 
     key: str = ""
     evidence: dict[str, Arrays] = field(default_factory=dict)
+    stored: Mapping[str, bytes] = field(default_factory=dict)
     links: dict[tuple[str, str], tuple[int, float] | None] = field(default_factory=dict)
 
     def use(self, ground: AlbumGround, manifest: Manifest) -> None:
         """Drop everything that is of another ground or model."""
         files = sorted(manifest.files.items())
         weights = manifest.evidence_for(view=False), manifest.evidence_for(view=True)
-        key = hashlib.sha256(f"{ground.digest} {files} {weights}".encode()).hexdigest()
+        key = hashlib.sha256(f"{_VERSION} {ground.digest} {files} {weights}".encode()).hexdigest()
         if key != self.key:
             # Links depend on the photographs alone.
             self.key, self.evidence = key, {}
+        read = {id: _read_evidence(content, key) for id, content in self.stored.items()}
+        self.evidence |= {id: arrays for id, arrays in read.items() if arrays}
+        self.stored = {}
 
     def keep(self, ids: set[str]) -> None:
         """Drop what is about photographs that are no longer in the album."""
         self.evidence = {id: arrays for id, arrays in self.evidence.items() if id in ids}
         self.links = {pair: link for pair, link in self.links.items() if ids.issuperset(pair)}
+
+    def to_bytes(self, id: str) -> bytes:
+        """Return the evidence of a photograph as a file: an archive of arrays, as numpy writes them."""
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, key=np.array(self.key), **self.evidence[id])
+        return buffer.getvalue()
+
+
+def _read_evidence(content: bytes, key: str) -> Arrays:
+    """Read evidence that this service stored itself; nothing if it is damaged, or of another ground or model."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            if str(archive["key"]) == key:
+                return {name: archive[name] for name in archive.files if name != "key"}
+    except _DAMAGE:
+        pass
+    return {}
 
 
 @dataclass(frozen=True, eq=False)
