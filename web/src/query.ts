@@ -73,7 +73,11 @@ function answerOf(found: SequenceAnswer, index: number, place: Place): Answer {
     ...common,
     ...pose,
     // Warnings about photographs are also those of their poses.
-    warnings: [...pose.warnings, ...warnings.filter((text) => !text.startsWith("photo[")), ...(found.film?.warnings ?? [])],
+    warnings: [
+      ...pose.warnings,
+      ...warnings.filter((text) => !text.startsWith("photo[")),
+      ...(found.film?.warnings ?? []),
+    ],
     floorplan_revision: pose.floorplan_id === found.floorplan_id ? floorplan_revision : undefined,
     level: pose.level ?? null,
     // A sequence has no probabilities of plans.

@@ -105,7 +105,11 @@ export class Venues {
 
   private draw(): void {
     const entries = this.found.map(({ id, name, plans }) =>
-      h("li", {}, planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id))),
+      h(
+        "li",
+        {},
+        planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id)),
+      ),
     );
     show(this.list, ...entries);
     byId("venues").hidden = this.found.length === 0;
