@@ -133,6 +133,9 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
             return image
         return Image.open(io.BytesIO(readable), formats=_formats(content))
 
+    # A PNG can have a text of this name, which is no packet; Pillow would look for an orientation in it.
+    if isinstance(image.info.get("xmp"), str):
+        del image.info["xmp"]
     packets, unread = xmp_packets(content)
     exif, is_damaged = _exif_of(image)
     was_turned, orientation = _was_turned(exif, size), exif.get(ExifTags.Base.Orientation)
@@ -149,8 +152,7 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
         kind=image.format,
         size=size,
         exif=exif,
-        # A PNG can have a text of this name.
-        packets=packets or [packet for packet in [image.info.get("xmp")] if packet and isinstance(packet, bytes)],
+        packets=packets or [packet for packet in [image.info.get("xmp")] if packet],
         is_upright=was_turned,
         is_cut=is_cut,
         warnings=[text for text, applies in faults.items() if applies],

@@ -138,6 +138,9 @@ def _open(
                         "use a larger picture"
                     )
                 dpi = picture.info.get("dpi")
+                # A PNG can have a text of this name, in which Pillow would look for an orientation.
+                if isinstance(picture.info.get("xmp"), str):
+                    del picture.info["xmp"]
                 upright = ImageOps.exif_transpose(picture)
                 drawn = upright.convert("RGBA")
                 flat = Image.new("RGBA", upright.size, "black" if _is_light(drawn) else "white")
