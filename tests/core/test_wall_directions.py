@@ -136,7 +136,7 @@ def test_features_keep_the_direction() -> None:
     end = content.index(b"}, ", begin) + 3
     earlier = content[:6] + (int.from_bytes(content[6:10], "little") - (end - begin)).to_bytes(4, "little")
     assert read_features(earlier + content[10:begin] + content[end:], bundle()).wall_direction is None
-    wrong = replace(photograph, wall_direction=replace(photograph.wall_direction, value=9.0))
+    wrong = replace(photograph, wall_direction=replace(known, value=9.0))
     with pytest.raises(InvalidFeaturesError, match="wall_direction"):
         read_features(FeatureEncoder(bundle(), threads=1).features(wrong), bundle())
 

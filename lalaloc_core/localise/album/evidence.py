@@ -12,6 +12,7 @@ import math
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -89,7 +90,8 @@ class AlbumMemory:
     def to_bytes(self, id: str) -> bytes:
         """Return the evidence of a photograph as a file: an archive of arrays, as numpy writes them."""
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, key=np.array(self.key), **self.evidence[id])
+        arrays: dict[str, Any] = {"key": np.array(self.key), **self.evidence[id]}
+        np.savez_compressed(buffer, **arrays)
         return buffer.getvalue()
 
 
