@@ -17,7 +17,7 @@ AlbumState = Literal["empty", "solving", "solved", "failed", "outdated"]
 # Bytes that count as stored for a correction and a pin with all its rooms and suggestions, and for the common part of a
 # solution, whatever their size: a solve changes nothing that counts.
 _PIN_BYTES, _SOLUTION_BYTES = 4096, 2048
-# Columns of `PhotographRecord`.
+# Columns of `PhotographRecord`: all but these.
 _UNLISTED = ("album_id", "entry", "evidence", "stored_bytes")
 _LISTED = [column for column in ALBUM_PHOTOGRAPHS.c if column.name not in _UNLISTED]
 # Values of an album whose lease nobody holds.

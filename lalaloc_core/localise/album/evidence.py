@@ -10,6 +10,7 @@ import hashlib
 import io
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -44,7 +45,7 @@ _EVERY, _PART, _VERSION = 4, 4096, 3
 _CONFIG = MatchingConfig()
 # Arrays of one photograph by name.
 Arrays = dict[str, np.ndarray]
-_DAMAGE = (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile)
+_DAMAGE = (ValueError, KeyError, NotImplementedError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 # Standard deviation of the scale of a plan; of the log height from one photograph to the next; and of a median over
 # that of a mean. Errors of fields of view by lines are alike, so the error of many is not less than `_LINES_SD`.
 _SCALE_SD, _HAND_SD, _MEDIAN, _LINES_SD = 0.05, 0.05, 1.25, 0.03
@@ -102,6 +103,7 @@ def _read_evidence(content: bytes, key: str) -> Arrays:
             if str(archive["key"]) == key:
                 return {name: archive[name] for name in archive.files if name != "key"}
     except _DAMAGE:
+        # The photograph is compared again.
         pass
     return {}
 
