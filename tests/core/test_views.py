@@ -13,6 +13,7 @@ import torch
 from lalaloc_core.bundle import Bundle, MatchingWeights
 from lalaloc_core.conventions import ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError
+from lalaloc_core.evaluate.calibrate.calibration import store_matching_weights
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.data.views import Stated, ViewPhotograph, ViewScenes
@@ -185,6 +186,9 @@ class TestTraining:
         bundle.check()
         stored = present(Bundle.open(bundle.folder).manifest.view)
         assert (stored.sectors, stored.image_width) == (4, 64)
+        store_matching_weights(bundle, weights := MatchingWeights(tail=1.5), views=True)
+        again = export_into(bundle.folder, run, tmp_path / "again", version="3")
+        assert present(again.manifest.view).evidence == weights
         image = np.random.default_rng(0).integers(0, 256, (64, 64, 4), dtype=np.uint8)
         image[..., 3] = 255
         encoder = ViewEncoder(bundle)

@@ -123,15 +123,17 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
     with _new_files(bundle.folder) as work:
         _export(work / VIEW_ONNX, _ViewOutputs(encoder), {"image": image, "camera_height_m": heights}, outputs)
     _save_weights(encoder, bundle.folder / VIEW_WEIGHTS, beside=bundle.folder / VIEW_ONNX)
-    view = ViewManifest(
-        config=dataclasses.asdict(config.view),
-        image_height=config.view.image_height,
-        image_width=config.view.image_width,
-        sectors=config.view.sectors,
-        top_deg=config.view.top_deg,
-        opening_prior=losses.opening_prior(encoder.opening_share, config.image.opening_balance).tolist(),
-        room_type_prior=encoder.room_type_share.tolist(),
-    )
+    parts = {
+        "config": dataclasses.asdict(config.view),
+        "image_height": config.view.image_height,
+        "image_width": config.view.image_width,
+        "sectors": config.view.sectors,
+        "top_deg": config.view.top_deg,
+        "opening_prior": losses.opening_prior(encoder.opening_share, config.image.opening_balance).tolist(),
+        "room_type_prior": encoder.room_type_share.tolist(),
+    }
+    before = bundle.manifest.view
+    view = ViewManifest(**parts) if before is None else dataclasses.replace(before, **parts)
     training = {**bundle.manifest.training, "view": training}
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
 
