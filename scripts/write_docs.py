@@ -36,7 +36,7 @@ _OTHER_FOLDERS = {
     "clients/typescript": ("Client for browsers and Node in TypeScript, which the web pages use.", "src/index.ts"),
     "web": ("Web pages in TypeScript; `make web` builds `service/web/` from them.", "src/app.ts"),
     "models/default": ("The shipped model and its card.", "README.md"),
-    "models/training": ("Weights in training, recipes, and a table of runs.", "README.md"),
+    "models/training": ("Recipes of training, and a table of runs.", "README.md"),
     "datasets/heldout": ("Sixty out-of-distribution homes with 240 spheres, for reporting only.", "README.md"),
     "docker": ("Image, compose files, nginx, Kubernetes manifests, Grafana dashboard.", "compose.yaml"),
     "tests": (
