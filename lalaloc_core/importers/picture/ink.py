@@ -18,6 +18,8 @@ FINEST_M, _MOST_PIXELS = 0.01, 12_000_000
 COLOURLESS = 128.0
 # Lighting is evened out over this length.
 _LIGHT_M = 1.2
+# Floors are wider than walls (m), and paler (of 255). Least share of the picture that dark ones have.
+_WIDER_M, _PALER, _LEAST_DARK = 0.6, 45.0, 0.01
 _MAX_SKEW_DEG = 10.0
 _SKEW_PIXELS = 700
 # Shortest side of a part of a picture.
@@ -87,9 +89,8 @@ def read_ink(
         if warmth is not None:
             warmth = cv2.resize(warmth, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
         metres_per_pixel /= factor
-    even = _even_light(gray, metres_per_pixel)
-    threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    threshold = float(np.clip(threshold, *_THRESHOLD))
+    even = _blank_floors(gray, _even_light(gray, metres_per_pixel), metres_per_pixel)
+    threshold = _threshold(even)
     skew_deg = find_skew(even < threshold) if straighten else 0.0
     if skew_deg:
         even = rotate_picture(even, skew_deg)
@@ -204,6 +205,24 @@ def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt
     paper = cv2.resize(paper, gray.shape[::-1], interpolation=cv2.INTER_LINEAR)
     even = 255.0 * gray.astype(np.float32) / np.maximum(paper.astype(np.float32), 60.0)
     return np.clip(even, 0, 255).astype(np.uint8)
+
+
+def _blank_floors(
+    gray: UInt8[np.ndarray, "h w"], even: UInt8[np.ndarray, "h w"], metres_per_pixel: float
+) -> UInt8[np.ndarray, "h w"]:
+    """Return an even picture with white floors: areas of the grey picture wider than walls, and paler than most."""
+    around = np.ones((round(_WIDER_M / metres_per_pixel) | 1,) * 2, np.uint8)
+    paper, threshold = cv2.morphologyEx(gray, cv2.MORPH_CLOSE, around), _threshold(even)
+    ink = gray[(even < threshold) & (paper >= threshold)]
+    is_floor = paper > (float(np.median(ink)) if ink.size else 255.0) + _PALER
+    if (is_floor & (paper < threshold)).mean() < _LEAST_DARK:
+        return even
+    return np.where(is_floor, cv2.divide(gray, paper, scale=255.0), even).astype(np.uint8)
+
+
+def _threshold(even: UInt8[np.ndarray, "h w"]) -> float:
+    threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return float(np.clip(threshold, *_THRESHOLD))
 
 
 def find_skew(ink: Bool[np.ndarray, "h w"], reach_deg: float = _MAX_SKEW_DEG) -> float:
