@@ -210,6 +210,13 @@ def test_window_of_curved_or_broken_or_pale_lines_closes_its_room(lines_of: str)
     assert len(plan["rooms"]) == 2
 
 
+def test_dark_floor_is_a_room():
+    page, pen = two_rooms()
+    pen.rectangle((457, 121, 779, 379), fill=(120, 125, 130))
+    found = shapes(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document)
+    assert sorted(room.area for room in found) == pytest.approx([8.4, 8.4], abs=0.2)
+
+
 def test_walls_that_are_paler_than_coloured_floors_are_walls():
     page, pen = two_rooms()
     pen.rectangle((100, 100, 800, 400), fill=(150, 180, 210))

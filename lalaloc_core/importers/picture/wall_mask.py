@@ -33,8 +33,6 @@ _LONG_M, _WIDEST_WALLS, _LIKE_USUAL, _OBLONG, _PIER = 1.5, 0.9, 0.25, 2.5, 1.5
 _PANE, _THINNEST_PANE, _WIDE_IN_STRIP = 0.15, 0.28, 0.03
 # Width of lines, and reach across them (pixels).
 _PEN_PX, _LINES_PX = 2.0, 11
-# Largest side (m) and smallest area (m²) of a ring of furniture, and the least area inside its outline relative to it.
-_RING_M, _SMALLEST_RING_M2, _HOLLOW = 2.4, 0.03, 1.25
 # Thickest strip of a wall with its lines (m), and share of a white area in such strips. Shortest stroke of a hatch (m),
 # and share of such strokes around a white area of the hatch.
 _THICKEST_M, _IN_WALL, _STROKE_OF_HATCH_M, _HATCHED = 0.46, 0.5, 0.12, 0.62
@@ -89,13 +87,12 @@ def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
 def outlined_walls(ink: Ink) -> WallMask | None:
     """Return walls drawn with two lines: the ink and the narrow white areas between its lines."""
     white = (~ink.mask).astype(np.uint8)
-    count, found, sizes, _ = cv2.connectedComponentsWithStats(white, connectivity=4)
-    labels, stats = np.asarray(found, dtype=np.int32), np.asarray(sizes)
+    count, found = cv2.connectedComponents(white, connectivity=4)
+    labels = np.asarray(found, dtype=np.int32)
     depth = cv2.distanceTransform(white, cv2.DIST_L2, 5)
     half_cavity = 0.5 * _MAX_CAVITY_M / ink.metres_per_pixel
     is_cavity = ~_reaches(labels, depth > half_cavity, count) | _is_narrow(labels, depth, half_cavity, count)
     is_cavity[0] = False
-    is_cavity[_furniture_rings(labels, stats, is_cavity, ink.metres_per_pixel)] = False
     is_cavity &= _is_in_wall(labels, depth, is_cavity, ink)
     return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
 
@@ -111,23 +108,6 @@ def _is_narrow(
     # A wide part covers more pixels than the centres of its discs.
     wide = 3.0 * np.bincount(labels[depth > reach], minlength=count)
     return (wide <= _WIDE_PART * area) & ~_reaches(labels, depth > 1.5 * reach, count)
-
-
-def _furniture_rings(
-    labels: Int[np.ndarray, "h w"], stats: Int[np.ndarray, "n 5"], is_cavity: Bool[np.ndarray, "n"], pixel_m: float
-) -> list[int]:
-    """Return the white areas around another one that is too small for a room with a door: rims of baths, rugs."""
-    found = []
-    long_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * pixel_m
-    for label in np.flatnonzero(is_cavity & (long_m <= _RING_M)):
-        x, y, width, height, area = stats[label].tolist()
-        if area * pixel_m**2 < _SMALLEST_RING_M2:
-            continue
-        part = (labels[y : y + height, x : x + width] == label).astype(np.uint8)
-        contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        if sum(map(cv2.contourArea, contours)) > _HOLLOW * area:
-            found.append(int(label))
-    return found
 
 
 def _is_in_wall(
