@@ -212,7 +212,7 @@ def test_window_of_curved_or_broken_or_pale_lines_closes_its_room(lines_of: str)
 
 def test_dark_floor_is_a_room():
     page, pen = two_rooms()
-    pen.rectangle((457, 121, 779, 379), fill=(120, 125, 130))
+    pen.rectangle((457, 121, 779, 379), fill=(80, 85, 90))
     found = shapes(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document)
     assert sorted(room.area for room in found) == pytest.approx([8.4, 8.4], abs=0.2)
 
