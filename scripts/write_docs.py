@@ -107,8 +107,9 @@ def pairs_table() -> str:
 
     def cell(name: str, found: dict[str, Any]) -> str:
         unit = "" if "over" in name else " s"
+        ratio = "" if found["ratio"] is None else f": {found['ratio']:.2f}"
         cpu = "" if found["cpu_ratio"] is None else f" ({found['cpu_ratio']:.2f})"
-        return f"{found['after']:.3g}{unit}: {found['ratio']:.2f}{cpu}"
+        return f"{found['after']:.3g}{unit}{ratio}{cpu}"
 
     names = dict.fromkeys(name for found in releases.values() for name in found["figures"])
     head = " | ".join(["figure", *(f"{name} over {found['before']}" for name, found in releases.items())])

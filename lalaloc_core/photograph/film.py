@@ -314,9 +314,11 @@ def _inside_bars(frame: UInt8[np.ndarray, "h w 3"]) -> tuple[slice, slice]:
 
 def _is_lit_beside(frame: UInt8[np.ndarray, "h w 3"], inside: tuple[slice, slice] | None) -> bool:
     """Return whether a frame shows something in what is taken for bars."""
-    is_seen = frame.max(axis=2) > 2 * _BLACK
-    is_seen[inside or _WHOLE] = False
-    return inside is not None and inside != _WHOLE and float(is_seen.mean()) > _SEEN
+    if inside is None or inside == _WHOLE:
+        return False
+    is_seen = np.maximum.reduce(cv2.split(frame)) > 2 * _BLACK
+    is_seen[inside] = False
+    return float(is_seen.mean()) > _SEEN
 
 
 @contextmanager
