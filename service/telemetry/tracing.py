@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from time import perf_counter, time_ns
 from typing import TYPE_CHECKING
 
-from lalaloc_core.errors import ConfigError
+from lalaloc_core.errors import ConfigError, install_command
 from service.telemetry.logs import RequestLogFields, TraceContext
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def otlp_exporter(endpoint: str) -> SpanExporter:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
     except ImportError as error:
         raise ConfigError(
-            f"LALALOC_OTLP_ENDPOINT is '{endpoint}', but '{error.name}' is missing: run pip install 'lalaloc[otel]'"
+            f"LALALOC_OTLP_ENDPOINT is '{endpoint}', but '{error.name}' is missing: run {install_command('otel')}"
         ) from error
     return OTLPSpanExporter(endpoint=endpoint, timeout=_EXPORT_TIMEOUT_S)
 

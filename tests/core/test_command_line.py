@@ -313,7 +313,7 @@ def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     monkeypatch.setattr(sys, "argv", sys.argv)
     assert main(["mcp"]) == 1
-    assert "run pip install 'lalaloc[mcp]'" in capsys.readouterr().err
+    assert "run .venv/bin/pip install -c constraints.txt -e '.[mcp]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -40,7 +40,7 @@ def pinned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder.mkdir()
     for name in ("kitchen", "study", "phone"):
         shutil.copy(EXAMPLES / f"{name}.jpg", folder)
-    shutil.copy(EXAMPLES / "study.jpg", folder / "study copy.jpg")
+    shutil.copy(EXAMPLES / "study.jpg", folder / "study \udcff\x07.jpg")
     (folder / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
     (folder / "notes.txt").write_text("hello")
     plan = json.loads((EXAMPLES / "flat.json").read_text()) | {"north_deg": 30.0}
@@ -53,7 +53,7 @@ def pinned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Path]) -> None:
     pins = json.loads((pinned[1] / "pins.json").read_text())
     rooms = {entry["photograph"]: entry["room"] for entry in pins["photographs"]}
-    places = {"kitchen.jpg": "kitchen", "phone.jpg": "living room", "study copy.jpg": "study", "study.jpg": "study"}
+    places = {"kitchen.jpg": "kitchen", "phone.jpg": "living room", "study \ufffd\ufffd.jpg": "study", "study.jpg": "study"}
     assert rooms == {"broken.jpg": None} | places
     notes = " ".join(pins["notes"])
     assert "'broken.jpg' is set aside: the photograph is not a readable JPEG" in notes
@@ -66,6 +66,8 @@ def test_tables_and_drawings_have_every_pin(pinned: tuple[Path, Path]) -> None:
     _, out = pinned
     rows = list(csv.DictReader(io.StringIO((out / "pins.csv").read_text())))
     assert [row["state"] == "set_aside" for row in rows] == [True, False, False, False, False]
+    assert {(row["room_confidence"] == row["confidence"]) for row in rows} == {True}
+    assert max(float(row["room_confidence"]) for row in rows) > 0.8
     collection = json.loads((out / "pins.geojson").read_text())
     assert len(collection["features"]) == 4
     longitude, latitude = collection["features"][0]["geometry"]["coordinates"]

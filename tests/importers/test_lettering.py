@@ -216,7 +216,7 @@ def test_without_the_extra_texts_are_not_read(monkeypatch: pytest.MonkeyPatch):
         import_plan(page.file())
     plan = import_plan(page.file(), ImportOptions(metres_per_pixel=1.0 / page.px_per_m))
     assert [room.get("name") for room in plan.document["rooms"]] == [None] * 3
-    assert any("run pip install 'lalaloc[ocr]'" in note for note in plan.report.notes)
+    assert any("-e '.[ocr]'" in note for note in plan.report.notes)
 
 
 def test_models_are_not_downloaded(monkeypatch: pytest.MonkeyPatch):

@@ -44,7 +44,7 @@ def test_import_without_package_names_the_extra(bare: httpx.Client, content: byt
     response = bare.post("/floorplans", files={"file": ("plan", content)}, data=fields)
     problem = assert_problem(response, 501, "missing-extra")
     assert f"the extra `{extra}`" in problem["detail"]
-    assert f"pip install 'lalaloc[{extra}]'" in problem["detail"]
+    assert f".venv/bin/pip install -c constraints.txt -e '.[{extra}]'" in problem["detail"]
 
 
 def test_export_without_package_names_the_extra(bare: httpx.Client) -> None:

@@ -243,8 +243,9 @@ def test_other_files_than_photographs_are_rejected(desktop: Visit, tmp_path: Pat
 
 
 def test_phone_needs_no_horizontal_scrolling(phone: Visit) -> None:
-    page = phone.open_example()
+    page = phone.open()
     expect(page.locator("#find")).to_be_in_viewport(ratio=1.0)
+    phone.choose_spheres()
     phone.find()
     assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
     for selector in ("#plan", "#stage", "#find", "#answer", "#edit-plan", "#draw-plan"):

@@ -47,7 +47,7 @@ export function showAll(photos: readonly Photo[], choose: (photo: Photo) => void
       // GeoJSON needs places on Earth, which only plans with an anchor have.
       features.length === found.length
         ? save("GeoJSON", "application/geo+json", JSON.stringify({ type: "FeatureCollection", features }))
-        : h("p", { class: "hint" }, "GeoJSON can be saved for plans whose place on Earth is known."),
+        : h("p", { class: "hint" }, "GeoJSON needs the plan’s place on Earth: “Edit”, then “Place on Earth”."),
     ),
   );
 }

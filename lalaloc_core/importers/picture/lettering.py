@@ -19,6 +19,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
 
+from lalaloc_core.errors import install_command
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.drawing.enclosed_rooms import without_overlaps
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
@@ -87,7 +88,7 @@ def read_texts(
     rows, columns = gray.shape
     found = PictureTexts(size=(float(columns), float(rows)))
     if find_spec("rapidocr") is None:
-        builder.notes.append("texts were not read: name the rooms, or run pip install 'lalaloc[ocr]'")
+        builder.notes.append(f"texts were not read: name the rooms, or run {install_command('ocr')}")
         return found
     budget.begin("reading texts")
     try:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI
-from lalaloc_core.errors import ConfigError, DatasetError, InvalidPhotographError
+from lalaloc_core.errors import ConfigError, DatasetError, InvalidPhotographError, install_command
 from lalaloc_core.learn.data.annotated import annotation_files
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
 from lalaloc_core.learn.data.posed_spheres import PosedSpheres, annotated, is_posed
@@ -266,7 +266,7 @@ def load_segmenter(path: Path) -> Segment:
         # Only in the extra 'trunk', so a type checker may not find it.
         from ai_edge_litert.interpreter import Interpreter  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ConfigError("--teacher needs the package ai-edge-litert; run pip install 'lalaloc[trunk]'") from error
+        raise ConfigError(f"--teacher needs the package ai-edge-litert; run {install_command('trunk')}") from error
     try:
         interpreter = Interpreter(str(path), num_threads=1)
         interpreter.allocate_tensors()

@@ -77,7 +77,7 @@ def summary_of(plan: FloorPlan, found: Localisability) -> list[str]:
     lines = ["Predicted share of photographs found within 1 m, heading unknown (stated):"]
     headings: tuple[HeadingState, HeadingState] = ("unknown", "known")
     for name, title in _TITLES.items():
-        unknown, known = (_percent(found.plan[condition_of(name, heading)]) for heading in headings)
+        unknown, known = (probability_text(found.plan[condition_of(name, heading)], 0) for heading in headings)
         lines.append(f"- {title}: {unknown} ({known})")
     return lines + _advice_of(plan, found)
 
@@ -94,12 +94,12 @@ def _advice_of(plan: FloorPlan, found: Localisability) -> list[str]:
         first, second = (f"'{plan.rooms[index].name}'" for index in pair.rooms)
         photograph, heading = parts_of(pair.condition)
         condition = f"{_TITLES[photograph]}, heading {heading}"
-        lines.append(f"{first} and {second} are confused: {_percent(pair.share)} ({condition})")
+        lines.append(f"{first} and {second} are confused: {probability_text(pair.share, 0)} ({condition})")
     gains = [(gain, name) for name, gain in found.gains.items() if gain is not None and name != "doors"]
     for gain, name in sorted(gains, reverse=True):
         if gain >= _WORTH:
-            before, after = found.plan[HARDEST], found.plan[HARDEST] + gain
-            lines.append(f"{_REMEDIES[name]}: {_percent(after)} are found instead of {_percent(before)}")
+            before, after = (probability_text(found.plan[HARDEST] + more, 0) for more in (0.0, gain))
+            lines.append(f"{_REMEDIES[name]}: {after} are found instead of {before}")
     doors = found.gains["doors"]
     if doors is None:
         lines.append(f"The plan shows no openings: {_REMEDIES['doors']}")
@@ -117,10 +117,6 @@ def _rows(values: Mapping[Condition, Any]) -> list[dict[str, float] | None]:
         else {name: round(value, 3) for name, value in zip(CONDITIONS, row, strict=True)}
         for row in columns
     ]
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
 
 
 @dataclass(frozen=True, kw_only=True)
