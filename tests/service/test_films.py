@@ -109,10 +109,10 @@ def film_workers() -> set[int | None]:
 def test_angles_of_many_photographs_are_found_beside_the_decoders(
     start_app: StartApp, tiny_view_bundle: Path, tmp_path: Path
 ) -> None:
-    photographs = [("photo", jpeg(frame)) for frame in turn(12, 30.0)]
+    photographs = [("photo", jpeg(frame)) for frame in turn(24, 15.0)]
     with start_app(tmp_path, bundle=tiny_view_bundle) as client:
         # Those of the module's app can run as well.
         plan_id, others = upload(client), film_workers()
-        for count, started in ((3, 0), (12, 1)):
+        for count, started in ((3, 0), (24, 1)):
             assert len(send(client, plan_id, *photographs[:count]).json()["poses"]) == count
             assert len(film_workers() - others) == started
