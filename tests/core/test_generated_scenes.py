@@ -13,14 +13,10 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.data.synthetic import altered_homes
 from lalaloc_core.learn.data.synthetic.altered_homes import (
-    CopiedScenes,
+    AlteredScenes,
     Cropped,
     DisturbedPhotograph,
-    DisturbedScenes,
-    ForeignScenes,
-    MismatchedScenes,
     OutdoorPhotograph,
-    UnopenedScenes,
     UpsideDown,
 )
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
@@ -32,8 +28,8 @@ LOOK = FURNISHED.appearances[0]
 
 
 def test_copies_differ_in_their_doors_only() -> None:
-    for name in CopiedScenes(HOMES).scenes("validation"):
-        home, scene = HOMES.load(name), CopiedScenes(HOMES).load(name)
+    for name in AlteredScenes(HOMES, "copies").scenes("validation"):
+        home, scene = HOMES.load(name), AlteredScenes(HOMES, "copies").load(name)
         rooms, plan = len(home.plan.rooms), scene.plan
         assert len(plan.rooms) == 4 * rooms
         assert plan.opening_kinds == home.plan.opening_kinds
@@ -61,8 +57,8 @@ def test_copies_differ_in_their_doors_only() -> None:
 
 def test_every_photograph_identifies_its_copy() -> None:
     photographs = 0
-    for name in CopiedScenes(HOMES).scenes("validation"):
-        home, scene = HOMES.load(name), CopiedScenes(HOMES).load(name)
+    for name in AlteredScenes(HOMES, "copies").scenes("validation"):
+        home, scene = HOMES.load(name), AlteredScenes(HOMES, "copies").load(name)
         rooms, plan = len(home.plan.rooms), scene.plan
         step_m = plan.rooms[rooms].polygon_m[0, 0] - home.plan.rooms[0].polygon_m[0, 0]
         for camera in scene.cameras:
@@ -87,11 +83,14 @@ class _Doorless(GeneratedScenes):
 
 
 def test_camera_without_door_in_view_is_left_out() -> None:
-    assert CopiedScenes(_Doorless(homes=1)).load("validation-00000").cameras == ()
+    assert AlteredScenes(_Doorless(homes=1), "copies").load("validation-00000").cameras == ()
 
 
 def test_cameras_show_the_next_home() -> None:
-    mismatched, own = MismatchedScenes(FURNISHED).load("validation-00001"), FURNISHED.load("validation-00001")
+    mismatched, own = (
+        AlteredScenes(FURNISHED, "mismatched").load("validation-00001"),
+        FURNISHED.load("validation-00001"),
+    )
     # The last home uses the first one beyond the split.
     following = FURNISHED.load("validation-00002")
     assert mismatched.plan.to_dict() == own.plan.to_dict()
@@ -113,7 +112,9 @@ def test_cameras_show_the_next_home() -> None:
 
 
 def test_even_homes_have_no_cropped_photograph() -> None:
-    shown = [camera.photographs[LOOK] for camera in MismatchedScenes(FURNISHED).load("validation-00000").cameras]
+    shown = [
+        camera.photographs[LOOK] for camera in AlteredScenes(FURNISHED, "mismatched").load("validation-00000").cameras
+    ]
     assert not any(isinstance(photograph, Cropped) for photograph in shown)
 
 
@@ -145,7 +146,7 @@ class _Shaded:
 
 
 def test_only_the_picture_is_disturbed() -> None:
-    scene, own = DisturbedScenes(FURNISHED).load("validation-00000"), FURNISHED.load("validation-00000")
+    scene, own = AlteredScenes(FURNISHED, "disturbed").load("validation-00000"), FURNISHED.load("validation-00000")
     assert scene.plan.to_dict() == own.plan.to_dict()
     for camera, mine in zip(scene.cameras, own.cameras, strict=True):
         assert np.array_equal(camera.position_m, mine.position_m)
@@ -185,7 +186,7 @@ def test_disturbed_photograph_has_no_depth() -> None:
 def test_photographs_are_asked_for_in_other_buildings() -> None:
     homes = GeneratedScenes(homes=6, shots_per_home=2)
     own = homes.load("validation-00000")
-    scenes = [ForeignScenes(homes).load(f"validation-{number:05d}") for number in range(6)]
+    scenes = [AlteredScenes(homes, "foreign").load(f"validation-{number:05d}") for number in range(6)]
     # The next home, its walls alone, and offices, of which one shows its openings.
     assert [bool(scene.plan.openings) for scene in scenes] == [True, False, False, True, False, True]
     assert [scene.plan.name == "office" for scene in scenes] == [False, False, True] * 2
@@ -201,7 +202,7 @@ def test_photographs_are_asked_for_in_other_buildings() -> None:
 
 def test_unopened_plans_show_walls_alone() -> None:
     homes = GeneratedScenes(homes=1)
-    own, bare = (dataset.load("validation-00000") for dataset in (homes, UnopenedScenes(homes)))
+    own, bare = (dataset.load("validation-00000") for dataset in (homes, AlteredScenes(homes, "unopened")))
     assert own.plan.openings
     assert not bare.plan.openings
     assert not bare.plan.opening_kinds

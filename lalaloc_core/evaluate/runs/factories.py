@@ -18,7 +18,8 @@ from lalaloc_core.evaluate.methods.method import Method
 from lalaloc_core.evaluate.methods.similarity import LayoutMetric, PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.learn.data import Appearance, Dataset, HeldoutScenes, ViewScenes, open_dataset
-from lalaloc_core.learn.data.synthetic import GeneratedScenes, altered_homes
+from lalaloc_core.learn.data.synthetic import GeneratedScenes
+from lalaloc_core.learn.data.synthetic.altered_homes import CHANGES, AlteredScenes
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig
 from lalaloc_core.localise.query import DEFAULT_STD_M
@@ -94,14 +95,7 @@ def _spheres(info: RunInfo) -> Dataset:
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
     homes = GeneratedScenes(**arguments)
-    derived = {
-        "copies": altered_homes.CopiedScenes,
-        "disturbed": altered_homes.DisturbedScenes,
-        "foreign": altered_homes.ForeignScenes,
-        "mismatched": altered_homes.MismatchedScenes,
-        "unopened": altered_homes.UnopenedScenes,
-    }
-    return derived[generator](homes) if generator in derived else homes
+    return AlteredScenes(homes, generator) if generator in CHANGES else homes
 
 
 def build_method(info: RunInfo) -> Method:

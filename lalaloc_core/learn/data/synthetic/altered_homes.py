@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +20,8 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, WithoutDepth
-from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
+from lalaloc_core.learn.data.dataset import Appearance, Camera, DatasetPhotograph, Scene, Split, WithoutDepth
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, camera_seed
 from lalaloc_core.learn.synth.augmentation import jittered, optics, stretched_images
 from lalaloc_core.render.sweep import sweep_layouts
 
@@ -31,16 +31,9 @@ _LENGTH_ERROR = 0.1
 _STRENGTH = 1.0
 
 
-@dataclass(frozen=True)
-class DisturbedScenes(DerivedScenes):
-    """Generated homes whose photographs are slightly stretched, and changed in exposure, blur and compression."""
-
-    variant: ClassVar[str] = "disturbed"
-
-    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        """Generate a scene and disturb its photographs."""
-        scene = self.homes.load(name, problems)
-        return dataclasses.replace(scene, cameras=tuple(_disturbed(camera) for camera in scene.cameras))
+def _disturb(own: Scene, _homes: GeneratedScenes) -> Scene:
+    """Stretch the photographs slightly, and change their exposure, blur and compression."""
+    return dataclasses.replace(own, cameras=tuple(map(_disturbed, own.cameras)))
 
 
 def _disturbed(camera: Camera) -> Camera:
@@ -71,27 +64,23 @@ _EVERY = 4
 _CROP = slice(0.3, 0.7), slice(0.25, 0.5)
 
 
-@dataclass(frozen=True)
-class MismatchedScenes(DerivedScenes):
-    """Generated homes whose cameras have photographs of the next home, or photographs that cannot be localised.
+def _mismatch(own: Scene, homes: GeneratedScenes) -> Scene:
+    """Give the cameras photographs of the next home, or photographs that cannot be localised.
 
     Poses and heights are those of the home's own cameras, and unrelated to the photographs.
     """
+    number, other = _next_home(own, homes)
+    cameras = [
+        dataclasses.replace(camera, photographs=_mismatched(camera, other.cameras[k % len(other.cameras)], k, number))
+        for k, camera in enumerate(own.cameras)
+    ]
+    return dataclasses.replace(own, cameras=tuple(cameras))
 
-    variant: ClassVar[str] = "asked with photographs of others"
 
-    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        """Generate a scene and replace its photographs."""
-        own = self.homes.load(name, problems)
-        prefix, _, number = name.rpartition("-")
-        other = self.homes.load(f"{prefix}-{int(number) + 1:0{len(number)}d}", problems)
-        cameras = [
-            dataclasses.replace(
-                camera, photographs=_mismatched(camera, other.cameras[k % len(other.cameras)], k, int(number))
-            )
-            for k, camera in enumerate(own.cameras)
-        ]
-        return dataclasses.replace(own, cameras=tuple(cameras))
+def _next_home(own: Scene, homes: GeneratedScenes) -> tuple[int, Scene]:
+    """Return the number of a home, and the home after it."""
+    prefix, _, number = own.name.rpartition("-")
+    return int(number), homes.load(f"{prefix}-{int(number) + 1:0{len(number)}d}")
 
 
 def _mismatched(camera: Camera, other: Camera, k: int, home: int) -> dict[Appearance, DatasetPhotograph]:
@@ -167,45 +156,36 @@ _SEEN_COLUMNS, _COLUMNS = 2, 128
 _CLEAR_M, _STEP_M, _MAX_THICKNESS_M = 0.15, 0.1, 0.5
 
 
-@dataclass(frozen=True)
-class CopiedScenes(DerivedScenes):
-    """Generated homes as plans of several copies in a row; one random copy per home is photographed.
+def _copy(own: Scene, homes: GeneratedScenes) -> Scene:
+    """Repeat the plan several times in a row; one random copy per home is photographed.
 
     In the other copies some doors are moved within their room, at least one of those that each camera sees, so every
     photograph identifies its copy. Doors without a free position are removed. Cameras that see no door are left out.
     """
-
-    variant: ClassVar[str] = f"{_COPIES} copies that differ in their doors"
-
-    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        """Generate a scene and copy it."""
-        scene = self.homes.load(name, problems)
-        rng = np.random.default_rng([self.homes.seed, zlib.crc32(name.encode())])
-        own = int(rng.integers(_COPIES))
-        x_min, _, x_max, _ = scene.plan.bounds_m
-        step_m = x_max - x_min + _APART_M
-        document = scene.plan.to_dict()
-        seen = [(camera, _seen_doors(scene.plan, camera)) for camera in scene.cameras]
-        seen = [(camera, doors) for camera, doors in seen if doors]
-        rooms, openings = [], []
-        for copy in range(_COPIES):
-            by_m = copy * step_m
-            rooms += [_moved_room(room, copy, by_m) for room in document["rooms"]]
-            kept = document.get("openings", [])
-            if copy != own:
-                kept = _with_moved_doors(scene.plan, kept, seen, rng)
-            openings += [_moved_opening(opening, copy, by_m) for opening in kept]
-        plan = FloorPlan.from_dict(
-            {**document, "rooms": rooms, "openings": openings, "opening_kinds": sorted(scene.plan.opening_kinds)}
-        )
-        shift_m, first_room = np.array([own * step_m, 0.0]), own * len(scene.plan.rooms)
-        cameras = tuple(
-            dataclasses.replace(
-                camera, position_m=camera.position_m + shift_m, room_index=camera.room_index + first_room
-            )
-            for camera, _ in seen
-        )
-        return dataclasses.replace(scene, plan=plan, cameras=cameras)
+    rng = np.random.default_rng([homes.seed, zlib.crc32(own.name.encode())])
+    whole = int(rng.integers(_COPIES))
+    x_min, _, x_max, _ = own.plan.bounds_m
+    step_m = x_max - x_min + _APART_M
+    document = own.plan.to_dict()
+    seen = [(camera, _seen_doors(own.plan, camera)) for camera in own.cameras]
+    seen = [(camera, doors) for camera, doors in seen if doors]
+    rooms, openings = [], []
+    for copy in range(_COPIES):
+        by_m = copy * step_m
+        rooms += [_moved_room(room, copy, by_m) for room in document["rooms"]]
+        kept = document.get("openings", [])
+        if copy != whole:
+            kept = _with_moved_doors(own.plan, kept, seen, rng)
+        openings += [_moved_opening(opening, copy, by_m) for opening in kept]
+    plan = FloorPlan.from_dict(
+        {**document, "rooms": rooms, "openings": openings, "opening_kinds": sorted(own.plan.opening_kinds)}
+    )
+    shift_m, first_room = np.array([whole * step_m, 0.0]), whole * len(own.plan.rooms)
+    cameras = tuple(
+        dataclasses.replace(camera, position_m=camera.position_m + shift_m, room_index=camera.room_index + first_room)
+        for camera, _ in seen
+    )
+    return dataclasses.replace(own, plan=plan, cameras=cameras)
 
 
 def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
@@ -327,39 +307,59 @@ def _room(
     return {"id": name, "name": name, "type": kind, "ceiling_height_m": ceiling_m, "polygon": polygon}
 
 
-@dataclass(frozen=True)
-class UnopenedScenes(DerivedScenes):
-    """Generated homes whose plans show walls alone."""
+def _leave_out_openings(own: Scene, _homes: GeneratedScenes) -> Scene:
+    return dataclasses.replace(own, plan=without_openings(own.plan))
 
-    variant: ClassVar[str] = "plans without openings"
+
+def _replace_plan(own: Scene, homes: GeneratedScenes) -> Scene:
+    """Show the photographs in the plan of another building; poses are those of other cameras."""
+    number, other = _next_home(own, homes)
+    kind = number % _KINDS
+    plan = other.plan
+    cameras = [
+        dataclasses.replace(camera, photographs=photographed.photographs)
+        for camera, photographed in zip(other.cameras, own.cameras, strict=False)
+    ]
+    if kind == _KINDS - 1:
+        plan = office_plan(np.random.default_rng([_OFFICE_SEED, number]))
+        middle = np.mean(plan.rooms[0].polygon_m, axis=0)
+        cameras = [dataclasses.replace(camera, position_m=middle, room_index=0) for camera in cameras]
+    if kind == 1 or number % (2 * _KINDS) == _KINDS - 1:
+        plan = without_openings(plan)
+    return dataclasses.replace(own, plan=plan, cameras=tuple(cameras))
+
+
+# Changes of a generated scene by the name of the generator, each with its part of the data set's description.
+CHANGES: dict[str, tuple[str, Callable[[Scene, GeneratedScenes], Scene]]] = {
+    "copies": (f"{_COPIES} copies that differ in their doors", _copy),
+    "disturbed": ("disturbed", _disturb),
+    "foreign": ("asked in plans of other buildings", _replace_plan),
+    "mismatched": ("asked with photographs of others", _mismatch),
+    "unopened": ("plans without openings", _leave_out_openings),
+}
+
+
+@dataclass(frozen=True)
+class AlteredScenes:
+    """Generated homes after one of `CHANGES`."""
+
+    homes: GeneratedScenes
+    change: str
+
+    @property
+    def description(self) -> str:
+        """Name of the data set in results."""
+        return f"{self.homes.description}, {CHANGES[self.change][0]}"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        """Appearances of the generated homes."""
+        return self.homes.appearances
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of a split's scenes."""
+        return self.homes.scenes(split)
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        """Generate a scene and leave out its openings."""
-        scene = self.homes.load(name, problems)
-        return dataclasses.replace(scene, plan=without_openings(scene.plan))
-
-
-@dataclass(frozen=True)
-class ForeignScenes(DerivedScenes):
-    """Photographs of generated homes in plans of other buildings; poses are those of other cameras."""
-
-    variant: ClassVar[str] = "asked in plans of other buildings"
-
-    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        """Generate a scene, and another building with the scene's photographs."""
-        own = self.homes.load(name, problems)
-        prefix, _, number = name.rpartition("-")
-        other = self.homes.load(f"{prefix}-{int(number) + 1:0{len(number)}d}", problems)
-        kind = int(number) % _KINDS
-        plan = other.plan
-        cameras = [
-            dataclasses.replace(camera, photographs=photographed.photographs)
-            for camera, photographed in zip(other.cameras, own.cameras, strict=False)
-        ]
-        if kind == _KINDS - 1:
-            plan = office_plan(np.random.default_rng([_OFFICE_SEED, int(number)]))
-            middle = np.mean(plan.rooms[0].polygon_m, axis=0)
-            cameras = [dataclasses.replace(camera, position_m=middle, room_index=0) for camera in cameras]
-        if kind == 1 or int(number) % (2 * _KINDS) == _KINDS - 1:
-            plan = without_openings(plan)
-        return dataclasses.replace(own, plan=plan, cameras=tuple(cameras))
+        """Generate a scene and change it."""
+        return CHANGES[self.change][1](self.homes.load(name, problems), self.homes)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import shapely
@@ -81,28 +81,6 @@ class GeneratedScenes:
 def training_plans(homes: int, seed: int) -> list[FloorPlan]:
     """Return the plans of the first training homes."""
     return [home_of(TRAIN, seed, index)[0].plan for index in range(homes)]
-
-
-@dataclass(frozen=True)
-class DerivedScenes:
-    """Base of data sets that change the scenes of generated homes; `load` makes the change, `variant` describes it."""
-
-    homes: GeneratedScenes
-    variant: ClassVar[str]
-
-    @property
-    def description(self) -> str:
-        """Name of the data set in results."""
-        return f"{self.homes.description}, {self.variant}"
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        """Appearances of the generated homes."""
-        return self.homes.appearances
-
-    def scenes(self, split: Split) -> Sequence[str]:
-        """Return the names of a split's scenes."""
-        return self.homes.scenes(split)
 
 
 def camera_seed(camera: Camera) -> int:
