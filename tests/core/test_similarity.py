@@ -186,15 +186,6 @@ class TestAnyMetric:
             assert grid.distances(query)[index] < 1e-6
             assert grid.nearest(query) == index
 
-    @pytest.mark.parametrize("metric", get_args(LayoutMetric))
-    def test_other_profile_width_is_refused(self, metric: LayoutMetric) -> None:
-        plan = crooked_flat()
-        grid = layout_grid(metric, plan, some_poses(plan, 0), CAMERA_M)
-        with pytest.raises(InvalidInputError, match="7 columns"):
-            grid.distances(layout_at(plan, np.array([1.0, 1.0]), 7))
-        with pytest.raises(InvalidInputError, match="7 columns"):
-            grid.nearest(layout_at(plan, np.array([1.0, 1.0]), 7))
-
 
 class TestRetrieval:
     @pytest.mark.parametrize("metric", get_args(LayoutMetric))

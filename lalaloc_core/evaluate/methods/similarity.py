@@ -19,7 +19,6 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, Question, grid_key
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.search.pipeline import StageClock
@@ -80,12 +79,6 @@ class LayoutGrid(ABC):
         """Return the index of the pose nearest to the query."""
         return int(self.distances(query).argmin())
 
-    def _check_columns(self, query: Layout) -> None:
-        if len(query.profile_m) != self.columns:
-            raise InvalidInputError(
-                f"the query's wall profile has {len(query.profile_m)} columns; this grid needs {self.columns}"
-            )
-
 
 class ChamferGrid(LayoutGrid):
     """Symmetric Chamfer distance (m) between back-projected point clouds, see `learn.metrics.chamfer_distance`."""
@@ -99,7 +92,7 @@ class ChamferGrid(LayoutGrid):
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
         """Return the distance of the query to every pose."""
-        pair = self._pair(query)
+        pair = _Comparison(self._depth_m, self._clouds_m, query)
         poses = np.arange(len(self._clouds_m))
         return pair.to_query(poses, slice(None)) + np.array([pair.from_query(int(index)) for index in poses])
 
@@ -110,7 +103,7 @@ class ChamferGrid(LayoutGrid):
         above the best distance are skipped. Cheap terms come first: distances to the query need one search tree,
         distances from it one for every pose.
         """
-        pair = self._pair(query)
+        pair = _Comparison(self._depth_m, self._clouds_m, query)
         bound = np.zeros(len(self._clouds_m))
         remaining = np.arange(len(bound))
         best, best_index = math.inf, -1
@@ -128,10 +121,6 @@ class ChamferGrid(LayoutGrid):
             if distance < best:
                 best, best_index = float(distance), int(index)
         return best_index
-
-    def _pair(self, query: Layout) -> _Comparison:
-        self._check_columns(query)
-        return _Comparison(self._depth_m, self._clouds_m, query)
 
 
 class _Comparison:
@@ -185,7 +174,6 @@ class DepthGrid(LayoutGrid):
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
         """Return the distance of the query to every pose."""
-        self._check_columns(query)
         depth = self._scaled(query.depth_m(self._depth.shape[1])[None])
         return np.abs(self._depth - depth).mean(axis=(1, 2), dtype=np.float64)
 
@@ -209,7 +197,6 @@ class EdgeGrid(LayoutGrid):
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
         """Return the distance of the query to every pose."""
-        self._check_columns(query)
         heights = np.array([query.camera_height_m]), np.array([query.ceiling_height_m])
         edges = edge_image(query.profile_m[None], *heights, self._rows)[0]
         to_poses = self._field[:, edges.ravel()].mean(axis=1, dtype=np.float64)
