@@ -18,7 +18,6 @@ from lalaloc_core.evaluate.runs.score import (
     Outcome,
     Scores,
     choose_worst,
-    count_outcomes,
     heading_errors_deg,
     outcomes,
     position_errors_m,
@@ -66,22 +65,16 @@ def open_runs(folders: Sequence[Path]) -> list[Run]:
     return runs
 
 
-class StageTime(NamedTuple):
-    """Number of queries that passed a stage, and its median and 95th percentile."""
-
-    count: int
-    median_ms: float
-    p95_ms: float
-
-
-def stage_times(predictions: Sequence[Prediction]) -> dict[str, StageTime]:
-    """Return times by stage, and of whole queries under `TOTAL`; empty without times."""
+def stage_times(predictions: Sequence[Prediction]) -> dict[str, tuple[int, float, float]]:
+    """Return, by stage and of whole queries (`TOTAL`), how many have times, and their median and 95th percentile."""
     timed = [prediction.timings_ms for prediction in predictions if prediction.timings_ms]
     names = dict.fromkeys(name for timings in timed for name in timings)
     times_ms = {name: [timings[name] for timings in timed if name in timings] for name in names}
     if timed:
         times_ms[TOTAL] = [sum(timings.values()) for timings in timed]
-    return {name: StageTime(len(ms), *map(float, np.percentile(ms, [50.0, 95.0]))) for name, ms in times_ms.items()}
+    return {
+        name: (len(ms), float(np.percentile(ms, 50.0)), float(np.percentile(ms, 95.0))) for name, ms in times_ms.items()
+    }
 
 
 def curves(runs: Sequence[Run]) -> dict[str, Float[np.ndarray, "n"]]:
@@ -144,8 +137,9 @@ def outcome_rows(run: Run) -> Iterator[Row]:
     """Yield the number of queries by outcome, for the first of several stages and for the final pose."""
     first = run.stages[:1] if len(run.stages) > 1 else []
     for stage in [*first, None] if run.predictions else []:
-        counts = count_outcomes(run.predictions, stage)
-        cells = [Cell(str(counts[kind]), percent(counts[kind] / len(run.predictions))) for kind in Outcome]
+        found = outcomes(run.predictions, stage)
+        counts = [found.count(kind) for kind in Outcome]
+        cells = [Cell(str(count), percent(count / len(found))) for count in counts]
         yield Row(stage or "answer", cells, stage is None)
 
 
@@ -169,8 +163,8 @@ def reliability_rows(run: Run) -> Iterator[Row]:
 
 def time_rows(run: Run) -> Iterator[Row]:
     """Yield median and 95th percentile of each stage and of whole queries."""
-    for name, time in stage_times(run.predictions).items():
-        yield Row(name, (Cell(str(time.count)), Cell(number(time.median_ms)), Cell(number(time.p95_ms))), name == TOTAL)
+    for name, (count, median_ms, p95_ms) in stage_times(run.predictions).items():
+        yield Row(name, (Cell(str(count)), Cell(number(median_ms)), Cell(number(p95_ms))), name == TOTAL)
 
 
 def worst_rows(run: Run) -> Iterator[Row]:

@@ -311,12 +311,6 @@ def outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> lis
     return [_outcome(prediction, stage, float(error_m)) for prediction, error_m in pairs]
 
 
-def count_outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> dict[Outcome, int]:
-    """Return the number of queries by outcome, for all outcomes."""
-    found = outcomes(predictions, stage)
-    return {outcome: found.count(outcome) for outcome in Outcome}
-
-
 def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Prediction]:
     """Return up to `count` queries: first those without an answer, then by decreasing error."""
     errors_m = position_errors_m(predictions)
