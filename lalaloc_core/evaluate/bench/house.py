@@ -10,7 +10,6 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from lalaloc_core.evaluate.bench.measured import Found, Setting, evaluate, summary
 from lalaloc_core.evaluate.bench.turns import found_in_film, found_in_turns
-from lalaloc_core.evaluate.calibrate.measured_errors import Spot
+from lalaloc_core.evaluate.calibrate.measured_errors import spots_of
 from lalaloc_core.evaluate.runs.albums import RoomAlbum, RoomKey, album_entry
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
@@ -54,7 +53,8 @@ def bench_house(setting: Setting) -> dict[str, Any]:
             for stated in ("field", "nothing"):
                 views = {"field_deg": field_deg, "per_camera": _VIEWS, "stated": stated}
                 rows[f"view_{field_deg:g}_{stated}_{heading}"] = _localised(setting, folder, views, known=known)
-    rows |= {f"turn_{name}": summary(found) for name, found in found_in_turns(setting.model, _spots(folder)).items()}
+    spots = spots_of(ViewScenes(PosedSpheres(folder), _TURN_DEG, _TURN_VIEWS), "validation")
+    rows |= {f"turn_{name}": summary(found) for name, found in found_in_turns(setting.model, spots).items()}
     scenes = list(map(PosedSpheres(folder).load, PosedSpheres(folder).scenes("validation")))
     films = [found_in_film(setting.model, scene.plan, camera) for scene in scenes for camera in scene.cameras]
     albums = {
@@ -75,13 +75,6 @@ def _localised(setting: Setting, folder: Path, views: dict[str, Any] | None, *, 
     )
     found = [Found.of(each.final_pose, each.truth, each.confidence) for each in evaluate(info)]
     return summary(found) | {"right_room": float(np.mean([each.right_room for each in found]))}
-
-
-def _spots(folder: Path) -> Iterator[Spot]:
-    scenes = ViewScenes(PosedSpheres(folder), _TURN_DEG, _TURN_VIEWS)
-    for scene in map(scenes.load, scenes.scenes("validation")):
-        for first in range(0, len(scene.cameras), _TURN_VIEWS):
-            yield Spot(scene.plan, scene.cameras[first : first + _TURN_VIEWS])
 
 
 def house_albums(setting: Setting) -> dict[str, RoomAlbum]:

@@ -56,11 +56,15 @@ class Spot(NamedTuple):
 
 def spots(homes: int, split: Split, textures: Path | None) -> Iterator[Spot]:
     """Yield the spots of furnished generated homes, 4 in each."""
-    scenes = ViewScenes(GeneratedScenes(homes=homes, furniture="full", textures=textures), _FIELD_DEG, _VIEWS)
-    for name in scenes.scenes(split):
-        scene = scenes.load(name)
-        for first in range(0, len(scene.cameras), _VIEWS):
-            yield Spot(scene.plan, scene.cameras[first : first + _VIEWS])
+    generated = GeneratedScenes(homes=homes, furniture="full", textures=textures)
+    return spots_of(ViewScenes(generated, _FIELD_DEG, _VIEWS), split)
+
+
+def spots_of(scenes: ViewScenes, split: Split) -> Iterator[Spot]:
+    """Yield the spots of a split, each with all of its views."""
+    for scene in map(scenes.load, scenes.scenes(split)):
+        for first in range(0, len(scene.cameras), scenes.per_camera):
+            yield Spot(scene.plan, scene.cameras[first : first + scenes.per_camera])
 
 
 def queries_of(spot: Spot, encoder: PhotographEncoder) -> dict[str, Query]:

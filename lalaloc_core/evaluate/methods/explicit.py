@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from cachetools import LRUCache, cachedmethod
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -71,7 +71,12 @@ class ExplicitLayout:
         grid = self._grid(question)
         image = read_image(self._encoders, question)
         with clock.stage("encode"):
-            profile_m, heading = self._profile(question, image)
+            # With the heading of the layouts to compare with it.
+            if image is None:
+                profile_m, heading = question.true_profile(self._columns), 0.0
+            else:
+                camera = question.camera
+                profile_m, heading = self._encoders.spheres.profile(image, camera.heading, camera.camera_height_m)
         with clock.stage("retrieve"):
             retrieved, distance = grid.nearest(profile_m)
         stages = {"retrieval": question.pose_of(question.grid, retrieved, distance)}
@@ -86,14 +91,6 @@ class ExplicitLayout:
         with clock.stage("align"):
             stages["align"] = self._align(question, profile_m, heading, stages["vdr"])
         return Answer(stages=stages, retrieved=retrieved, timings_ms=clock.timings_ms)
-
-    def _profile(
-        self, question: Question, image: UInt8[np.ndarray, "h w 3"] | None
-    ) -> tuple[Float[np.ndarray, "w"], float]:
-        """Return the query's wall profile (m) and the heading of the layouts to compare with it."""
-        if image is None:
-            return question.true_profile(self._columns), 0.0
-        return self._encoders.spheres.profile(image, question.camera.heading, question.camera.camera_height_m)
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
     def _grid(self, question: Question) -> _RenderedPoses:
