@@ -55,7 +55,7 @@ class TestMaps:
         assert (kind == sphere[row, :, 0]).mean() > 0.99
 
     def test_column_shares_are_probabilities(self) -> None:
-        seen = read_walls_and_openings(painted(), by_colour, WIDTH).openings
+        seen = read_walls_and_openings(painted(), by_colour, WIDTH)[0]
         value = lambda column: seen[column * WIDTH // COLUMNS]  # noqa: E731
         assert value(260).tolist() == [1.0, 0.0]
         assert value(640).tolist() == [0.0, 1.0]
@@ -80,7 +80,7 @@ class TestWalls:
     azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2.0 * np.pi
 
     def test_wall_distance_comes_from_the_floor_line(self) -> None:
-        seen = read_walls_and_openings(room((2.0, 3.0)), by_colour, WIDTH).log_distance
+        seen = read_walls_and_openings(room((2.0, 3.0)), by_colour, WIDTH)[1]
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         assert np.isfinite(seen).all()
         np.testing.assert_allclose(seen, expected, atol=0.05)
@@ -88,7 +88,7 @@ class TestWalls:
     def test_ceiling_line_replaces_a_hidden_floor_line(self) -> None:
         sphere = room((2.0, 3.0))
         sphere[ROWS // 2 + 20 :, 100:200] = SOFA
-        seen = read_walls_and_openings(sphere, by_colour, WIDTH).log_distance
+        seen = read_walls_and_openings(sphere, by_colour, WIDTH)[1]
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         np.testing.assert_allclose(seen, expected, atol=0.08)
 
@@ -102,7 +102,7 @@ class TestWalls:
             sloped[: ROWS // 2, there] = room((2.0, 3.0), ceiling_m=ceiling_m)[: ROWS // 2, there]
         sloped[ROWS // 2 + 20 :, 100:200] = SOFA
         for picture in (sphere, sloped):
-            unseen = np.isnan(read_walls_and_openings(picture, by_colour, WIDTH).log_distance)
+            unseen = np.isnan(read_walls_and_openings(picture, by_colour, WIDTH)[1])
             assert unseen[14:24].all()
             assert not unseen[30:].any()
 

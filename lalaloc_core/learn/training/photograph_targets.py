@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -91,10 +91,9 @@ def _taught(paths: Sequence[Path], teachers: Sequence[Path], height: int, width:
     for path in segmenters:
         segment = load_segmenter(path)
         large = _read(paths, SPHERE_ROWS, 2 * SPHERE_ROWS)
-        readings = [read_walls_and_openings(picture.numpy(), segment, width) for picture in large]
-        openings = torch.from_numpy(np.stack([reading.openings for reading in readings]))
+        readings = (read_walls_and_openings(picture.numpy(), segment, width) for picture in large)
+        openings, distance = (torch.from_numpy(np.stack(part)) for part in zip(*readings, strict=True))
         openings = torch.cat([openings, torch.full_like(openings[..., :1], torch.nan)], dim=2)
-        distance = torch.from_numpy(np.stack([reading.log_distance for reading in readings]))
         targets.append((openings, distance))
     for path in bundles:
         encoder = _load_encoder(path)
@@ -175,23 +174,16 @@ _COLUMNS_WITH_BOTH, _FLATNESS = 8, 0.08
 Segment = Callable[[UInt8[np.ndarray, "h w 3"]], Int[np.ndarray, "h w"]]
 
 
-@dataclass(frozen=True, eq=False)
-class SegmenterReading:
-    """Predictions of a sphere by column.
+def read_walls_and_openings(
+    sphere: UInt8[np.ndarray, "h w 3"], segment: Segment, width: int
+) -> tuple[Float[np.ndarray, "w 2"], Float[np.ndarray, "w"]]:
+    """Return the probabilities of door and window, and the log distance of the wall in camera heights, by column.
 
-    `openings` are probabilities of door and window. `log_distance` is that of the wall in camera heights; NaN where it
-    is not visible.
+    The distance is NaN where the wall is not visible.
     """
-
-    openings: Float[np.ndarray, "w 2"]
-    log_distance: Float[np.ndarray, "w"]
-
-
-def read_walls_and_openings(sphere: UInt8[np.ndarray, "h w 3"], segment: Segment, width: int) -> SegmenterReading:
-    """Predict the walls and openings of a sphere in `width` columns."""
     elevation_deg = np.arange(-_REACH_DEG, _REACH_DEG, _STEP_DEG) + 0.5 * _STEP_DEG
     classes = _class_map(sphere, segment, np.radians(elevation_deg), width)
-    return SegmenterReading(_openings(classes, elevation_deg), _walls(classes, elevation_deg))
+    return _openings(classes, elevation_deg), _walls(classes, elevation_deg)
 
 
 def _openings(kind: Int[np.ndarray, "r w"], elevation_deg: Float[np.ndarray, "r"]) -> Float[np.ndarray, "w 2"]:
