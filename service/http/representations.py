@@ -12,7 +12,6 @@ import asyncio
 import hashlib
 import re
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
-from dataclasses import dataclass
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -141,21 +140,9 @@ async def _disconnect(receive: Receive) -> None:
 
 # Private, and revalidated each time: keys can be revoked and plans replaced.
 _CACHED = {"Cache-Control": "private, no-cache"}
-_TAG = re.compile(r'[ \t,]*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"[ \t]*(?:,[ \t,]*|\Z)')
+_TAG = re.compile(r'[ \t,]*(W/)?("[\x21\x23-\x7e\x80-\xff]*")[ \t]*(?:,[ \t,]*|\Z)')
 _DIGITS = 32
 _RANGE = re.compile(r"bytes=[ \t]*([0-9]{0,18})-([0-9]{0,18})[ \t]*")
-
-
-@dataclass(frozen=True)
-class Tags:
-    """List of entity tags, without quotes.
-
-    The list is `*` if `any`; `all` are strong and weak tags.
-    """
-
-    any: bool
-    strong: frozenset[str]
-    all: frozenset[str]
 
 
 def digest_etag(digest: str) -> str:
@@ -171,8 +158,7 @@ def revision_etag(revision_id: str, *parts: object) -> str:
 
 def not_modified(request: Request, etag: str, headers: Mapping[str, str] | None = None) -> Response | None:
     """Return 304 if the client has the representation with this tag already; otherwise None."""
-    none_match = _tags(request, "If-None-Match")
-    if none_match is not None and (none_match.any or etag.strip('"') in none_match.all):
+    if {"*", etag}.intersection(_tags(request, "If-None-Match") or ()):
         return Response(status_code=304, headers={"ETag": etag, **_CACHED, **(headers or {})})
     return None
 
@@ -219,29 +205,29 @@ def expected_revision(request: Request, resource_id: str, revision_id: str, *, w
     Returns:
         The revision that must still be current when the change is stored; None for any.
     """
-    match, none_match = _tags(request, "If-Match"), _tags(request, "If-None-Match")
-    if none_match is not None and (none_match.any or revision_id in _revisions(none_match.all)):
+    match, none_match = _tags(request, "If-Match", weak=False), _tags(request, "If-None-Match") or set()
+    if "*" in none_match or revision_id in _revisions(none_match):
         raise RevisionMismatchError(resource_id, "any other (If-None-Match)", revision_id, what=what)
-    if match is None or match.any:
+    if match is None or "*" in match:
         return None
-    named = _revisions(match.strong)
+    named = _revisions(match)
     if revision_id not in named:
         raise RevisionMismatchError(resource_id, ", ".join(sorted(named)) or "a weak tag", revision_id, what=what)
     return revision_id
 
 
-def _revisions(tags: frozenset[str]) -> set[str]:
-    return {tag.partition(".")[0] for tag in tags}
+def _revisions(tags: set[str]) -> set[str]:
+    return {tag.strip('"').partition(".")[0] for tag in tags}
 
 
-def _tags(request: Request, name: str) -> Tags | None:
-    """Return the tags of a header, whose lines are joined; None without the header."""
+def _tags(request: Request, name: str, *, weak: bool = True) -> set[str] | None:
+    """Return the tags of a header in their quotes, `*` without, weak ones only if wanted; None without the header."""
     values = request.headers.getlist(name)
     if not values:
         return None
     text = ", ".join(values).strip(" \t")
     if text == "*":
-        return Tags(any=True, strong=frozenset(), all=frozenset())
+        return {"*"}
     found: list[tuple[bool, str]] = []
     end = 0
     while end < len(text) and (tag := _TAG.match(text, end)) is not None:
@@ -250,5 +236,4 @@ def _tags(request: Request, name: str) -> Tags | None:
     if not found or end < len(text):
         fault = f"is '{text[:100]}', which is neither * nor a list of entity tags in double quotes"
         raise InvalidRequestError([(name, fault)])
-    strong = frozenset(opaque for weak, opaque in found if not weak)
-    return Tags(any=False, strong=strong, all=frozenset(opaque for _, opaque in found))
+    return {opaque for is_weak, opaque in found if weak or not is_weak}
