@@ -55,10 +55,10 @@ async def get_original(floorplan_id: str, call: Call) -> Response:
     original = await run_in_threadpool(originals.checked, plan.revision_id)
     if digest is None or original is None:
         raise errors.UnknownFloorPlanError(floorplan_id)
+    media_type, size_bytes = original
     # An uploaded drawing can contain scripts, so browsers must not open it as a page of this service.
-    kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
-    chunks = _chunks(plan, original.size_bytes, call)
-    return tagged_stream(chunks, original.size_bytes, original.media_type, digest_etag(digest), kept)
+    kept = {"Content-Disposition": "attachment"} if media_type != JSON else None
+    return tagged_stream(_chunks(plan, size_bytes, call), size_bytes, media_type, digest_etag(digest), kept)
 
 
 @router.get(

@@ -11,7 +11,6 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import httpx
@@ -52,12 +51,6 @@ class _Registry(JWSRegistry):
     max_header_length = 4096
 
 
-@dataclass(frozen=True)
-class _Published:
-    keys: KeySet
-    fetched_s: float
-
-
 class TokenVerifier:
     """Check of tokens; for one event loop.
 
@@ -76,7 +69,8 @@ class TokenVerifier:
     ) -> None:
         self._settings, self._clock, self._now = settings, clock, now
         self._registry = _Registry(algorithms=ALGORITHMS, strict_check_header=False)
-        self._published: _Published | None = None
+        # Keys of the issuer, and when they were fetched.
+        self._published: tuple[KeySet, float] | None = None
         self._tried_s = -float("inf")
         self._fetching: asyncio.Task[None] | None = None
 
@@ -164,10 +158,10 @@ class TokenVerifier:
             self._begin_fetch()
         if self._published is None or self._age_s() >= _STALE_S:
             raise IssuerUnavailableError()
-        return self._published.keys
+        return self._published[0]
 
     def _age_s(self) -> float:
-        return float("inf") if self._published is None else self._clock() - self._published.fetched_s
+        return float("inf") if self._published is None else self._clock() - self._published[1]
 
     def _begin_fetch(self) -> asyncio.Task[None] | None:
         """Return a fetch in progress; None if the last one ended a moment ago."""
@@ -179,7 +173,7 @@ class TokenVerifier:
 
     async def _fetch(self) -> None:
         try:
-            self._published = _Published(await fetch_keys(self._settings.oidc_issuer), self._clock())
+            self._published = await fetch_keys(self._settings.oidc_issuer), self._clock()
         except (httpx.HTTPError, OSError, ValueError, RecursionError) as error:
             fields = {"issuer": self._settings.oidc_issuer, "reason": f"{type(error).__name__}: {error}"[:300]}
             logging.getLogger(LOGGER_NAME).warning("fetching the issuer's keys failed", extra={"fields": fields})

@@ -174,10 +174,8 @@ class KeptAnswers:
             values = {"id": answer_id, "tenant": tenant, "plan_id": plan_id, "created_at": now, "stored_bytes": size}
             connection.execute(KEPT_ANSWERS.insert(), values | {"content": content})
             newest = select(_ANSWERS.id).where(own).order_by(_ANSWERS.created_at.desc(), _ANSWERS.id)
-            surplus = connection.scalars(newest.offset(limit).limit(limit)).all()
-            freed = 0
-            if surplus:
-                freed = deleted_bytes(connection, delete(KEPT_ANSWERS).where(_ANSWERS.id.in_(surplus)))
+            surplus = newest.offset(limit).limit(limit)
+            freed = deleted_bytes(connection, delete(KEPT_ANSWERS).where(_ANSWERS.id.in_(surplus)))
             self._quota.settle(connection, tenant, StoredBytes(answers=size - freed))
         return answer_id
 

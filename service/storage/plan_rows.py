@@ -157,14 +157,6 @@ def _height_std_m(plan: FloorPlan) -> float | None:
     return DEFAULT_STD_M if plan.states_camera_height else None
 
 
-@dataclass(frozen=True)
-class OriginalFile:
-    """Uploaded file of a revision, without its content."""
-
-    media_type: str
-    size_bytes: int
-
-
 class Originals:
     """Uploaded files of all tenants. Callers check access first."""
 
@@ -175,8 +167,8 @@ class Originals:
         """Return the SHA-256 digest of a revision's file."""
         return self._database.value(select(REVISIONS.c.original_sha256).where(REVISIONS.c.id == revision_id))
 
-    def checked(self, revision_id: str) -> OriginalFile | None:
-        """Compare a revision's file with its digest, and return the file."""
+    def checked(self, revision_id: str) -> tuple[str, int] | None:
+        """Compare a revision's file with its digest, and return its media type and size (bytes)."""
         columns = REVISIONS.c
         query = select(columns.plan_id, columns.original_sha256, columns.original_media_type)
         digest, size_bytes = hashlib.sha256(), 0
@@ -189,7 +181,7 @@ class Originals:
                 size_bytes += len(chunk)
         if digest.hexdigest() != row.original_sha256:
             raise damaged("original", row.plan_id, revision_id)
-        return OriginalFile(row.original_media_type or JSON, size_bytes)
+        return row.original_media_type or JSON, size_bytes
 
     def chunk(self, revision_id: str, number: int) -> bytes | None:
         """Return one chunk of a revision's file; None after the last, and if the revision was deleted."""

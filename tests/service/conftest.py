@@ -327,7 +327,7 @@ def original_of(store: Store, plan_id: str) -> bytes:
     file = store.originals.checked(summary.revision_id)
     assert file is not None
     content = b""
-    while len(content) < file.size_bytes:
+    while len(content) < file[1]:
         chunk = store.originals.chunk(summary.revision_id, len(content) // CHUNK_BYTES)
         assert chunk
         content += chunk

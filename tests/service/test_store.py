@@ -21,7 +21,6 @@ from lalaloc_core.render.sampling import PoseSet
 from service.errors import RevisionMismatchError, ServiceError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.storage import database
 from service.storage.kept_answers import KEPT_FOR, IdempotencyKeys
-from service.storage.plan_rows import OriginalFile
 from service.storage.plans import PlanDocument
 from service.storage.records import (
     Claimed,
@@ -188,7 +187,7 @@ def test_read_during_deletion_is_complete(open_store: OpenStore, half_way: str) 
 
     event.listen(second.database._engine, "before_cursor_execute", delete_elsewhere)
     if "chunks" in half_way:
-        assert second.originals.checked(added.revision_id) == OriginalFile("application/json", len(original))
+        assert second.originals.checked(added.revision_id) == ("application/json", len(original))
         assert second.originals.checked(added.revision_id) is None
         assert second.originals.chunk(added.revision_id, 0) is None
     else:
