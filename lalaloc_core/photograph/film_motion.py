@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -80,19 +79,20 @@ class FlowTracker:
         swept = None if shift is None else math.atan(-shift / focal)
         if moved is None:
             return (math.nan, _GUESSED_SHARE) if swept is None else (swept, _EDGE_SHARE)
+        places, growth, share = moved
         # Angles, because pixels near the border are narrower.
-        angles = np.arctan(moved.places / focal)
+        angles = np.arctan(places / focal)
         across, down = np.median(angles[1] - angles[0], axis=0)
         turn = -float(across)
         self._down += float(down)
-        if moved.places.shape[1] < _FEW or abs(turn) < _STILL:
+        if places.shape[1] < _FEW or abs(turn) < _STILL:
             if swept is None:
                 return math.nan, _GUESSED_SHARE
             if abs(turn - swept) > max(_UNLIKE, _UNLIKE_SHARE * abs(swept)):
                 return swept, _EDGE_SHARE
         self._nods.append(float(down))
-        self._shares.append(moved.share)
-        self._grown += moved.growth
+        self._shares.append(share)
+        self._grown += growth
         return turn, _CORNER_SHARE
 
     def reckoned(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
@@ -172,16 +172,13 @@ def _edges_shift(before: Float[np.ndarray, "h w"], after: Float[np.ndarray, "h w
     return float(best[1]) if best[0] > _CORRELATION else None
 
 
-class _Moved(NamedTuple):
-    """Corners that move together: their places (pixels from the centre) before and after, log growth, share of all."""
+def _moved(
+    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "2 n 2"], float, float] | None:
+    """Return the motion of corners from one sample to the next; None if too few are found again.
 
-    places: Float[np.ndarray, "2 n 2"]
-    growth: float
-    share: float
-
-
-def _moved(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> _Moved | None:
-    """Return the motion of corners from one sample to the next; None if too few are found again."""
+    Of those that move together: their places (pixels from the centre) before and after, log growth, share of all.
+    """
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, _QUALITY, _APART)
     if corners is None or len(corners) < _LEAST:
         return None
@@ -197,4 +194,4 @@ def _moved(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) ->
     growth = math.hypot(change[0, 0], change[1, 0])
     agreed = together.ravel() == 1
     places = np.stack([one[agreed], other[agreed]]).astype(float)
-    return _Moved(places, math.log(max(growth, 1e-3)), float(agreed.mean()))
+    return places, math.log(max(growth, 1e-3)), float(agreed.mean())

@@ -41,7 +41,7 @@ def cast_rays(
     pad. The distance is inf for a ray that meets no wall, which happens only outside a closed room.
     """
     xp = array_namespace(origin_m, azimuth, walls_m)
-    return _distance(xp.max(inverse_crossings(origin_m, azimuth, walls_m).inverse_m, axis=1))
+    return _distance(xp.max(inverse_crossings(origin_m, azimuth, walls_m)[0], axis=1))
 
 
 def nearest_walls(
@@ -49,7 +49,7 @@ def nearest_walls(
 ) -> tuple[Float[Array, "b c"], Int[Array, "b c"]]:
     """Return the distances of `cast_rays` and the index of the wall that each ray meets (any, for equal distances)."""
     xp = array_namespace(origin_m, azimuth, walls_m)
-    inverse_m = inverse_crossings(origin_m, azimuth, walls_m).inverse_m
+    inverse_m, _, _ = inverse_crossings(origin_m, azimuth, walls_m)
     return _distance(xp.max(inverse_m, axis=1)), xp.argmax(inverse_m, axis=1)
 
 
@@ -62,23 +62,13 @@ def _distance(inverse_m: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return xp.where(meets, distance_m, xp.full_like(distance_m, xp.inf))
 
 
-class InverseCrossings(NamedTuple):
-    """Inverse distances from ray origins to walls.
-
-    Attributes:
-        inverse_m: (b, n, c) inverse distance (1/m) to every wall along every ray; 0 or less for a miss.
-        edge_x, edge_y: (b, n) components of e / (p × e) for the wall from p to p + e, relative to the origin.
-    """
-
-    inverse_m: Array
-    edge_x: Array
-    edge_y: Array
-
-
 def inverse_crossings(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
-) -> InverseCrossings:
+) -> tuple[Float[Array, "b n c"], Float[Array, "b n"], Float[Array, "b n"]]:
     """Intersect every ray with every wall; see `cast_rays` for the arguments.
+
+    Returns the inverse distance (1/m) to every wall along every ray, 0 or less for a miss; and the components of
+    e / (p × e) for the wall from p to p + e, relative to the origin.
 
     A ray along the unit vector u meets the line from p to p + e at the distance d with 1 / d = (u × e) / (p × e), where
     v × w = v_x w_y - v_y w_x. It meets the wall itself if p and p + e lie on opposite sides of the ray. All three cross
@@ -99,7 +89,7 @@ def inverse_crossings(
     products = xp.stack([crossed_y, -crossed_x], axis=2) @ direction
     count = walls_m.shape[1]
     inverse_m, begins, ends = products[:, :count], products[:, count : 2 * count], products[:, 2 * count :]
-    return InverseCrossings(xp.where(begins * ends <= 0.0, inverse_m, xp.zeros_like(inverse_m)), by_x, by_y)
+    return xp.where(begins * ends <= 0.0, inverse_m, xp.zeros_like(inverse_m)), by_x, by_y
 
 
 def wall_profile(
@@ -144,16 +134,10 @@ def back_project(depth_m: Float[Array, "b h w"]) -> Float[Array, "b h*w 3"]:
 
 
 class ProfileJacobian(NamedTuple):
-    """Log wall profiles and their derivatives.
-
-    Attributes:
-        by_pose: (b, 3, c) derivatives by x and y (m) and by the heading (radians).
-        wall: (b, c) index of the wall that each ray meets.
-    """
+    """Log wall profiles, and their derivatives (b, 3, c) by x and y (m) and by the heading (radians)."""
 
     log_m: Array
     by_pose: Array
-    wall: Array
 
 
 def log_profile_gradient(
@@ -174,13 +158,12 @@ def log_distance_gradient(
 ) -> ProfileJacobian:
     """Return log distances and derivatives along any azimuths (radians); see `log_profile_gradient`."""
     xp = array_namespace(origin_m, azimuth, walls_m)
-    crossings = inverse_crossings(origin_m, azimuth, walls_m)
-    wall = xp.argmax(crossings.inverse_m, axis=1)
-    inverse_m = xp.maximum(xp.max(crossings.inverse_m, axis=1), 1.0 / _MAX_DISTANCE_M)
-    edge_x = xp.take_along_axis(crossings.edge_x, wall, axis=1)
-    edge_y = xp.take_along_axis(crossings.edge_y, wall, axis=1)
+    every_m, by_x, by_y = inverse_crossings(origin_m, azimuth, walls_m)
+    wall = xp.argmax(every_m, axis=1)
+    inverse_m = xp.maximum(xp.max(every_m, axis=1), 1.0 / _MAX_DISTANCE_M)
+    edge_x, edge_y = xp.take_along_axis(by_x, wall, axis=1), xp.take_along_axis(by_y, wall, axis=1)
     turned = -(xp.cos(azimuth) * edge_y + xp.sin(azimuth) * edge_x) / inverse_m
-    return ProfileJacobian(-xp.log(inverse_m), xp.stack([-edge_y, edge_x, turned], axis=1), wall)
+    return ProfileJacobian(-xp.log(inverse_m), xp.stack([-edge_y, edge_x, turned], axis=1))
 
 
 def free_travel_m(

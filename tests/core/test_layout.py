@@ -19,7 +19,13 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.plans import VALIDATION, generate_home
 from lalaloc_core.localise.match import Layouts, layouts_at
 from lalaloc_core.localise.match.pose_grid import layouts_of_plans
-from lalaloc_core.render.profile import free_travel_m, log_distance_gradient, log_profile_gradient, wall_profile
+from lalaloc_core.render.profile import (
+    free_travel_m,
+    log_distance_gradient,
+    log_profile_gradient,
+    nearest_walls,
+    wall_profile,
+)
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from lalaloc_core.render.sweep import profiles_at, sweep_layouts
 from tests.core.reference_views import reference_view
@@ -226,7 +232,7 @@ class TestProfiles:
         def log_profile(unknowns: torch.Tensor) -> torch.Tensor:
             return wall_profile(unknowns[:, :2], unknowns[:, 2], walls, COLUMNS).log()
 
-        value, by_pose, _ = log_profile_gradient(pose[:, :2], pose[:, 2], walls, COLUMNS)
+        value, by_pose = log_profile_gradient(pose[:, :2], pose[:, 2], walls, COLUMNS)
         for unknown in range(3):
             tangent = torch.zeros_like(pose)
             tangent[:, unknown] = 1.0
@@ -244,7 +250,10 @@ class TestProfiles:
         single = log_profile_gradient(position, heading, walls, COLUMNS)
         assert single.by_pose.dtype == torch.float32
         # Next to an occluding edge rounding decides which wall is met.
-        same = single.wall.numpy() == exact.wall
+        azimuth = scene.heading[:, None] + column_azimuths(COLUMNS)
+        _, wall = nearest_walls(scene.poses.position_m, azimuth, scene.walls_m)
+        _, single_wall = nearest_walls(position, torch.tensor(azimuth, dtype=torch.float32), walls)
+        same = single_wall.numpy() == wall
         assert same.mean() > 0.95
         np.testing.assert_allclose(single.log_m.numpy()[same], exact.log_m[same], atol=1e-4)
         for unknown in range(3):

@@ -282,7 +282,7 @@ def test_known_values_are_not_aligned(prototype_sets: list[np.ndarray]) -> None:
     rows, rng = prototype_sets[0][:5], np.random.default_rng(13)
     query = replace(query_at(prototype_sets[0], 3, rng), camera_height=CameraHeight(1.5, 0.0))
     costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
-    step = PrototypeAlignment(costs).pairs(rows, np.zeros(5, int), np.zeros(5, int)).step
+    _, step = PrototypeAlignment(costs).pairs(rows, np.zeros(5, int), np.zeros(5, int))
     assert np.abs(step[:, :2]).max() > 0.01
     np.testing.assert_array_equal(step[:, 2:], 0.0)
 
@@ -341,7 +341,7 @@ def test_mass_sums_over_prototypes_and_hypotheses(prototype_sets: list[np.ndarra
     expected = []
     for part in few:
         offset = np.zeros(len(part), int)
-        cost = np.stack([alignment.pairs(part, np.full(len(part), k), offset).cost for k in range(4)])
+        cost = np.stack([alignment.pairs(part, np.full(len(part), k), offset)[0] for k in range(4)])
         weighed = part["log_area"] - WEIGHTS.temperature * cost.astype(float)
         expected.append(np.logaddexp.reduce(weighed, axis=None))
     found = index.whole.log_masses(query, WEIGHTS, CONFIG)

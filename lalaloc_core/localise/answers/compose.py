@@ -106,8 +106,9 @@ def _uncertainty(place: Placed, model: ConfidenceModel | None) -> tuple[Covarian
     uncertainty = pose_uncertainty(information, place.plan.rooms[place.candidate.room_index], model)
     if uncertainty is None:
         return None, None
-    (xx, xy), (_, yy) = uncertainty.position_m2.tolist()
-    return [[xx, xy], [xy, yy]], None if uncertainty.heading_std is None else math.degrees(uncertainty.heading_std)
+    position_m2, heading_std = uncertainty
+    (xx, xy), (_, yy) = position_m2.tolist()
+    return [[xx, xy], [xy, yy]], None if heading_std is None else math.degrees(heading_std)
 
 
 def _heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:

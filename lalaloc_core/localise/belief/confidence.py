@@ -140,23 +140,13 @@ def confidence_of(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class PoseUncertainty:
-    """Uncertainty of a pose.
-
-    Attributes:
-        position_m2: covariance of (x, y) in m², plan frame.
-        heading_std: standard deviation of the heading (radians); None if the heading was given.
-    """
-
-    position_m2: Float[np.ndarray, "2 2"]
-    heading_std: float | None
-
-
 def pose_uncertainty(
     information: Float[np.ndarray, "p p"], room: Room, model: ConfidenceModel
-) -> PoseUncertainty | None:
+) -> tuple[Float[np.ndarray, "2 2"], float | None] | None:
     """Return the uncertainty of a pose in a room; None if the model has no factors for it.
+
+    It is the covariance of (x, y) in m², plan frame, and the standard deviation of the heading (radians), None if the
+    heading was given.
 
     Standard deviations are limited to those of a uniform distribution: over the room's longest extent (its length over
     √12), as along a corridor without visible ends, and over all headings (π/√3).
@@ -175,7 +165,7 @@ def pose_uncertainty(
         heading_std = _ANY_HEADING_STD
         if by_heading > 0.0:
             heading_std = min(math.sqrt(model.heading_factor / by_heading), _ANY_HEADING_STD)
-    return PoseUncertainty(0.5 * (covariance + covariance.T), heading_std)
+    return 0.5 * (covariance + covariance.T), heading_std
 
 
 def marginal_information(information: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "2 2"], float | None]:

@@ -87,11 +87,6 @@ class Known:
     rooms: bool = False
 
 
-class _Told(NamedTuple):
-    bits: float
-    share: float
-
-
 def next_step(plan: FloorPlan, manifest: Manifest, known: Known, *, step_m: float) -> NextStep | None:
     """Return the step with the highest expected confidence; None where the answer is sure, or no step is worth it."""
     return next(iter(next_steps(plan, manifest, known, step_m=step_m)), None)
@@ -156,7 +151,7 @@ class _Belief:
 
     def told(
         self, likelihood: Float[np.ndarray, "k n"], *, near: Float[np.ndarray, "n n"] | None = None, drawn: bool = True
-    ) -> _Told:
+    ) -> tuple[float, float]:
         """Return the mean information and the mean share within 1 m of the best place after some observations.
 
         `likelihood` is that of each observation at every place; the observations are `drawn`, or all that are possible.
@@ -166,14 +161,14 @@ class _Belief:
         total = after.sum(axis=1)
         possible = total > 0.0
         if not possible.any():
-            return _Told(0.0, self.share)
+            return 0.0, self.share
         after, total = after[possible] / total[possible, None], total[possible]
         cells, before = after @ self._in_cell, self.weight @ self._in_cell
         ratio = np.divide(cells, before, out=np.ones_like(cells), where=cells > 0.0)
         bits = (cells * np.log2(ratio)).sum(axis=1)
         share = (after @ (self._near if near is None else near)).max(axis=1)
         weights = None if drawn else total
-        return _Told(float(np.average(bits, weights=weights)), float(np.average(share, weights=weights)))
+        return float(np.average(bits, weights=weights)), float(np.average(share, weights=weights))
 
     @cached_property
     def _in_cell(self) -> Float[np.ndarray, "n c"]:
@@ -252,18 +247,18 @@ class _Photographs:
         rows = self._drawn(self._belief.weight)
         likelihood = self._likelihoods(self._layouts, rows, masks)
         for number, turn in enumerate(turns):
-            told = self._belief.told(likelihood[:, number])
-            yield NextStep(kind="turn", bits=told.bits, confidence=self._known.fit * told.share, turn=turn)
+            bits, share = self._belief.told(likelihood[:, number])
+            yield NextStep(kind="turn", bits=bits, confidence=self._known.fit * share, turn=turn)
 
     def doors(self) -> Iterator[NextStep]:
         """Yield the steps through a door to a photograph from behind it."""
         for door in self._doors():
             told = self._through(door)
             if told is not None:
-                confidence = self._known.fit * told.share
-                yield NextStep(kind="door", bits=told.bits, confidence=confidence, **door._asdict())
+                bits, share = told
+                yield NextStep(kind="door", bits=bits, confidence=self._known.fit * share, **door._asdict())
 
-    def _through(self, door: _Door) -> _Told | None:
+    def _through(self, door: _Door) -> tuple[float, float] | None:
         """Return the expectation of a photograph from behind a door; None if few places have that door."""
         belief, layouts = self._belief, self._layouts
         assert layouts.kind is not None

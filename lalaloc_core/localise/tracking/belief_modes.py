@@ -174,9 +174,8 @@ def measured_pose(plan: FloorPlan, encoder: LayoutEncoder, query: Query, answer:
     model = encoder.manifest.confidence_for(view=query.is_view)
     if answer.information is not None and model is not None:
         uncertainty = pose_uncertainty(answer.information, plan.rooms[answer.room_index], model)
-        if uncertainty is not None and uncertainty.heading_std is not None:
-            covariance[:2, :2] = uncertainty.position_m2
-            covariance[2, 2] = uncertainty.heading_std**2
+        if uncertainty is not None and uncertainty[1] is not None:
+            covariance[:2, :2], covariance[2, 2] = uncertainty[0], uncertainty[1] ** 2
     return mean, covariance + np.diag([1e-6, 1e-6, 1e-8])
 
 

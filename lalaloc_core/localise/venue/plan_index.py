@@ -244,7 +244,8 @@ class PlanIndex:
             masses, alignment = _Masses(self.plan_count, search.costs.temperature), PrototypeAlignment(search.costs)
             _, j = search.costs.shape
             for batch in self._batches(pairs):
-                masses.add(batch, alignment.pairs(batch.rows, *np.divmod(batch.pairs.hypothesis, j)).cost)
+                cost, _ = alignment.pairs(batch.rows, *np.divmod(batch.pairs.hypothesis, j))
+                masses.add(batch, cost)
             return masses.log()
 
         return aligned

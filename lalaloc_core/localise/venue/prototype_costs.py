@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -238,18 +237,6 @@ def _walls(factor: Float[np.ndarray, "n a"], precision: Float[np.ndarray, "n a"]
     return mean_log(factor, factors=_FACTORS, max_factor=_MAX_FACTOR)
 
 
-class _Aligned(NamedTuple):
-    """Pairs of a prototype and a hypothesis.
-
-    Attributes:
-        cost: (n,) cost at the aligned pose, with the prior of the unknowns.
-        step: (n, 4) unknowns: x, y (m), turn (radians) and log height; 0 for those that the query states exactly.
-    """
-
-    cost: Float[np.ndarray, "n"]
-    step: Float[np.ndarray, "n 4"]
-
-
 class PrototypeAlignment:
     """Alignment of pairs of a prototype and a hypothesis for one query: their cost at the best pose nearby.
 
@@ -281,14 +268,19 @@ class PrototypeAlignment:
         self._free = np.flatnonzero(sigma > 0.0)
         self._stiffness = (1.0 / np.square(sigma[self._free])).astype(np.float32)
 
-    def pairs(self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]) -> _Aligned:
-        """Align prototypes, each under one hypothesis; the arguments are as in `PrototypeCosts.pairs`."""
-        aligned = _Aligned(np.empty(len(rows), np.float32), np.zeros((len(rows), 4), np.float32))
+    def pairs(
+        self, rows: np.ndarray, hypothesis: Int[np.ndarray, "n"], offset: Int[np.ndarray, "n"]
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 4"]]:
+        """Align prototypes, each under one hypothesis; the arguments are as in `PrototypeCosts.pairs`.
+
+        Returns the costs at the aligned poses, with the prior of the unknowns; and the unknowns: x, y (m), turn
+        (radians) and log height, 0 for those that the query states exactly.
+        """
+        cost, unknowns = np.empty(len(rows), np.float32), np.zeros((len(rows), 4), np.float32)
         for begin in range(0, len(rows), _ALIGNED_CHUNK):
             part = slice(begin, begin + _ALIGNED_CHUNK)
-            aligned.cost[part], step = self._pairs(rows[part], hypothesis[part], offset[part])
-            aligned.step[part, self._free] = step
-        return aligned
+            cost[part], unknowns[part, self._free] = self._pairs(rows[part], hypothesis[part], offset[part])
+        return cost, unknowns
 
     def _pairs(
         self, rows: np.ndarray, hypothesis: np.ndarray, offset: np.ndarray
