@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice, product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -62,14 +62,8 @@ class Combination:
 
 Figures = dict[str, float]
 Rows = Mapping[Combination, Mapping[str, Figures]]
-
-
-class Solved(NamedTuple):
-    """Figures of an album, and for each of its pins the share of its room and whether that is right."""
-
-    figures: Figures
-    misread: float
-    pins: list[tuple[float, bool]]
+# Figures of an album, and for each of its pins 1, the share of its room, the album's misread and whether it is right.
+_Result = tuple[Figures, list[tuple[float, float, float, bool]]]
 
 
 def bench_album_weights(setting: Setting) -> dict[str, Any]:
@@ -80,13 +74,13 @@ def bench_album_weights(setting: Setting) -> dict[str, Any]:
         the one with the best score of the other sources; and `confidence` fitted to the pins of the chosen one, a tenth
         of which are in the plans of other homes.
     """
-    solved: defaultdict[Combination, defaultdict[str, list[Solved]]] = defaultdict(lambda: defaultdict(list))
+    solved: defaultdict[Combination, defaultdict[str, list[_Result]]] = defaultdict(lambda: defaultdict(list))
     with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
         for source, found in pool.map(partial(_solved, setting.bundle), _albums(setting)):
             for weights, album in found.items():
                 solved[weights][source].append(album)
     rows = {
-        weights: {source: _total([album.figures for album in albums]) for source, albums in row.items()}
+        weights: {source: _total([figures for figures, _ in albums]) for source, albums in row.items()}
         for weights, row in solved.items()
     }
     sources = sorted({source for row in rows.values() for source in row if not source.startswith(_FOREIGN)})
@@ -122,11 +116,11 @@ def _albums(setting: Setting) -> Iterator[tuple[str, RoomAlbum]]:
         yield f"{_FOREIGN}_house", houses["album"].elsewhere(before)
 
 
-def _solved(bundle: Bundle, named: tuple[str, RoomAlbum]) -> tuple[str, dict[Combination, Solved]]:
+def _solved(bundle: Bundle, named: tuple[str, RoomAlbum]) -> tuple[str, dict[Combination, _Result]]:
     """Return an album by combination; its photographs are compared once for each temperature."""
     source, album = named
     encoder = PhotographEncoder(bundle, threads=1)
-    found = dict[Combination, Solved]()
+    found = dict[Combination, _Result]()
     for temperature in _TEMPERATURES:
         memory = AlbumMemory()
         for misread, (pairs, crowding) in product(_MISREAD, _PAIRS_CROWDING):
@@ -134,19 +128,19 @@ def _solved(bundle: Bundle, named: tuple[str, RoomAlbum]) -> tuple[str, dict[Com
             encoder.manifest = weights.changed(bundle.manifest)
             solved = album.solve(encoder, memory)
             pins = [
-                (pin.confidence, (pin.pose.plan_id, pin.pose.room_id) == room)
+                (1.0, pin.confidence, solved.misread, (pin.pose.plan_id, pin.pose.room_id) == room)
                 for pin, room in zip(solved.pins, album.rooms, strict=True)
                 if pin.pose is not None
             ]
-            found[weights] = Solved(pin_figures(solved.pins, album.rooms), solved.misread, pins)
+            found[weights] = pin_figures(solved.pins, album.rooms), pins
     return source, found
 
 
-def _fitted_confidence(albums: Mapping[str, list[Solved]]) -> list[float]:
+def _fitted_confidence(albums: Mapping[str, list[_Result]]) -> list[float]:
     """Return `AlbumWeights.confidence` by logistic regression, in which sources count alike."""
     rows, weights = [], []
     for source, each in albums.items():
-        pins = [(1.0, share, album.misread, right) for album in each for share, right in album.pins]
+        pins = [pin for _, of_album in each for pin in of_album]
         rows += pins
         weights += [(_OTHERS if source.startswith(_FOREIGN) else 1.0) / max(len(pins), 1)] * len(pins)
     table, weight = np.array(rows), np.array(weights) / sum(weights)

@@ -76,14 +76,16 @@ def home_album(
 ) -> AlbumCase:
     """Return an album of a generated home, without photographs that are refused."""
     model = setting.model
-    album = taken_album(split, index, _PHOTOGRAPHS, spheres=spheres, furniture=furniture, textures=setting.textures)
+    plan, taken = taken_album(
+        split, index, _PHOTOGRAPHS, spheres=spheres, furniture=furniture, textures=setting.textures
+    )
     projection = "equirectangular" if spheres else "perspective"
     photographs, truth = list[AlbumPhotograph](), list[Pose]()
-    for number, each in enumerate(album.photographs):
+    for number, (pixels, spot) in enumerate(taken):
         with suppress(InvalidPhotographError):
-            photographs.append(_entry(model, number, each.pixels, projection, each.taken_s))
-            truth.append(Pose.at(each.position_m, each.room_index, each.heading))
-    return AlbumCase.of(model, album.plan, photographs, truth)
+            photographs.append(_entry(model, number, pixels, projection, spot.taken_s))
+            truth.append(Pose.at(spot.position_m, spot.room_index, spot.heading))
+    return AlbumCase.of(model, plan, photographs, truth)
 
 
 def galleries(setting: Setting) -> dict[str, Iterator[AlbumCase]]:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -56,30 +56,30 @@ def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, 
     drawing = _Drawing()
     rooms = []
     for room in plan.rooms:
-        prism = drawing.prism(room.polygon_m, 0.0, room.ceiling_height_m)
-        drawing.semantic(room_type(room.name), [prism.floor, prism.ceiling, *prism.walls])
-        rooms.append(prism)
+        caps, walls = drawing.prism(room.polygon_m, 0.0, room.ceiling_height_m)
+        drawing.semantic(room_type(room.name), caps + walls)
+        rooms.append(walls)
     for opening in openings:
         twin = _twin(plan, openings, opening)
         if twin is not None and twin.room < opening.room:
             continue
         near, far = opening_ends_m(plan.rooms[opening.room], opening), _far_side_m(plan, opening, twin)
-        box = drawing.prism(np.stack([near[0], far[0], far[1], near[1]]), opening.sill_m, opening.head_m)
+        caps, sides = drawing.prism(np.stack([near[0], far[0], far[1], near[1]]), opening.sill_m, opening.head_m)
         # The box makes a hole in its wall, and one in the wall of the room behind it.
-        drawing.add_hole(rooms[opening.room].walls[opening.wall], box.walls[3])
+        drawing.add_hole(rooms[opening.room][opening.wall], sides[3])
         if twin is not None:
-            drawing.add_hole(rooms[twin.room].walls[twin.wall], box.walls[1])
+            drawing.add_hole(rooms[twin.room][twin.wall], sides[1])
         kind = "window" if opening.kind == "window" else "door"
-        drawing.semantic(kind, [box.floor, box.ceiling, *box.walls])
+        drawing.semantic(kind, caps + sides)
     outside = [room.shape.buffer(_OUTER_WALL_M, join_style="mitre") for room in plan.rooms]
-    walls = []
+    outer = []
     # A grid of millimetres avoids edges too short to have a direction.
     for part in shapely.get_parts(shapely.union_all(outside, grid_size=1.0 / _MM_PER_M)):
         ring_m = np.array(part.exterior.coords)[:-1]
         # Clockwise, because the empty space is outside.
         ring_m = ring_m[::-1] if part.exterior.is_ccw else ring_m
-        walls += drawing.prism(ring_m, 0.0, float(plan.ceiling_heights_m.max()), is_open=True).walls
-    drawing.semantic("outwall", walls)
+        outer += drawing.prism(ring_m, 0.0, float(plan.ceiling_heights_m.max()), is_open=True)[1]
+    drawing.semantic("outwall", outer)
     return drawing.document()
 
 
@@ -118,14 +118,6 @@ def write_depth(path: Path, depth_m: Float[np.ndarray, "h w"]) -> None:
     Image.fromarray(np.where(seen, depth_mm, 0.0).astype(np.uint16)).save(path, compress_level=_PNG_COMPRESSION)
 
 
-class _Prism(NamedTuple):
-    """Indices of a prism's planes; wall k belongs to edge k, and a missing floor or ceiling is -1."""
-
-    floor: int
-    ceiling: int
-    walls: list[int]
-
-
 @dataclass
 class _Drawing:
     """Junctions, lines, planes and semantics; lines and planes reference their parts by index."""
@@ -137,20 +129,22 @@ class _Drawing:
 
     def prism(
         self, polygon_m: Float[np.ndarray, "n 2"], floor_m: float, ceiling_m: float, *, is_open: bool = False
-    ) -> _Prism:
-        """Add a vertical prism, empty to the left of its edges; an open one has no floor and ceiling."""
+    ) -> tuple[list[int], list[int]]:
+        """Add a vertical prism, empty to the left of its edges; an open one has no floor and ceiling.
+
+        Returns the indices of its floor and ceiling, and of its walls, of which wall k belongs to edge k.
+        """
         below, above = ([self._junction(x, y, z) for x, y in polygon_m.tolist()] for z in (floor_m, ceiling_m))
         floor, ceiling = self._ring(below), self._ring(above)
         uprights = [self._line(*ends) for ends in zip(below, above, strict=True)]
-        caps = (-1, -1)
+        caps, walls = list[int](), list[int]()
         if not is_open:
-            caps = (self._plane("floor", (0.0, 0.0, 1.0), floor), self._plane("ceiling", (0.0, 0.0, -1.0), ceiling))
-        walls = []
+            caps = [self._plane("floor", (0.0, 0.0, 1.0), floor), self._plane("ceiling", (0.0, 0.0, -1.0), ceiling)]
         for k, (dx, dy) in enumerate((np.roll(polygon_m, -1, axis=0) - polygon_m).tolist()):
             length = float(np.hypot(dx, dy))
             boundary = [floor[k], uprights[(k + 1) % len(uprights)], ceiling[k], uprights[k]]
             walls.append(self._plane("wall", (-dy / length, dx / length, 0.0), boundary))
-        return _Prism(*caps, walls)
+        return caps, walls
 
     def add_hole(self, wall: int, face: int) -> None:
         self.planes[wall][2].extend(self.planes[face][2][:4])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,23 +38,13 @@ _WINDOW, _WINDOW_SIZE = Window(math.radians(116.0), math.radians(58.0)), (928, 9
 _SPHERE_SIZE = (512, 1024)
 
 
-@dataclass(frozen=True, eq=False)
-class TakenPhotograph:
-    """A photograph, or a full sphere, with the pose of its camera; the heading (radians) is that of its centre."""
+class Spot(NamedTuple):
+    """Pose of the camera of a photograph; the heading (radians) is that of its centre."""
 
-    pixels: UInt8[np.ndarray, "h w 3"]
     position_m: Float[np.ndarray, "2"]
     room_index: int
     heading: float
     taken_s: float
-
-
-class TakenAlbum(NamedTuple):
-    """Photographs of one home in the order in which they were taken, and their field of view (degrees)."""
-
-    plan: FloorPlan
-    photographs: list[TakenPhotograph]
-    field_deg: float
 
 
 def taken_album(
@@ -66,8 +55,8 @@ def taken_album(
     spheres: bool = False,
     furniture: FurnitureLevel = "full",
     textures: Path | None = None,
-) -> TakenAlbum:
-    """Return an album of one home of a split."""
+) -> tuple[FloorPlan, list[tuple[UInt8[np.ndarray, "h w 3"], Spot]]]:
+    """Return an album of one home of a split: photographs, or full spheres, in the order in which they were taken."""
     number = SPLIT_NUMBERS[split]
     home, rng = home_of(number, 0, index)
     renderers = split_renderer_cache(number, 0, textures)
@@ -93,18 +82,11 @@ def taken_album(
         else:
             (pitch, roll), sphere = tilt_by_hand(rng), renderers.part_of_sphere(shot, _WINDOW, _WINDOW_SIZE)
             pixels = cut_view(sphere, camera, azimuth=0.0, pitch=pitch, roll=roll)
-        photographs.append(TakenPhotograph(pixels, spot.position_m, spot.room_index, spot.heading, spot.taken_s))
-    return TakenAlbum(home.plan, photographs, field_deg)
+        photographs.append((pixels, spot))
+    return home.plan, photographs
 
 
-class _Spot(NamedTuple):
-    position_m: Float[np.ndarray, "2"]
-    room_index: int
-    heading: float
-    taken_s: float
-
-
-def _walk(home: Home, count: int, rng: np.random.Generator) -> list[_Spot]:
+def _walk(home: Home, count: int, rng: np.random.Generator) -> list[Spot]:
     """Return places and headings in the order of a walk through the doors of a home; large rooms have more."""
     rooms = home.plan.rooms
     order = _order_of_rooms(home, rng)
@@ -112,7 +94,7 @@ def _walk(home: Home, count: int, rng: np.random.Generator) -> list[_Spot]:
     order = [index for index in order if index not in small] or order
     share = np.array([math.sqrt(rooms[index].area_m2) for index in order]) * rng.gamma(_EVENNESS, size=len(order))
     by_room = _shared(count, share / share.sum())
-    spots: list[_Spot] = []
+    spots: list[Spot] = []
     taken_s = 0.0
     for room_index, photographs in zip(order, by_room, strict=True):
         for number in range(photographs):
@@ -126,7 +108,7 @@ def _walk(home: Home, count: int, rng: np.random.Generator) -> list[_Spot]:
                 place, heading = _framed(home, room_index, rng)
             walked_m = 0.0 if last is None else float(np.linalg.norm(place - last.position_m))
             taken_s += _PAUSE_S * float(rng.gamma(2.0, 0.5)) + walked_m / _WALK_M_S
-            spots.append(_Spot(place, room_index, heading, taken_s))
+            spots.append(Spot(place, room_index, heading, taken_s))
     return spots
 
 
