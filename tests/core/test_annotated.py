@@ -88,8 +88,6 @@ class TestReading:
         hall = read_annotation(root / "hall.json")
         assert np.allclose(hall.outlines[0].polygon_m, CAMERA_HEIGHT_M * np.array(POLYGON))
         assert hall.outlines[0].ceiling_height_m == pytest.approx(1.8 * CAMERA_HEIGHT_M)
-        assert hall.has_flat_ceiling
-        assert not read_annotation(root / "den.json").has_flat_ceiling
         # The centre column looks along +y, columns further right clockwise of it.
         profile_m = hall.profile_m(0, 64)
         ahead, right = profile_m[31:33].mean(), profile_m[47:49].mean()

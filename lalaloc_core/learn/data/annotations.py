@@ -56,7 +56,6 @@ class AnnotatedPhotograph:
     photograph: FilePhotograph
     quality: Quality
     outlines: tuple[DrawnRoom, ...]
-    has_flat_ceiling: bool
     class_spans: tuple[ClassSpan, ...]
     notes: str = ""
 
@@ -113,7 +112,6 @@ def read_annotation(path: Path) -> AnnotatedPhotograph:
         photograph=photograph,
         quality=cast(Quality, quality),
         outlines=tuple(outlines),
-        has_flat_ceiling=document["ceiling_above_camera"] is not None,
         class_spans=spans,
         notes=reader.text(document, "notes"),
     )

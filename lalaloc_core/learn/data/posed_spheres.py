@@ -146,7 +146,6 @@ def _annotated(plan: FloorPlan, camera: Camera) -> AnnotatedPhotograph:
         photograph=photograph,
         quality="good",
         outlines=(dataclasses.replace(room, ceiling_height_m=scale * room.ceiling_height_m),),
-        has_flat_ceiling=True,
         class_spans=_class_spans(plan, camera),
     )
 
