@@ -7,14 +7,12 @@ metres, and single rooms with hundreds of walls.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
-from lalaloc_core.learn.synth.homes.plans import Home, home_of
+from lalaloc_core.learn.synth.homes.plans import home_of
 
 # Between what stands side by side (m).
 _GAP_M = 0.3
@@ -28,27 +26,13 @@ _MAX_DEPTH_M = 350.0
 _LIMITS = PlanLimits(max_rooms=10**6, max_plan_vertices=10**7, max_openings=10**6)
 
 
-@dataclass(frozen=True, eq=False)
-class Building:
-    """A large building as one plan.
-
-    Photographs of its homes are photographs of the building. `shift_m` is the translation of each home, and
-    `first_room` the index of its first room in the plan.
-    """
-
-    plan: FloorPlan
-    homes: tuple[Home, ...]
-    shift_m: Float[np.ndarray, "h 2"]
-    first_room: tuple[int, ...]
-
-
 def building_of(split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> Building:
     """Return a building of the homes of a split with at least this floor area, `hall_share` of it in halls."""
-    return _Builder(split, seed, area_m2, hall_share).build()
+    return Building(split, seed, area_m2, hall_share)
 
 
-class _Builder:
-    """Lays out wings, each a row of homes or halls with a corridor along it."""
+class Building:
+    """A large building as one `plan`: wings, each a row of homes or halls with a corridor along it."""
 
     def __init__(self, split: int, seed: int, area_m2: float, hall_share: float) -> None:
         self._split, self._seed = split, seed
@@ -57,16 +41,11 @@ class _Builder:
         self._length_m = max(1.1 * math.sqrt(area_m2), area_m2 / _MAX_DEPTH_M)
         self._rooms: list[dict[str, Any]] = []
         self._openings: list[dict[str, Any]] = []
-        self._homes: list[Home] = []
-        self._shift_m: list[np.ndarray] = []
-        self._first_room: list[int] = []
-        self._floor_m2 = self._halls_m2 = 0.0
-
-    def build(self) -> Building:
-        y_m = 0.0
+        self._homes = 0
+        self._floor_m2 = self._halls_m2 = y_m = 0.0
         while self._floor_m2 < self._area_m2:
             y_m = self._corridors(self._wing(y_m))
-        plan = FloorPlan.from_dict(
+        self.plan = FloorPlan.from_dict(
             {
                 "name": "synthetic building",
                 "rooms": self._rooms,
@@ -75,7 +54,6 @@ class _Builder:
             },
             _LIMITS,
         )
-        return Building(plan, tuple(self._homes), np.array(self._shift_m), tuple(self._first_room))
 
     def _wing(self, y_m: float) -> float:
         """Place homes and halls from left to right; return the end of the wing."""
@@ -89,14 +67,12 @@ class _Builder:
         return y_m + depth_m + _GAP_M
 
     def _home(self, x_m: float, y_m: float) -> tuple[float, float]:
-        number = len(self._homes)
+        number = self._homes
         home, _ = home_of(self._split, self._seed, number)
         left, bottom, right, top = home.plan.bounds_m
         shift_m = np.array([x_m - left, y_m - bottom])
         document = home.plan.to_dict()
-        self._homes.append(home)
-        self._shift_m.append(shift_m)
-        self._first_room.append(len(self._rooms))
+        self._homes += 1
         for room in document["rooms"]:
             moved = (np.array(room["polygon"]) + shift_m).tolist()
             self._rooms.append(room | {"id": f"{number}-{room['id']}", "polygon": moved})
