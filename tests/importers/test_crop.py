@@ -76,7 +76,7 @@ def test_storeys_have_the_levels_of_their_titles():
 
 
 @pytest.mark.parametrize(("text", "number"), [
-    ("Second Floor", 2), ("1st floor", 1), ("Level 2", 2), ("2. Obergeschoss", 2), ("1. UG", -1), ("EG", 0),
+    ("Second Floor", 2), ("1st floor", 1), ("Level 2", 2), ("2. Obergeschoss", 2), ("1. UG", -1), ("EG", 0), ("4OG", 4),
     ("Lower level", -1), ("Living room", None), ("950 SF", None), ("2", None), ("First aid", None), ("12 m", None),
 ])  # fmt: skip
 def test_titles_of_storeys(text: str, number: int | None):

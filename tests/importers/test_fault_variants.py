@@ -225,8 +225,20 @@ def _storeys(*layers: str) -> dict[str, list[float]]:
     return {plan.level.name if plan.level else "": _areas(plan) for plan in plans}
 
 
-def test_words_for_storeys_count_before_numbers_of_layers():
-    assert _storeys("01_EG_Wand", "04_OG_Wand") == {"EG": [24.3, 14.6], "OG": [20.0, 18.9]}
+@pytest.mark.parametrize(
+    ("layers", "names"),
+    [
+        (("01_EG_Wand", "04_OG_Wand"), ("EG", "OG")), (("2.OG-Wand", "1.OG-Wand"), ("1.OG", "2.OG")),
+        (("Wand 4OG", "WAND_OG5"), ("4OG", "OG5")), (("A-WALL-L1", "A-WALL-L0"), ("L0", "L1")),
+        (("E10 Mur", "E9 Mur"), ("E9", "E10")), (("Étage 2 murs", "Étage 1 murs"), ("Étage 1", "Étage 2")),
+        (("Level -1 Wall", "LEVEL-01-WALL"), ("Level -1", "LEVEL-01")), (("1.DG Wand", "1.OG Wand"), ("1.OG", "1.DG")),
+        (("OG-1-Wand", "OG-2-Wand"), ("",)), (("Wand_EI30", "Wand_EI90"), ("",)),
+    ],
+)  # fmt: skip
+def test_words_for_storeys_count_before_numbers_of_layers(layers: tuple[str, ...], names: tuple[str, ...]):
+    found = _storeys(*layers)
+    assert tuple(found) == names
+    assert len(names) == 1 or sorted(found.values()) == [[20.0, 18.9], [24.3, 14.6]]
 
 
 @pytest.mark.parametrize("layers", [("WALL-RC", "WALL-PB"), ("A_²", "WALL")])

@@ -34,10 +34,16 @@ _SHARE, _MIN_M2 = 0.3, 12.0
 _MARGIN_M, _MAX_NAMED = 0.5, 6
 _STOREYS = keys_by_word("storeys")
 _NUMBERS = _STOREYS | keys_by_word("storeys_in_titles")
-_BESIDE = frozenset(PLAN_WORDS["levels"]["beside"].split())
+_BESIDE, _COUNTED, _JOINED = (frozenset(PLAN_WORDS["levels"][key].split()) for key in ("beside", "counted", "joined"))
 _WORDS = re.compile(r"[^\W_]+")
-# Parts of the names of layers, and the share of the smaller storey's box that one over it covers.
-_PARTS, _OVER = re.compile(r"[^\w+]+|_"), 0.5
+# A word of the name of a layer with a number before or after it: "2.OG", "4OG", "Level -1".
+_NUMBERED = re.compile(
+    r"(?<![^\W_])(?:([12]\d(?=\.|[^\W\d_])|[1-9])[. _-]{0,2})?((?:[^\W\d_]|\+)+)"
+    r"(?:(?=([ ._-]?)((?:(?<=[ ._])-)?[0-2]?\d)(?![^\W_]))|(?![^\W_]))"
+)
+# Parts of the names of layers, shortest word that can be apart from its number, and the share of the smaller storey's
+# box that one over it covers.
+_PARTS, _SHORTEST, _OVER = re.compile(r"[^\w+]+|_"), 3, 0.5
 
 
 def assemble_storeys(
@@ -148,15 +154,24 @@ def _levels(storeys: Sequence[BaseGeometry], letterings: Sequence[Lettering]) ->
 def title_of(text: str) -> Level | None:
     """Return the level that a text is the title of, such as "FIRST FLOOR", "2. Obergeschoss" or "Level 2"."""
     words = ["".join(split_words(word)) if word.isalpha() else word.casefold() for word in _WORDS.findall(text)]
-    known = [float(_NUMBERS[word]) for word in words if word in _NUMBERS]
+    known = [number for word in words if (number := _number_in(word)) is not None]
     digits = [float(word) for word in words if word.isdecimal() and len(word) == 1]
     is_title = len(known) + len(digits) + sum(word in _BESIDE for word in words) >= len(words)
     if not is_title or not (known or (digits and len(words) > 1)) or len(digits) > 1:
         return None
-    number = known[0] if known else 0.0
-    # "1. UG" is the storey -1.
-    number = math.copysign(digits[0], number) if digits and (number or not known) else number
-    return Level(" ".join(text.split()), number)
+    return Level(" ".join(text.split()), _counted(known[0] if known else None, *digits))
+
+
+def _number_in(word: str) -> float | None:
+    storey = _storey(word) if len(word) >= _SHORTEST and not word.isalpha() else None
+    return float(_NUMBERS[word]) if word in _NUMBERS else storey and storey[1]
+
+
+def _counted(number: float | None, digit: float = 0.0) -> float:
+    """Return the number of a storey that a digit counts: "1. UG" is -1, and "1. DG" lies over "DG"."""
+    if not number or not digit:
+        return digit if number is None else number
+    return math.copysign(digit, number) if abs(number) == 1.0 else number + 0.1 * digit
 
 
 def _reading_order(storeys: Sequence[BaseGeometry]) -> list[int]:
@@ -243,10 +258,18 @@ def _is_over(first: shapely.Polygon, second: shapely.Polygon) -> bool:
 @lru_cache(maxsize=1024)
 def _storey(layer: str) -> tuple[str, float] | None:
     """Return the name and number of the storey that the name of a layer has; None without one."""
+    for found in _NUMBERED.finditer(layer):
+        before, letters, gap, after = found.groups("")
+        word = letters.casefold() if "+" in letters else "".join(split_words(letters))
+        is_joined = bool(after) and not gap
+        # "OG-2" can be the second wall.
+        digit = float(before or ("" if gap == "-" else after) or 0) if word in _COUNTED else 0.0
+        whole = found[0] if before else layer[found.start() : max(found.end(), found.end(4))]
+        for key in (word, found[0].casefold(), f"{word}{after}" if is_joined else word):
+            if key in _STOREYS:
+                return whole if digit or key != word else letters, _counted(float(_STOREYS[key]), abs(digit))
+        if (after or before) and ((word in _BESIDE and len(word) > _SHORTEST) or (is_joined and word in _JOINED)):
+            return layer[found.start() : max(found.end(), found.end(4))], float(after or before)
     parts = list(filter(None, _PARTS.split(layer)))
-    for part in parts:
-        word = "".join(split_words(part)) if part.isalpha() else part.casefold()
-        if word in _STOREYS:
-            return part, float(_STOREYS[word])
     numbers = (part for part in parts if part.isdecimal() and len(part) <= 2 and part != layer)
     return next(((part, float(part)) for part in numbers), None)
