@@ -131,6 +131,27 @@ def test_projected_crs_is_converted():
     assert plan.anchor.latitude == pytest.approx(48.13, abs=0.02)  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "is_exchanged", "said"),
+    [
+        (139.7, 35.7, True, "the latitude would be 139.7°"), (-118.2, 34.1, True, "the latitude would be -118.2°"),
+        (88.4, 22.6, True, "the latitude would be 88.4°"), (139.7, 35.7, False, ""), (-88.4, 22.6, False, ""),
+        (13.4, 52.5, False, "taken for longitude 13.400° and latitude 52.500°"),
+        (13.4, 52.5, True, "taken for longitude 52.500° and latitude 13.400°"),
+    ],
+)  # fmt: skip
+def test_order_of_latitude_and_longitude_is_found_or_said(
+    longitude: float, latitude: float, is_exchanged: bool, said: str
+):
+    points = LocalFrame(longitude, latitude).to_earth(np.array([[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]], dtype=float))
+    ring = points[:, ::-1] if is_exchanged else points
+    report = (plan := import_plan(json.dumps({"type": "Polygon", "coordinates": [ring.tolist()]}).encode())).report
+    lines_said = [line for line in (*report.warnings, *report.unsure) if "exchange the two" in line]
+    assert [said in line for line in lines_said] == [True] * bool(said)
+    if "taken" not in said:
+        assert shapes(plan.document)[0].area == pytest.approx(12.0, abs=1e-3)
+
+
 def test_imdf_kiosks_are_holes_and_windows_are_kept():
     shaft = _feature([[1, 1], [1.5, 1], [1.5, 1.5], [1, 1.5]], feature_type="kiosk", level_id="L")
     unit = _feature([[0, 0], [4, 0], [4, 3], [0, 3]], feature_type="unit", category="restroom",

@@ -17,6 +17,8 @@ from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 
 _MAX_REACH_M = 5000.0
+# System of WGS84 with the longitude first.
+ORDERED = "OGC:CRS84"
 # Latitudes beyond this are longitudes. Shares of square corners from which coordinates are in the right order and up to
 # which they are not, and cosines of corners that are square, and of those that count.
 _MAX_LATITUDE, _SQUARE, _OBLIQUE = 85.0, 0.9, 0.5
@@ -24,20 +26,22 @@ _SQUARE_COSINE, _STRAIGHT = 0.05, 0.9
 
 
 class Projection(NamedTuple):
-    """Conversion of file coordinates to metres, with the anchor, metres per unit, their source, and warnings."""
+    """Conversion of coordinates to metres, with the anchor, metres per unit, their source, warnings and guesses."""
 
     project: Callable[[BaseGeometry], BaseGeometry]
     anchor: Anchor | None
     metres_per_unit: float
     source: str
     warnings: tuple[str, ...] = ()
+    unsure: tuple[str, ...] = ()
 
 
 def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportOptions) -> Projection:
     """Return the conversion for the shapes of a file.
 
-    `crs` is the code of the coordinate reference system, None for WGS84.
+    `crs` is the code of the coordinate reference system, None for WGS84 in a probable order.
     """
+    is_ordered, crs = crs == ORDERED, None if crs == ORDERED else crs
     points = np.concatenate([shapely.get_coordinates(shape) for shape in shapes])
     low, high = points.min(axis=0), points.max(axis=0)
     if options.units is not None:
@@ -60,6 +64,11 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
             raise InvalidFloorPlanError(
                 f"the crs '{crs}' is unknown or cannot be used; export the file in WGS84"
             ) from error
+    exchanged, why = (False, "") if crs is not None else _order(shapes, low, high)
+    if exchanged:
+        found = projection([_flipped(shape) for shape in shapes], ORDERED, options)
+        warning = f"the positions are latitude and longitude, and were read so: {why}; exchange the two"
+        return found._replace(project=lambda shape: found.project(_flipped(shape)), warnings=(warning,))
     if not (np.abs([low, high]) <= [180.0, 90.0]).all():
         raise InvalidFloorPlanError(
             f"coordinates reach ({high[0]:g}, {high[1]:g}), outside longitude ±180 and latitude ±90; "
@@ -73,19 +82,6 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
     def project(shape: BaseGeometry) -> BaseGeometry:
         return shapely.transform(shape, lambda points: frame.to_local(convert(points)))
 
-    if crs is None and np.abs([low, high]).max() <= _MAX_LATITUDE:
-        swapped = LocalFrame(frame.latitude, frame.longitude)
-        as_stated, exchanged = (
-            _square_share([shapely.transform(shape, change) for shape in shapes])
-            for change in (frame.to_local, lambda points: swapped.to_local(points[:, ::-1]))
-        )
-        if as_stated < _OBLIQUE and exchanged > _SQUARE:
-            found = projection([_flipped(shape) for shape in shapes], crs, options)
-            warning = (
-                "the positions are latitude and longitude, and were read so: in the order of GeoJSON, longitude first, "
-                "the rooms would not be square; exchange the two"
-            )
-            return found._replace(project=lambda shape: found.project(_flipped(shape)), warnings=(warning,))
     reach_m = float(np.abs(frame.to_local(convert(points))).max())
     if not reach_m <= _MAX_REACH_M:
         raise InvalidFloorPlanError(
@@ -93,7 +89,31 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
             "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
     anchor = Anchor(frame.latitude, frame.longitude)
-    return Projection(project, anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs)
+    source = "longitude and latitude (WGS84)" if crs is None else crs
+    return Projection(project, anchor, 1.0, source, unsure=() if is_ordered or not why else (why,))
+
+
+def _order(shapes: Sequence[BaseGeometry], low: np.ndarray, high: np.ndarray) -> tuple[bool, str]:
+    """Return whether positions are latitude and longitude, and the reason, or that it is unknown; "" if it is sure."""
+    x, y = np.abs([low, high]).max(axis=0)
+    if x > _MAX_LATITUDE or y > 180.0:
+        return False, ""
+    longitude, latitude = (0.5 * (low + high)).tolist()
+    if y > _MAX_LATITUDE:
+        return True, f"in the order of GeoJSON, longitude first, the latitude would be {latitude:g}°"
+    frame, swapped = LocalFrame(longitude, latitude), LocalFrame(latitude, longitude)
+    as_stated, exchanged = (
+        _square_share([shapely.transform(shape, change) for shape in shapes])
+        for change in (frame.to_local, lambda points: swapped.to_local(points[:, ::-1]))
+    )
+    if as_stated < _OBLIQUE and exchanged > _SQUARE:
+        return True, "in the order of GeoJSON, longitude first, the rooms would not be square"
+    if exchanged < _OBLIQUE and as_stated > _SQUARE:
+        return False, ""
+    return False, (
+        f"the positions are taken for longitude {longitude:.3f}° and latitude {latitude:.3f}°, as GeoJSON orders them; "
+        "if the place is wrong and the plan mirrored, exchange the two"
+    )
 
 
 def _flipped(shape: BaseGeometry) -> BaseGeometry:

@@ -24,7 +24,7 @@ from lalaloc_core.importers.common.geometry import opening_line, polygons_from_g
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.map_projection import projection
+from lalaloc_core.importers.common.map_projection import ORDERED, projection
 from lalaloc_core.importers.common.opening_placement import WallLines
 from lalaloc_core.importers.common.sketch import (
     ROOM_HEIGHT_M,
@@ -93,9 +93,10 @@ def import_features(
     if not features:
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
     _refuse_map(features, format)
-    project, anchor, metres_per_unit, source, warnings = projection(
-        [feature.shape for feature in features], crs, options
-    )
+    # The other formats state which number is the latitude.
+    crs = crs if format == "geojson" else ORDERED
+    placed = projection([feature.shape for feature in features], crs, options)
+    anchor = placed.anchor
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
     on_any_level: list[Feature] = []
@@ -122,14 +123,15 @@ def import_features(
     by_level = with_rooms or by_level
 
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
-        builder = ReportBuilder(format, metres_per_unit, source, warnings=list(warnings))
+        builder = ReportBuilder(format, placed.metres_per_unit, placed.source)
+        builder.warnings, builder.unsure = list(placed.warnings), list(placed.unsure)
         sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
         if anchor is not None:
             sketch.north_deg = anchor.north_deg
         sketch.name = level.name if len(by_level) > 1 else None
         drawer = _Drawer(sketch, options, builder)
         for feature in (*members, *on_any_level):
-            drawer.add(feature, role_of(feature), project(feature.shape))
+            drawer.add(feature, role_of(feature), placed.project(feature.shape))
             budget.check_time()
         drawer.add_points()
         return assemble(sketch, builder, options, budget.limits.plan)

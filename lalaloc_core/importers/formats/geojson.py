@@ -116,12 +116,12 @@ def _count_numbers(value: Any, where: str) -> int:
 
 
 def _crs(document: Any) -> str | None:
-    """Return the EPSG code in the legacy member `crs` ("urn:ogc:def:crs:EPSG::25832"), None for WGS84."""
+    """Return the code in the legacy member `crs` ("urn:ogc:def:crs:EPSG::25832"), None for WGS84."""
     crs = document.get("crs") if isinstance(document, Mapping) else None
     properties = crs.get("properties") if isinstance(crs, Mapping) else None
     name = properties.get("name") if isinstance(properties, Mapping) else None
     if not isinstance(name, str) or "CRS84" in name or name.endswith(":4326"):
-        return None
+        return "OGC:CRS84" if "CRS84" in str(name) else None
     digits = name.rpartition(":")[2]
     if not digits.isascii() or not digits.isdigit() or len(digits) > 6:
         raise InvalidFloorPlanError(f"the crs '{name[:100]}' is not an EPSG code; export the file in WGS84")
