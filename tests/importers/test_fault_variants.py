@@ -16,7 +16,7 @@ from scipy import ndimage
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, import_plan, import_plans
 from lalaloc_core.importers.common.geometry import find_floor
-from lalaloc_core.importers.drawing.drawing_scale import _AT_SHEET
+from lalaloc_core.importers.drawing.drawing_scale import _AT_SHEET, _written_scale
 from tests.importers.conftest import dxf_file, lines, shapes
 from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import _map
@@ -311,3 +311,24 @@ def test_room_with_an_area_drawn_twice_in_it_stays():
 def test_sheet_number_after_a_scale_is_no_paper():
     assert _AT_SHEET.search("1:100  A1.01") is None
     assert _AT_SHEET.search("1:100 (A1)")
+
+
+@pytest.mark.parametrize(
+    ("texts", "paper_m", "scale"),
+    [
+        ("Scale at A1: 1:50", 0.42, 100), ("Scale @ A1|Scale:1:50", 0.42, 100), ("1:50 auf DIN A1", 0.42, 100),
+        ("1:50 @ A1 / 1:100 @ A3", 0.42, 100), ("A1: 1:50, A3: 1:100", 0.841, 50), ("1:50 @ A1/1:100 @ A3", 0.297, 141),
+        ("1:50 @ A1", 0.25, 50), ("1:50 @ A1, 1:200 @ A1", 0.841, None), ("1:50|1:200", 0.841, None),
+        ('1/4" = 1\'-0"', None, 48), ("1/8'' = 1'", None, 96), ('3/16" = 1\' - 0"', None, 64), ('1/2"=1\'', None, 24),
+        ('1/4" = 1\'-0" @ ARCH D', 0.457, 96), ('1 1/2" = 1\'-0"', None, None), ('3\'-0" x 1/4"', None, None),
+    ],
+)  # fmt: skip
+def test_scale_that_is_written_for_a_sheet_or_in_inches(texts: str, paper_m: float | None, scale: int | None):
+    found = _written_scale(texts.split("|"), paper_m)
+    assert (found and found[0]) == (scale and pytest.approx(scale, rel=0.01))
+
+
+def test_svg_on_paper_of_another_size_than_its_scale_is_for():
+    drawn = '<rect class="room" width="40" height="50"/><text x="5" y="5">1:50 @ A1</text>'
+    root = '<svg xmlns="http://www.w3.org/2000/svg" width="297mm" height="420mm" viewBox="0 0 297 420">'
+    assert import_plan(f"{root}{drawn}</svg>".encode()).report.metres_per_unit == pytest.approx(0.1, rel=0.01)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -21,16 +21,21 @@ from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
-_WRITTEN = re.compile(r"(?<![\d.,:])1\s?[:/]\s?(\d{1,4})(?![\d.,:])")
-# Longer sides of sheets (m), and a scale that is for one of them: "1:50 @ A1", "1:100 (A3)".
-_SHEETS_M = {"A0": 1.189, "A1": 0.841, "A2": 0.594, "A3": 0.42, "A4": 0.297, "ARCH D": 0.914, "ARCH E": 1.219,
-             "ARCH C": 0.61, "ANSI B": 0.432, "ANSI C": 0.559, "ANSI D": 0.864, "ANSI E": 1.118}  # fmt: skip
-_AT_SHEET = re.compile(
-    rf"1\s?[:/]\s?\d{{1,4}}\W{{0,3}}(?:at|on|auf|sur|en|su|in|op)?\W{{0,3}}({'|'.join(_SHEETS_M)})(?!\w|[.-]\w)",
-    re.IGNORECASE,
+_WRITTEN = re.compile(r"(?<![\d.,])(?<!\d:)1\s?[:/]\s?(\d{1,4})(?![\d:]|[.,]\d)")
+# 1/4" = 1'-0", 1" = 20'.
+_INCHES = re.compile(
+    r"(?<![\d./])(?:(\d)[ -])?([1-9]\d?)(?:/([1-9]\d?))?\s?(?:[\"″”“]|''|in\b\.?)\s?=\s?"
+    r"(\d{1,3})\s?(?:['′’]|ft\b\.?)(?:\s?-?\s?0\s?(?:[\"″”“]|''|in\b\.?))?"
 )
+# Longer sides of sheets (m), and a scale that is for one of them: "1:50 @ A1", "1:100 (A3)", "Scale at A1: 1:50".
+_SHEETS_M = {"A0": 1.189, "A1": 0.841, "A2": 0.594, "A3": 0.42, "A4": 0.297, "ARCH D": 0.914, "ARCH E": 1.219,
+             "ARCH C": 0.61, "ARCH B": 0.457, "ANSI A": 0.279, "ANSI B": 0.432, "ANSI C": 0.559, "ANSI D": 0.864,
+             "ANSI E": 1.118}  # fmt: skip
+_SCALE, _FOR = r"1\s?[:/]\s?(\d{1,4})\b", r"\W{0,3}(?:(?:at|on|auf|sur|en|su|in|op|din|iso)\W{0,3}){0,2}"
+_SHEET = rf"\b({'|'.join(_SHEETS_M)})(?!\w|[.-]\w)"
+_AT_SHEET = re.compile(rf"{_SCALE}{_FOR}{_SHEET}|(?:{_SHEET}{_FOR}{_SCALE}|(?:scale|@){_FOR}{_SHEET})", re.IGNORECASE)
 # Common scales of building drawings.
-_USUAL = {10, 20, 25, 33, 48, 50, 64, 75, 96, 100, 125, 150, 192, 200, 250, 300, 400, 500, 1000}
+_USUAL = {10, 20, 24, 25, 32, 33, 48, 50, 64, 75, 96, 100, 120, 125, 128, 150, 192, 200, 240, 250, 300, 400, 500, 1000}
 # "4.20", "4,205 m", "420", "4200 mm".
 _METRIC = re.compile(r"(\d{1,3}[.,]\d{1,3}|\d{1,5})\s*(m|cm|mm|)")
 _IMPERIAL = re.compile(r"(\d{1,3})\s*['′]\s*-?\s*(?:(\d{1,2})\s*[\"″]?)?")
@@ -131,16 +136,13 @@ def drawing_scale(
         if own is not None:
             return checked(*own)
         texts = [lettering.text for drawing in drawings for lettering in drawing.letterings]
-        written = _written_scale(texts)
+        written = _written_scale(texts, paper_m)
         if written is not None and paper_m_per_unit is not None:
-            sheet, larger = _sheet(texts, paper_m)
-            source = f"1:{written:g}, written in the drawing"
-            source += f" for {sheet}, {larger:.3g} times the page" if sheet else ""
-            return checked(written * larger * paper_m_per_unit, source)
+            return checked(written[0] * paper_m_per_unit, written[1])
         found = next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None) or guess()
         if found:
             return checked(*found)
-        hint = f" (1:{written:g} is written in it, but it has no size on paper)" if written is not None else ""
+        hint = f" (1:{written[0]:g} is written in it, but it has no size on paper)" if written is not None else ""
         if sizes := [text for text in texts if _has_size(text)]:
             hint += f" ({len(sizes)} texts such as '{sizes[0][:50]}' are sizes of rooms, but no two rooms have these)"
         raise InvalidFloorPlanError(
@@ -155,21 +157,34 @@ def drawing_scale(
     return checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)")
 
 
-def _written_scale(texts: Iterable[str]) -> int | None:
-    """Return the denominator of the only scale written on a drawing, None if there is none or several."""
-    found = {int(match) for text in texts for match in _WRITTEN.findall(text)} & _USUAL
-    return found.pop() if len(found) == 1 else None
+def _written_scale(texts: Sequence[str], paper_m: float | None) -> tuple[float, str] | None:
+    """Return the denominator of the only scale written, for a page whose longer side is `paper_m`, and its source."""
+    texts = [_INCHES.sub(_in_inches, text) for text in texts]
+    scales = {int(match) for text in texts for match in _WRITTEN.findall(text)} & _USUAL
+    # A page of no sheet's size is a part of one.
+    is_sheet = paper_m is not None and any(abs(size_m / paper_m - 1.0) <= _TOLERANCE for size_m in _SHEETS_M.values())
+    sheets: dict[int, tuple[str, float]] = {}
+    for number, first, second, other, third in (found for text in texts for found in _AT_SHEET.findall(text)):
+        name = " ".join((first or second or third).upper().split())
+        for scale in scales & {int(number or other)} if number or other else scales:
+            if is_sheet and paper_m:
+                sheets.setdefault(scale, (name, _SHEETS_M[name] / paper_m))
+    own = {scale for scale, (_, larger) in sheets.items() if abs(larger - 1.0) <= _TOLERANCE}
+    sizes = [scale * larger for scale, (_, larger) in sheets.items()]
+    # "1:50 @ A1 / 1:100 @ A3" is one scale.
+    if len(scales) > 1 and sheets.keys() == scales and (own or max(sizes) <= (1.0 + _TOLERANCE) * min(sizes)):
+        scales = own or {min(scales)}
+    if len(scales) != 1:
+        return None
+    scale = next(iter(scales))
+    name, larger = ("", 1.0) if scale in own else sheets.get(scale, ("", 1.0))
+    source = f"1:{scale}, written in the drawing" + (f" for {name}, {larger:.3g} times the page" if name else "")
+    return scale * larger, source
 
 
-def _sheet(texts: Iterable[str], paper_m: float | None) -> tuple[str, float]:
-    """Return the sheet that a written scale is for, and its longer side over that of the page; "" and 1 if alike."""
-    for text in texts if paper_m else ():
-        found = _AT_SHEET.search(text)
-        if found is not None and paper_m:
-            name = " ".join(found[1].upper().split())
-            larger = _SHEETS_M[name] / paper_m
-            return ("", 1.0) if abs(larger - 1.0) <= _TOLERANCE else (name, larger)
-    return "", 1.0
+def _in_inches(match: re.Match[str]) -> str:
+    inches = int(match[1] or 0) + int(match[2]) / int(match[3] or 1)
+    return f"1:{12 * int(match[4]) / inches:g}"
 
 
 def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:

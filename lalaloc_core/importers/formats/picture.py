@@ -88,6 +88,7 @@ def _read_plan(
         "the picture",
         [texts.drawing],
         paper_m_per_unit=paper_m_per_pixel,
+        paper_m=None if paper_m_per_pixel is None else max(gray.shape) * paper_m_per_pixel,
         own=measured,
         guess=lambda: assume_scale(guess_scale(measure, first_scale(drawn_extent(gray)), budget), builder),
     )

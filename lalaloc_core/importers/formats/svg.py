@@ -128,7 +128,7 @@ def _picture_text(pictures: int) -> str:
 
 def _read_plan(root: Element, pictures: int, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Read the plan, without embedded pictures."""
-    paper_m, own = _size_on_paper(root), _own_scale(root)
+    (unit_m, paper_m), own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder("svg", warnings=[_picture_text(pictures)] if pictures else [])
     drawing = _read_drawing(root, options, builder, budget)
     if options.crop is not None:
@@ -138,7 +138,8 @@ def _read_plan(root: Element, pictures: int, options: ImportOptions, budget: Bud
         "the SVG",
         [drawing],
         budget.check_time,
-        paper_m_per_unit=paper_m,
+        paper_m_per_unit=unit_m,
+        paper_m=paper_m,
         own=own,
         guess=lambda: assume_scale(guess_drawing(drawing, budget, flip_y=options.y_axis != "up"), builder),
     )
@@ -187,18 +188,19 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def _size_on_paper(root: Element) -> float | None:
-    """Return the length of a user unit on paper (m), None if the width has no unit or is in pixels."""
-    match = _LENGTH.fullmatch(root.get("width", ""))
-    if match is None or match[2] in ("", "px"):
-        return None
+def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
+    """Return the lengths (m) on paper of a user unit and the longer side, None if the width has no unit or pixels."""
+    found = [_LENGTH.fullmatch(root.get(key, "")) for key in ("width", "height")]
+    sides = [match for match in found if match is not None and match[2] not in ("", "px")]
     try:
-        width_m = float(match[1]) * _METRES[match[2]]
+        sides_m = [float(match[1]) * _METRES[match[2]] for match in sides]
         numbers = [float(part) for part in re.split(r"[,\s]+", root.get("viewBox", "").strip()) if part]
     except ValueError:
-        return None
-    units = numbers[2] if len(numbers) == 4 else width_m / _METRES["px"]
-    return width_m / units if width_m > 0.0 and units > 0.0 else None
+        return None, None
+    if sides[:1] != found[:1] or not sides_m[0] > 0.0:
+        return None, None
+    units = numbers[2] if len(numbers) == 4 else sides_m[0] / _METRES["px"]
+    return (sides_m[0] / units, max(sides_m)) if units > 0.0 else (None, None)
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
