@@ -270,6 +270,9 @@ def test_french_polylines_and_blocks_in_feet():
         ("A-DOOR", "door"), ("TÜREN", "door"), ("Zimmertür", "door"), ("portes", "door"), ("mur porteur", "wall"),
         ("A-GLAZ", "window"), ("Dachfenster", "window"), ("Außenwände", "wall"), ("A-WALL-PATT", "wall"),
         ("STÜTZEN", "obstacle"), ("Pièces", "room"), ("MÖBEL", "ignored"), ("DOOR-DIMENSIONS", "ignored"), ("0", None),
+        ("Abbruchwand", "demolished"), ("A-WALL-DEM", "demolished"), ("Wand zu entfernen", "demolished"),
+        ("RÜCKBAU_WÄNDE", "demolished"), ("mur à déposer", "demolished"), ("walls to be removed", "demolished"),
+        ("Rückbautür", "demolished"), ("muro a demolir", "demolished"), ("REMODEL-WALL", "wall"), ("A-WALL-E", "wall"),
     ],
 )  # fmt: skip
 def test_role_of_a_layer(layer: str, role: str | None):
