@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from ezdxf.enums import TextEntityAlignment
 from ezdxf.filemanagement import new as new_dxf
+from ezdxf.render.forms import cube
 from scipy import ndimage
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -332,3 +333,30 @@ def test_svg_on_paper_of_another_size_than_its_scale_is_for():
     drawn = '<rect class="room" width="40" height="50"/><text x="5" y="5">1:50 @ A1</text>'
     root = '<svg xmlns="http://www.w3.org/2000/svg" width="297mm" height="420mm" viewBox="0 0 297 420">'
     assert import_plan(f"{root}{drawn}</svg>".encode()).report.metres_per_unit == pytest.approx(0.1, rel=0.01)
+
+
+def test_what_a_drawing_lacks_is_named_once_with_its_number():
+    document = _drawn_rooms("Rooms", "Rooms")
+    space = document.modelspace()
+    document.blocks.new("attached").block.dxf.xref_path = "ground.dwg"
+    document.blocks.new("hollow")
+    outer = document.blocks.new("outer")
+    underlay = document.add_underlay_def(filename="plan.pdf", fmt="pdf")
+    for place in ((0.0, 0.0), (5.0, 0.0)):
+        outer.add_blockref("attached", place)
+        outer.add_blockref("hollow", place)
+        space.add_blockref("outer", place)
+        space.add_underlay(underlay, insert=place)
+    cube().scale_uniform(0.5).translate(8.6, 0.0, 0.0).render_polyface(space, dxfattribs={"layer": "COLUMN"})
+    stored = f"ENTITIES\n  0\nAEC_WALL\n  5\nFF01\n330\n{space.layout_key}\n100\nAcDbEntity\n  8\nWAND\n"
+    with pytest.raises(InvalidFloorPlanError, match="no lines, areas or hatches; AEC_WALL on layer 'WAND' is not read"):
+        import_plan(dxf_file(new_dxf()).replace(b"ENTITIES\n", stored.encode(), 1))
+    plan = import_plan(dxf_file(document).replace(b"ENTITIES\n", stored.encode(), 1))
+    for line in (
+        "the drawing attaches 'ground.dwg' (2 times), which is not in the file: bind it (XREF, Bind)",
+        "the block 'hollow' is empty (2 times); if it is another drawing, bind it",
+        "PDFUNDERLAY on layer '0' (2 times) is not read: send that PDF, or import it (PDFIMPORT)",
+        "AEC_WALL on layer 'WAND' is not read: turn such objects into lines (EXPORTTOAUTOCAD)",
+    ):
+        assert sum(warning.startswith(line) for warning in plan.report.warnings) == 1
+    assert {use.used_as for use in plan.report.layers if use.layer == "COLUMN"} == {"faces: obstacle", "ignored"}

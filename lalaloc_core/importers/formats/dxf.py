@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import threading
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,12 +21,13 @@ from ezdxf import options as dxf_options  # pyright: ignore[reportPrivateImportU
 from ezdxf import path as dxf_path
 from ezdxf import recover
 from ezdxf.document import Drawing as DxfDocument
-from ezdxf.entities.dxfentity import DXFEntity
+from ezdxf.entities.dxfentity import DXFEntity, DXFTagStorage
 from ezdxf.entities.dxfgfx import DXFGraphic
+from ezdxf.entities.image import Image
 from ezdxf.entities.insert import Insert
 from ezdxf.entities.lwpolyline import LWPolyline
 from ezdxf.entities.mline import MLine
-from ezdxf.entities.polyline import Polyline
+from ezdxf.entities.polyline import Polyface, Polyline, Polymesh
 from ezdxf.entities.text import Text
 from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
@@ -47,6 +49,7 @@ from lalaloc_core.importers.formats.dxf_unit import find_unit
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
+_READ = _LINES | _FILLED | _TEXTS | {"INSERT", "3DFACE"}
 # Alignments of texts that reach from one point to another.
 _BETWEEN = (3, 5)
 # Roles that blocks have by their own names.
@@ -54,6 +57,11 @@ _OF_BLOCKS = {"door", "window", "passage", "obstacle", "ignored", "demolished"}
 # Entities that draw no part of a building.
 _NO_LINES = {"POINT", "DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "LEADER", "MULTILEADER", "TOLERANCE",
              "VIEWPORT", "WIPEOUT", "RAY", "XLINE", "ATTDEF", "LIGHT", "ACAD_TABLE", "OLE2FRAME", "IMAGE"}  # fmt: skip
+# Remedies for what is not read; EXPLODE makes lines of other kinds.
+_BIND = "bind it (XREF, Bind), or send that drawing"
+_MAKE_PLAIN = "turn such objects into lines (EXPORTTOAUTOCAD), or print a PDF"
+_REMEDIES = {"PDFUNDERLAY": "send that PDF, or import it (PDFIMPORT)", "DGNUNDERLAY": "import it (DGNIMPORT)",
+             "DWFUNDERLAY": "send the drawing it was made of", "ACAD_PROXY_ENTITY": _MAKE_PLAIN}  # fmt: skip
 _MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
 _BYTES_PER_SHAPE = 10
@@ -211,7 +219,7 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     size = max(abs(high[0] - low[0]), abs(high[1] - low[1]))
     # The maximum distance of a curve from its polyline, in drawing units.
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
-    _name_missing(document, builder)
+    missing = _count_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
             builder.use(context.layer, "ignored (layer is off)")
@@ -219,8 +227,15 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
             _add_fixture(entity, context, drawing, builder, sag, budget)
         elif context.role in ("ignored", "demolished") or not options.includes_layer(context.layer):
             builder.leave_out(context.layer, context.role)
-        else:
+        elif (kind := entity.dxftype()) in _READ:
             _add(entity, context, drawing, builder, sag, budget)
+        else:
+            builder.use(context.layer, f"ignored ({kind})")
+            if kind not in _NO_LINES and context.role != "text":
+                subject = f"{kind} on layer '{context.layer[:50]}'"
+                missing[subject, f" is not read: {_REMEDIES.get(kind, 'explode it (EXPLODE)')}"] += 1
+    for (subject, remedy), count in missing.items():
+        builder.warnings.append(f"{subject}{f' ({count} times)' if count > 1 else ''}{remedy}")
     if options.layers and not drawing.areas and not drawing.strokes:
         available = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
@@ -230,19 +245,30 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     return drawing
 
 
-def _name_missing(document: DxfDocument, builder: ReportBuilder) -> None:
-    """Warn of attached drawings and pictures, which are not in the file."""
-    for insert in document.modelspace().query("INSERT"):
-        block = document.blocks.get(insert.dxf.name)
-        if block is not None and block.block is not None and not len(block) and block.block.dxf.get("xref_path"):
-            builder.warnings.append(
-                f"the drawing attaches '{block.block.dxf.xref_path[:100]}', which is not in the file: bind it (XREF, "
-                "Bind), or send that drawing"
-            )
-    for picture in document.modelspace().query("IMAGE"):
-        definition = picture.image_def  # type: ignore[attr-defined]
-        name = "" if definition is None else definition.dxf.get("filename", "")
-        builder.warnings.append(f"the drawing attaches the picture '{name[:100]}', which is not read: send the picture")
+def _count_missing(document: DxfDocument, builder: ReportBuilder) -> Counter[tuple[str, str]]:
+    """Count, by subject and remedy, what the file only refers to, and objects of other programs; also in its blocks."""
+    found: Counter[tuple[str, str]] = Counter()
+    layouts: list[Iterable[DXFEntity]] = [document.modelspace()]
+    seen: set[str] = set()
+    for entity in (entity for layout in layouts for entity in layout):
+        if isinstance(entity, Insert):
+            block = document.blocks.get(entity.dxf.name)
+            if block is not None and len(block):
+                if block.name not in seen:
+                    layouts.append(block)
+                seen.add(block.name)
+            elif block is not None and block.block is not None and (path := block.block.dxf.get("xref_path")):
+                found[f"the drawing attaches '{path[:100]}'", f", which is not in the file: {_BIND}"] += 1
+            else:
+                found[f"the block '{entity.dxf.name[:50]}' is empty", f"; if it is another drawing, {_BIND}"] += 1
+        elif isinstance(entity, Image):
+            name = "" if entity.image_def is None else entity.image_def.dxf.get("filename", "")
+            found[f"the drawing attaches the picture '{name[:100]}'", ", which is not read: send the picture"] += 1
+        elif isinstance(entity, DXFTagStorage):
+            layer = str(entity.graphic_properties().get("layer", "0"))
+            builder.use(layer, f"ignored ({entity.dxftype()})")
+            found[f"{entity.dxftype()} on layer '{layer[:50]}'", f" is not read: {_MAKE_PLAIN}"] += 1
+    return found
 
 
 def _walk(
@@ -277,7 +303,7 @@ def _walk(
                     yield copy, context
                 else:
                     yield from _walk(copy.virtual_entities(), context, depth + 1, budget)
-        elif isinstance(entity, MLine):
+        elif isinstance(entity, MLine | Polyface | Polymesh):
             for part in entity.virtual_entities():
                 budget.check_time()
                 yield part, _Context(layer, role)
@@ -318,11 +344,6 @@ def _add(
         faces = polygons_from_geometry(shapely.Polygon(corners)) if in_range(corners) else []
         drawing.areas += [Area(face, context.layer, role) for face in faces]
         builder.use(context.layer, f"faces: {role or 'possible walls'}" if faces else "ignored")
-    else:
-        builder.use(context.layer, f"ignored ({kind})")
-        if kind not in _NO_LINES:
-            place = f"{kind} on layer '{context.layer[:50]}'"
-            builder.warnings.append(f"{place} is not read: explode it into lines (EXPLODE)")
 
 
 def _anchor(entity: DXFGraphic) -> tuple[float, float] | None:

@@ -24,7 +24,7 @@ from lalaloc_core.importers.drawing.vector_drawing import Drawing
 _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
 # Extents (m) of drawings beyond which the unit is doubted.
 _EXTENT_M = (4.0, 1000.0)
-_MAX_DIMENSIONS = 1000
+_MAX_DIMENSIONS, _MAX_WARNINGS = 1000, 3
 # A unit is meant within so many standard deviations of the estimated scale, or this share of it.
 _NEAR_STDS, _NEAR = 3.0, 0.1
 
@@ -36,9 +36,8 @@ def find_unit(
     code = document.header.get("$INSUNITS", 0)
     own_unit = _INSUNITS.get(code)
     if not drawing.shapes:
-        raise InvalidFloorPlanError(
-            "the DXF's model space has no lines, areas or hatches; move the plan from the layout to the model space"
-        )
+        remedy = "; ".join(builder.warnings[:_MAX_WARNINGS]) or "move the plan from the layout to the model space"
+        raise InvalidFloorPlanError(f"the DXF's model space has no lines, areas or hatches; {remedy}")
     extent = drawing.extent
     measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
     sides = [float(np.sqrt(area.shape.area)) for area in drawing.areas if area.role == "room"]
