@@ -354,8 +354,8 @@ def test_skew_is_found(degrees: float):
     assert find_skew(turned) == pytest.approx(-degrees, abs=0.15)
 
 
-def vector_pdf() -> bytes:
-    """Return a page with filled walls, a door and texts at 1:100."""
+def vector_pdf(more: str = "") -> bytes:
+    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres."""
     centimetre = 72 / 2.54
     content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n"
     for x, y, w, h in [
@@ -368,6 +368,7 @@ def vector_pdf() -> bytes:
         content += f"BT /F1 0.4 Tf {x} {2.5 if x > 1 else -0.6} Td ({text}) Tj ET\n"
     for line in range(8):
         content += f"7 {4 + 0.1 * line:.1f} m 8 {4 + 0.1 * line:.1f} l S\n"
+    content += more
     objects = [
         "<< /Type /Catalog /Pages 2 0 R >>",
         "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -387,8 +388,10 @@ def vector_pdf() -> bytes:
     return f"{out}trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
 
 
-def test_pdf_with_lines_is_read_as_a_drawing():
-    plan = import_plan(vector_pdf())
+@pytest.mark.parametrize(("picture", "count"), [("", 0), ("q 3 0 0 4 10 1 cm BI /W 1 /H 1 /CS /G /BPC 8 ID x EI Q", 1)])
+def test_pdf_with_lines_is_read_as_a_drawing(picture: str, count: int):
+    plan = import_plan(vector_pdf(picture))
+    assert sum("pictures cover 8% of the page" in warning for warning in plan.report.warnings) == count
     assert plan.report.scale_source == "1:100, written in the drawing"
     assert plan.report.is_draft
     assert sorted(names_and_types(plan)) == [("Kitchen", "kitchen"), ("Wohnzimmer", "living")]

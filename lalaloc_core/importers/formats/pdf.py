@@ -36,8 +36,8 @@ from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 _METRES_PER_POINT = 0.0254 / 72.0
-# A page with fewer lines, or with a larger share covered by pictures, is a scan.
-_MIN_LINES, _MOSTLY = 12, 0.5
+# A page with fewer lines, or with a larger share covered by pictures, is a scan; smaller pictures are logos.
+_MIN_LINES, _MOSTLY, _LEAST = 12, 0.5, 0.02
 _FINEST_M, _COARSEST_PT = 0.01, 4.0
 # Margin around a text that is removed, as a share of the root of its area.
 _AROUND_TEXT = 0.1
@@ -120,6 +120,9 @@ def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budge
     drawing = found.drawing
     if not _is_drawing(found):
         return None
+    if found.picture_share >= _LEAST:
+        share = f"pictures cover {found.picture_share:.0%} of the page"
+        builder.warnings.append(f"{share} and are not read, as it has lines: if one is the plan, set crop to it")
     builder.use("lines", "possible walls", len(drawing.strokes))
     builder.use("areas", "possible walls", len(drawing.areas))
     builder.use("curves", "door swings", len(drawing.swings))
