@@ -34,8 +34,10 @@ _USDZ = (
     "apps call it 'JSON', 'raw data' or 'CapturedRoom', and developers encode CapturedRoom or CapturedStructure with "
     "JSONEncoder"
 )
-# JSON files of other programs, by a member or type.
-_OTHER_JSON = {
+# Members of maps of robots by rand256, Roborock and Dreame, and of JSON files of other programs, or their types.
+_ROBOT_MEMBERS = ("charger", "robot", "vacuum_position", "rism")
+_ROBOT_MAP = "a map of a vacuum robot, which cannot be read: export it as a Valetudo map or a picture (PNG)"
+_OTHER_JSON = dict.fromkeys(_ROBOT_MEMBERS, _ROBOT_MAP) | {
     "CityJSON": "CityJSON, a city model; convert the building with its rooms to IndoorGML, or export its plan as DXF",
     "floors": "FML, a project of Floorplanner; export the floor plan there as DXF, SVG, PDF or PNG",
     "meshes": "a glTF model, which has no rooms; export the floor plan as IFC or DXF from the program that made it",
@@ -355,7 +357,7 @@ def _json_format(document: Any) -> Format:
         format = next(known, None)
         if format is not None:
             return format
-        if "rooms" in document or PLANS in document:
+        if ("rooms" in document or PLANS in document) and document.keys().isdisjoint(_ROBOT_MEMBERS):
             return FORMATS["native"]
         if document.get("type") in _GEOJSON_TYPES:
             return FORMATS["geojson"]

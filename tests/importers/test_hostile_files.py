@@ -212,6 +212,8 @@ def test_import_above_the_time_limit():
         (b"hello there", "in no known format; supported formats are native JSON, GeoJSON, OpenStreetMap"),
         (b"AC1032 dwg", "a DWG drawing, and no program that reads it is installed|could not read the DWG drawing"),
         (b'{"doors": [], "foo": 1}', "the members 'doors', 'foo', of no known format; .* RoomPlan 'walls'"),
+        (b'{"image": {}, "path": {}, "robot": [1, 2]}', "vacuum robot, .*: export it as a Valetudo map"),
+        (b'{"rooms": {}, "vacuum_position": {}}', "a map of a vacuum robot, which cannot be read: export it"),
         (b"GIF89a", "a GIF picture, which cannot be read: save it as PNG"),
         (b"<html></html>", "an HTML page, such as the page of a link to a file, .*: download the file itself"),
         (b"<page></page>", "XML of no known kind: save a drawing as SVG or DXF, a map as OSM or IndoorGML"),
