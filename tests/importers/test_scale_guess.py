@@ -115,7 +115,7 @@ def test_sizes_that_contradict_the_others_or_the_scale_are_named():
     assert shape.startswith("'5.0m x 7.9m' was read as the size of a room, but does not fit its room")
     assert scale.startswith("the areas and sides written in 2 rooms give 0.02501 m per unit, and 0.02 is used (option")
     assert builder.scale_factor == pytest.approx(1.25, rel=0.01)
-    assert builder.rejected_texts[-1] == "'19' x 11'' was read as the size of a room, but is in no room"
+    assert builder.rejected_texts == ["'19' x 11'' was read as the size of a room, but is in no room"]
 
 
 def test_written_sides_of_rooms_give_the_scale_of_a_picture_with_a_title():

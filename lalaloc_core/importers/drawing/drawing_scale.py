@@ -258,16 +258,15 @@ def check_areas(
         for index, share in shares.items()
         if abs(share / usual - 1.0) > tolerance
     ]
-    builder.rejected_texts += against
     for index, written in enumerate([*texts, outside]):
         # Open rooms have the sizes of their parts; a single size that does not fit is a contradiction.
         unused = [f"'{text[:50]}'" for text in written if index not in areas and _has_size(text)]
         reason = "does not fit its room" if len(unused) == 1 else "is one of several in a room"
         reason = reason if index < len(rooms) else "is in no room"
         lines = [f"{text} was read as the size of a room, but {reason}" for text in unused]
-        builder.rejected_texts += lines
-        against += lines if len(lines) == 1 and index < len(rooms) else []
+        (against if len(lines) == 1 and index < len(rooms) else builder.rejected_texts).extend(lines)
     if not is_sure:
+        builder.rejected_texts += against
         return
     builder.warnings += [f"{text}, against {len(agreeing)} sizes that agree; check its walls" for text in against]
     if abs(length - 1.0) <= _TOLERANCE:
