@@ -99,6 +99,14 @@ def test_crop_cuts_the_lines_of_a_drawing():
     assert room.area == pytest.approx(12.0, abs=0.2)
 
 
+@pytest.mark.parametrize(("gap", "count"), [(40, 1), (0, 0)])
+def test_storeys_of_lines_are_apart_where_no_wall_joins_them(gap: int, count: int):
+    walls = "".join(f'<path d="M0 {y}h600v400h-600z M30 {y + 30}h540v340h-540z"/>' for y in (0, 400 + gap))
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg"><g stroke="black" fill="none">{walls}</g></svg>'
+    warnings = import_plan(svg.encode(), ImportOptions(metres_per_pixel=0.01)).report.warnings
+    assert sum("2 storeys seem to be drawn side by side" in warning for warning in warnings) == count
+
+
 @pytest.mark.parametrize("format", ["svg", "dxf"])
 def test_storeys_of_a_vector_drawing_are_named_with_their_crop(format: str):
     storeys = [(0.0, 0.0, 5.0, 4.0), (9.0, 0.0, 13.0, 3.5)]

@@ -141,7 +141,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
         report_unused(drawing, shapes, builder, bounds)
     else:
         drawing = without
-        sketch.drawn = reading.walls.envelope
+        sketch.drawn, sketch.walls = reading.walls.envelope, reading.walls
         outlines = [room.shape for room in shapes]
         parts, wide = split_named_rooms(outlines, reading.walls, gaps, drawing.letterings, budget.check_time)
         if wide:
