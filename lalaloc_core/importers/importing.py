@@ -5,9 +5,11 @@ from __future__ import annotations
 import codecs
 import re
 import time
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError, MissingExtraError, SeveralLevelsError
@@ -26,22 +28,9 @@ _GEOJSON_TYPES = {
     "GeometryCollection",
 }  # fmt: skip
 _NO_MEMORY = ("bad_alloc", "Insufficient memory", "Failed to allocate", "bad allocation")
-# Advice for files of other kinds, by the last word of their description.
-_ADVICE = {"drawing": "save it as DXF", "picture": "save it as PNG", "archive": "unpack it",
-           "model": "export the floor plan as IFC or DXF from the program that made it"}  # fmt: skip
-_USDZ = (
-    "the file is a USDZ archive, a 3D model without rooms as RoomPlan apps share it; export the scan's JSON instead: "
-    "apps call it 'JSON', 'raw data' or 'CapturedRoom', and developers encode CapturedRoom or CapturedStructure with "
-    "JSONEncoder"
-)
-# Members of maps of robots by rand256, Roborock and Dreame, and of JSON files of other programs, or their types.
-_ROBOT_MEMBERS = ("charger", "robot", "vacuum_position", "rism")
-_ROBOT_MAP = "a map of a vacuum robot, which cannot be read: export it as a Valetudo map or a picture (PNG)"
-_OTHER_JSON = dict.fromkeys(_ROBOT_MEMBERS, _ROBOT_MAP) | {
-    "CityJSON": "CityJSON, a city model; convert the building with its rooms to IndoorGML, or export its plan as DXF",
-    "floors": "FML, a project of Floorplanner; export the floor plan there as DXF, SVG, PDF or PNG",
-    "meshes": "a glTF model, which has no rooms; export the floor plan as IFC or DXF from the program that made it",
-}
+# Other files, with advice: `advice` by the last word of their description, `json` by their members, and `usdz`.
+_OTHER = tomllib.loads(Path(__file__).with_name("other_files.toml").read_text(encoding="utf-8"))
+_OTHER_JSON = {member: text for members, text in _OTHER["json"].items() for member in members.split()}
 # Suffixes of plan files, such as .imdf.zip.
 _SUFFIXES = re.compile(r"(?:(?<=.)\.imdf)?(?<=.)\.[A-Za-z0-9]{1,10}$")
 # Members of a JSON document of no known format that are named.
@@ -334,7 +323,7 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
 
     names = member_names(content, _MAX_MEMBER_NAMES)
     if any(name.casefold().endswith(_USD) for name in names):
-        raise InvalidFloorPlanError(_USDZ)
+        raise InvalidFloorPlanError(_OTHER["usdz"])
     # Homes have a member for every model of a piece of furniture.
     if _HOME.intersection(names):
         return FORMATS["sweethome3d"], read_archive(content, limits, suffixes=("home.xml",))
@@ -357,12 +346,12 @@ def _json_format(document: Any) -> Format:
         format = next(known, None)
         if format is not None:
             return format
-        if ("rooms" in document or PLANS in document) and document.keys().isdisjoint(_ROBOT_MEMBERS):
+        kind = str(document.get("type"))
+        other = "CityJSON" if kind.startswith("CityJSON") else next((key for key in _OTHER_JSON if key in document), "")
+        if ("rooms" in document or PLANS in document) and not other:
             return FORMATS["native"]
         if document.get("type") in _GEOJSON_TYPES:
             return FORMATS["geojson"]
-        kind = str(document.get("type"))
-        other = "CityJSON" if kind.startswith("CityJSON") else next((key for key in _OTHER_JSON if key in document), "")
         if other:
             raise InvalidFloorPlanError(f"the file is {_OTHER_JSON[other]}")
         members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
@@ -387,7 +376,7 @@ def _format_by_magic(content: bytes) -> Format:
         raise InvalidFloorPlanError("the file is empty; export it again")
     kind = describe_file(content)
     if kind is not None:
-        advice = STAND_INS.get(kind) or _ADVICE.get(kind.rpartition(" ")[2], "convert it")
+        advice = STAND_INS.get(kind) or _OTHER["advice"].get(kind.rpartition(" ")[2], "convert it")
         found = f"{kind}, which cannot be read: {advice}"
     elif start.startswith(b"<"):
         found = "XML of no known kind: save a drawing as SVG or DXF, a map as OSM or IndoorGML"

@@ -325,7 +325,7 @@ def test_sheet_number_after_a_scale_is_no_paper():
     ],
 )  # fmt: skip
 def test_scale_that_is_written_for_a_sheet_or_in_inches(texts: str, paper_m: float | None, scale: int | None):
-    found = _written_scale(texts.split("|"), paper_m)
+    found = _written_scale(texts.split("|"), paper_m or math.inf)
     assert (found and found[0]) == (scale and pytest.approx(scale, rel=0.01))
 
 

@@ -94,9 +94,7 @@ def import_features(
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
     _refuse_map(features, format)
     # The other formats state which number is the latitude.
-    crs = crs if format == "geojson" else ORDERED
-    placed = projection([feature.shape for feature in features], crs, options)
-    anchor = placed.anchor
+    placed = projection([feature.shape for feature in features], crs if format == "geojson" else ORDERED, options)
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
     on_any_level: list[Feature] = []
@@ -125,9 +123,9 @@ def import_features(
     def make(level: Level, members: Sequence[Feature]) -> ImportedPlan:
         builder = ReportBuilder(format, placed.metres_per_unit, placed.source)
         builder.warnings, builder.unsure = list(placed.warnings), list(placed.unsure)
-        sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
-        if anchor is not None:
-            sketch.north_deg = anchor.north_deg
+        sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=placed.anchor)
+        if placed.anchor is not None:
+            sketch.north_deg = placed.anchor.north_deg
         sketch.name = level.name if len(by_level) > 1 else None
         drawer = _Drawer(sketch, options, builder)
         for feature in (*members, *on_any_level):

@@ -24,7 +24,7 @@ from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 _WRITTEN = re.compile(r"(?<![\d.,])(?<!\d:)1\s?[:/]\s?(\d{1,4})(?![\d:]|[.,]\d)")
 # 1/4" = 1'-0", 1" = 20'.
 _INCHES = re.compile(
-    r"(?<![\d./])(?:(\d)[ -])?([1-9]\d?)(?:/([1-9]\d?))?\s?(?:[\"″”“]|''|in\b\.?)\s?=\s?"
+    r"(?<![\d./])(?<!\d[ -])([1-9]\d?)(?:/([1-9]\d?))?\s?(?:[\"″”“]|''|in\b\.?)\s?=\s?"
     r"(\d{1,3})\s?(?:['′’]|ft\b\.?)(?:\s?-?\s?0\s?(?:[\"″”“]|''|in\b\.?))?"
 )
 # Longer sides of sheets (m), and a scale that is for one of them: "1:50 @ A1", "1:100 (A3)", "Scale at A1: 1:50".
@@ -136,7 +136,7 @@ def drawing_scale(
         if own is not None:
             return checked(*own)
         texts = [lettering.text for drawing in drawings for lettering in drawing.letterings]
-        written = _written_scale(texts, paper_m)
+        written = _written_scale(texts, paper_m or math.inf)
         if written is not None and paper_m_per_unit is not None:
             return checked(written[0] * paper_m_per_unit, written[1])
         found = next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None) or guess()
@@ -157,18 +157,21 @@ def drawing_scale(
     return checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)")
 
 
-def _written_scale(texts: Sequence[str], paper_m: float | None) -> tuple[float, str] | None:
-    """Return the denominator of the only scale written, for a page whose longer side is `paper_m`, and its source."""
-    texts = [_INCHES.sub(_in_inches, text) for text in texts]
+def _written_scale(texts: Sequence[str], paper_m: float) -> tuple[float, str] | None:
+    """Return the denominator of the only scale written, for a page with the longer side `paper_m`, and its source."""
+    texts = [
+        _INCHES.sub(lambda found: f"1:{12 * int(found[3]) * int(found[2] or 1) / int(found[1]):g}", text)
+        for text in texts
+    ]
     scales = {int(match) for text in texts for match in _WRITTEN.findall(text)} & _USUAL
     # A page of no sheet's size is a part of one.
-    is_sheet = paper_m is not None and any(abs(size_m / paper_m - 1.0) <= _TOLERANCE for size_m in _SHEETS_M.values())
+    is_sheet = any(abs(size_m / paper_m - 1.0) <= _TOLERANCE for size_m in _SHEETS_M.values())
     sheets: dict[int, tuple[str, float]] = {}
-    for number, first, second, other, third in (found for text in texts for found in _AT_SHEET.findall(text)):
+    for_sheets = [found for text in texts if is_sheet for found in _AT_SHEET.findall(text)]
+    for number, first, second, other, third in for_sheets:
         name = " ".join((first or second or third).upper().split())
         for scale in scales & {int(number or other)} if number or other else scales:
-            if is_sheet and paper_m:
-                sheets.setdefault(scale, (name, _SHEETS_M[name] / paper_m))
+            sheets.setdefault(scale, (name, _SHEETS_M[name] / paper_m))
     own = {scale for scale, (_, larger) in sheets.items() if abs(larger - 1.0) <= _TOLERANCE}
     sizes = [scale * larger for scale, (_, larger) in sheets.items()]
     # "1:50 @ A1 / 1:100 @ A3" is one scale.
@@ -180,11 +183,6 @@ def _written_scale(texts: Sequence[str], paper_m: float | None) -> tuple[float, 
     name, larger = ("", 1.0) if scale in own else sheets.get(scale, ("", 1.0))
     source = f"1:{scale}, written in the drawing" + (f" for {name}, {larger:.3g} times the page" if name else "")
     return scale * larger, source
-
-
-def _in_inches(match: re.Match[str]) -> str:
-    inches = int(match[1] or 0) + int(match[2]) / int(match[3] or 1)
-    return f"1:{12 * int(match[4]) / inches:g}"
 
 
 def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:

@@ -41,8 +41,7 @@ _NUMBERED = re.compile(
     r"(?<![^\W_])(?:([12]\d(?=\.|[^\W\d_])|[1-9])[. _-]{0,2})?((?:[^\W\d_]|\+)+)"
     r"(?:(?=([ ._-]?)((?:(?<=[ ._])-)?[0-2]?\d)(?![^\W_]))|(?![^\W_]))"
 )
-# Parts of the names of layers, shortest word that can be apart from its number, and the share of the smaller storey's
-# box that one over it covers.
+# Parts of names of layers, shortest word apart from its number, and share of a smaller storey's box that one covers.
 _PARTS, _SHORTEST, _OVER = re.compile(r"[^\w+]+|_"), 3, 0.5
 
 
@@ -154,17 +153,12 @@ def _levels(storeys: Sequence[BaseGeometry], letterings: Sequence[Lettering]) ->
 def title_of(text: str) -> Level | None:
     """Return the level that a text is the title of, such as "FIRST FLOOR", "2. Obergeschoss" or "Level 2"."""
     words = ["".join(split_words(word)) if word.isalpha() else word.casefold() for word in _WORDS.findall(text)]
-    known = [number for word in words if (number := _number_in(word)) is not None]
+    known = [float(_NUMBERS[word]) for word in words if word in _NUMBERS]
     digits = [float(word) for word in words if word.isdecimal() and len(word) == 1]
     is_title = len(known) + len(digits) + sum(word in _BESIDE for word in words) >= len(words)
     if not is_title or not (known or (digits and len(words) > 1)) or len(digits) > 1:
         return None
     return Level(" ".join(text.split()), _counted(known[0] if known else None, *digits))
-
-
-def _number_in(word: str) -> float | None:
-    storey = _storey(word) if len(word) >= _SHORTEST and not word.isalpha() else None
-    return float(_NUMBERS[word]) if word in _NUMBERS else storey and storey[1]
 
 
 def _counted(number: float | None, digit: float = 0.0) -> float:
@@ -270,6 +264,5 @@ def _storey(layer: str) -> tuple[str, float] | None:
                 return whole if digit or key != word else letters, _counted(float(_STOREYS[key]), abs(digit))
         if (after or before) and ((word in _BESIDE and len(word) > _SHORTEST) or (is_joined and word in _JOINED)):
             return layer[found.start() : max(found.end(), found.end(4))], float(after or before)
-    parts = list(filter(None, _PARTS.split(layer)))
-    numbers = (part for part in parts if part.isdecimal() and len(part) <= 2 and part != layer)
+    numbers = (part for part in _PARTS.split(layer) if part.isdecimal() and len(part) <= 2 and part != layer)
     return next(((part, float(part)) for part in numbers), None)

@@ -52,7 +52,8 @@ _AUTOMATIC = re.compile(
     r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I
 )
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
-_LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|cm|in|pt|pc|px|)\s*")
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc)\s*")
 # Fills that are less opaque do not hide what is below them.
 _OPAQUE = 0.9
 # Elements without a shape, and elements that are drawn only where they are used.
@@ -190,17 +191,11 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 
 def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
     """Return the lengths (m) on paper of a user unit and the longer side, None if the width has no unit or pixels."""
-    found = [_LENGTH.fullmatch(root.get(key, "")) for key in ("width", "height")]
-    sides = [match for match in found if match is not None and match[2] not in ("", "px")]
-    try:
-        sides_m = [float(match[1]) * _METRES[match[2]] for match in sides]
-        numbers = [float(part) for part in re.split(r"[,\s]+", root.get("viewBox", "").strip()) if part]
-    except ValueError:
-        return None, None
-    if sides[:1] != found[:1] or not sides_m[0] > 0.0:
-        return None, None
-    units = numbers[2] if len(numbers) == 4 else sides_m[0] / _METRES["px"]
-    return (sides_m[0] / units, max(sides_m)) if units > 0.0 else (None, None)
+    sides = [_LENGTH.fullmatch(root.get(key, "")) for key in ("width", "height")]
+    width_m, height_m = (0.0 if side is None else float(side[1]) * _METRES[side[2]] for side in sides)
+    numbers = [float(number) for number in _NUMBER.findall(root.get("viewBox", ""))]
+    units = numbers[2] if len(numbers) == 4 else width_m / _METRES["px"]
+    return (width_m / units, max(width_m, height_m)) if width_m > 0.0 and units > 0.0 else (None, None)
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
