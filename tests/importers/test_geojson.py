@@ -132,7 +132,7 @@ def test_projected_crs_is_converted():
 
 
 @pytest.mark.parametrize(
-    ("longitude", "latitude", "is_exchanged", "said"),
+    ("longitude", "latitude", "swapped", "said"),
     [
         (139.7, 35.7, True, "the latitude would be 139.7°"), (-118.2, 34.1, True, "the latitude would be -118.2°"),
         (88.4, 22.6, True, "the latitude would be 88.4°"), (139.7, 35.7, False, ""), (-88.4, 22.6, False, ""),
@@ -140,11 +140,9 @@ def test_projected_crs_is_converted():
         (13.4, 52.5, True, "taken for longitude 52.500° and latitude 13.400°"),
     ],
 )  # fmt: skip
-def test_order_of_latitude_and_longitude_is_found_or_said(
-    longitude: float, latitude: float, is_exchanged: bool, said: str
-):
+def test_order_of_coordinates_is_found_or_said(longitude: float, latitude: float, swapped: bool, said: str):
     points = LocalFrame(longitude, latitude).to_earth(np.array([[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]], dtype=float))
-    ring = points[:, ::-1] if is_exchanged else points
+    ring = points[:, ::-1] if swapped else points
     report = (plan := import_plan(json.dumps({"type": "Polygon", "coordinates": [ring.tolist()]}).encode())).report
     lines_said = [line for line in (*report.warnings, *report.unsure) if "exchange the two" in line]
     assert [said in line for line in lines_said] == [True] * bool(said)
@@ -263,11 +261,6 @@ def test_rings_of_an_osm_relation_are_joined():
     assert shapes(plan.document)[0].area == pytest.approx(27.0, abs=1e-2)
 
 
-def test_osm_without_rooms_says_what_to_download():
-    with pytest.raises(InvalidFloorPlanError, match=r"no way with the tag 'indoor'.*Overpass query"):
-        import_plan(b'{"elements": [{"type": "node", "id": 1, "lat": 1.0, "lon": 1.0, "tags": {"shop": "yes"}}]}')
-
-
 @pytest.mark.parametrize(
     ("document", "message"),
     [
@@ -276,6 +269,10 @@ def test_osm_without_rooms_says_what_to_download():
         ({"type": "FeatureCollection", "features": [{"type": "Thing"}]}, "feature 0 is not a GeoJSON Feature"),
         ({"type": "Feature", "geometry": {"type": "Polygon", "coordinates": "x"}}, "geometry of the feature"),
         ({"type": "Point", "coordinates": [1, 2]}, "no room was found"),
+        (
+            {"elements": [{"type": "node", "id": 1, "lat": 1.0, "lon": 1.0}]},
+            "no way with the tag 'indoor'.*Overpass query",
+        ),
         ({"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}, "the limit for a plan"),
         (
             {"type": "Polygon", "coordinates": [[[0, 0], [1e400, 0], [1, 1], [0, 0]]]},

@@ -5,11 +5,12 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import shapely
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageOps
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
 from benchmarks.plans import TABLE, Count, Plan, Score, count_found, intersection_over_union, read_plan
@@ -210,6 +211,15 @@ def test_window_of_curved_or_broken_or_pale_lines_closes_its_room(lines_of: str)
     assert len(plan["rooms"]) == 2
 
 
+@pytest.mark.parametrize(("paper", "ink"), [("white", "black"), ("black", "white"), ((20, 60, 120), (220, 235, 255))])
+@pytest.mark.parametrize(("turn_deg", "size"), [(0, 1.0), (90, 0.5), (33, 1.3)])
+def test_drawing_of_any_colours_direction_and_size_is_read(paper: Any, ink: Any, turn_deg: int, size: float):
+    page = two_rooms()[0].convert("L").rotate(turn_deg, fillcolor=255, expand=True)
+    page = ImageOps.colorize(page.resize((round(page.width * size), round(page.height * size))), ink, paper)
+    found = shapes(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01 / size)).document)
+    assert sorted(room.area for room in found) == pytest.approx([8.4, 8.4], abs=0.1)
+
+
 def test_dark_floor_is_a_room():
     page, pen = two_rooms()
     pen.rectangle((457, 121, 779, 379), fill=(80, 85, 90))
@@ -357,7 +367,7 @@ def test_skew_is_found(degrees: float):
 def vector_pdf(more: str = "") -> bytes:
     """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres."""
     centimetre = 72 / 2.54
-    content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n"
+    content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n{more}\n"
     for x, y, w, h in [
         (0, 0, 9.3, 0.15), (0, 5.15, 9.3, 0.15), (0, 0, 0.15, 5.3), (9.15, 0, 0.15, 5.3),
         (4.5, 0, 0.1, 1.5), (4.5, 2.4, 0.1, 2.8),
@@ -368,7 +378,6 @@ def vector_pdf(more: str = "") -> bytes:
         content += f"BT /F1 0.4 Tf {x} {2.5 if x > 1 else -0.6} Td ({text}) Tj ET\n"
     for line in range(8):
         content += f"7 {4 + 0.1 * line:.1f} m 8 {4 + 0.1 * line:.1f} l S\n"
-    content += more
     objects = [
         "<< /Type /Catalog /Pages 2 0 R >>",
         "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
