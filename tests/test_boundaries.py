@@ -204,16 +204,12 @@ def test_imports_have_no_cycles() -> None:
 
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
-def test_package_docstring_names_its_first_file(package: str) -> None:
-    begin = re.search(r"Begin\s+with\s+`([^`]+)`", ast.get_docstring(_tree(package)) or "")
+def test_package_docstring_names_its_first_file_and_no_missing_ones(package: str) -> None:
+    docstring, folder = ast.get_docstring(_tree(package)) or "", MODULES[package].parent
+    begin = re.search(r"Begin\s+with\s+`([^`]+)`", docstring)
     assert begin
-    assert (MODULES[package].parent / begin[1]).exists()
-
-
-@pytest.mark.parametrize("package", sorted(PACKAGES))
-def test_files_in_package_docstrings_exist(package: str) -> None:
-    folder = MODULES[package].parent
-    named = re.findall(r"`([\w/]+\.py)`", ast.get_docstring(_tree(package)) or "")
+    assert (folder / begin[1]).exists()
+    named = re.findall(r"`([\w/]+\.py)`", docstring)
     # Paths are relative to the folder, its parent or the repository.
     assert [name for name in named if not any((base / name).exists() for base in (folder, folder.parent, ROOT))] == []
 

@@ -70,7 +70,7 @@ def _copied() -> list[str]:
     return [source for copy in copies for source in copy.split()]
 
 
-def test_direct_requirements_are_pinned() -> None:
+def test_direct_requirements_are_pinned_once() -> None:
     project = tomllib.loads(PYPROJECT)["project"]
     groups = [project["dependencies"], *project["optional-dependencies"].values()]
     requirements = [Requirement(text) for group in groups for text in group]
@@ -79,10 +79,8 @@ def test_direct_requirements_are_pinned() -> None:
     for requirement in requirements:
         name = canonicalize_name(requirement.name)
         assert name in own or requirement.specifier.contains(pins[name]), requirement
-
-
-def test_torch_is_pinned_once() -> None:
-    assert "torch" not in pinned_versions()
+    # Its build depends on the machine.
+    assert "torch" not in pins
     assert re.fullmatch(r"\d+\.\d+\.\d+", install_torch.pinned_version(PYPROJECT))
 
 
@@ -132,7 +130,7 @@ def test_right_installed_torch_is_kept(
     assert install_torch.is_installed("2.0.0", wants_cpu=wants_cpu) is right
 
 
-def test_image_copies_existing_files() -> None:
+def test_image_copies_existing_files_and_can_export_spans() -> None:
     sources = _copied()
     assert sources
     assert [source for source in sources if not (ROOT / source).exists()] == []
@@ -140,6 +138,7 @@ def test_image_copies_existing_files() -> None:
     let_through = [line[1:] for line in lines if line.startswith("!")]
     assert "*" in lines
     assert [source for source in sources if not any(fnmatch(source.rstrip("/"), name) for name in let_through)] == []
+    assert {"service", "lpo", "otel"} <= set(extras_of("docker/requirements.lock"))
 
 
 def test_image_and_compose_use_known_settings() -> None:
@@ -159,10 +158,6 @@ def test_compose_publishes_locally_by_default() -> None:
     assert environment["LALALOC_ALLOW_ANONYMOUS"] == "${LALALOC_ALLOW_ANONYMOUS:-off}"
 
 
-def test_image_can_export_spans() -> None:
-    assert {"service", "lpo", "otel"} <= set(extras_of("docker/requirements.lock"))
-
-
 def test_proxy_and_replicas_match() -> None:
     replicas = {name: service for name, service in REPLICAS.items() if name.startswith("replica-")}
     proxy = (ROOT / "docker" / "nginx.conf").read_text(encoding="utf-8")
@@ -178,9 +173,13 @@ def test_proxy_and_replicas_match() -> None:
         assert service["environment"]["LALALOC_API_KEYS"] == "on"
 
 
-def test_containers_have_time_to_stop() -> None:
+def test_containers_and_pods_have_time_to_stop() -> None:
     for service in (COMPOSE, REPLICAS["replica-1"]):
         assert float(service["stop_grace_period"].rstrip("s")) > Settings().requests.stop_deadline_s
+    notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().requests.stop_deadline_s
+    assert POD["terminationGracePeriodSeconds"] > notice_s + deadline_s
+    probe = CONTAINER["readinessProbe"]
+    assert notice_s > probe["periodSeconds"] * probe["failureThreshold"]
 
 
 def test_image_does_not_run_as_root() -> None:
@@ -303,13 +302,6 @@ def test_manifest_settings_exist() -> None:
     # Secret values come from a secret.
     assert all("value" not in entry and "secretKeyRef" in entry["valueFrom"] for entry in CONTAINER["env"])
     assert "database_url" not in {name.removeprefix(PREFIX).lower() for name in given}
-
-
-def test_pod_has_time_to_stop() -> None:
-    notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().requests.stop_deadline_s
-    assert POD["terminationGracePeriodSeconds"] > notice_s + deadline_s
-    probe = CONTAINER["readinessProbe"]
-    assert notice_s > probe["periodSeconds"] * probe["failureThreshold"]
 
 
 def test_pod_has_minimal_rights() -> None:

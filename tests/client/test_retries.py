@@ -342,9 +342,7 @@ def test_import_whose_lines_break_off_or_end_with_overload_is_repeated(
     assert steps == [ImportStep("reading texts", 1, 3), ImportStep("reading texts")]
     assert len({request.headers["idempotency-key"] for request in failing.requests}) == 1
     assert all("application/x-ndjson" in request.headers["accept"] for request in failing.requests)
-
-
-def test_service_that_tells_no_steps_is_understood(failing: FailingServer, make_client: MakeClient) -> None:
+    # A service that tells no steps.
     failing.plan = [Planned(201, PLAN, {"Content-Type": "application/json", "ETag": '"r.1"'})]
     with make_client(failing.url, retry=QUICK) as client:
         assert client.upload_floorplan(b"<svg/>", on_step=lambda _step: None).etag == '"r.1"'

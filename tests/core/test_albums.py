@@ -207,10 +207,13 @@ def test_photograph_of_an_album_that_fits_badly_is_uncertain_and_not_set_aside(
     assert pins[1].confidence == pytest.approx(0.3 / rooms)
 
 
-def test_correction_of_an_unknown_room_is_refused(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
+def test_unknown_room_and_repeated_id_are_refused(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
     correction = read_correction({"kind": "room", "plan_id": "flat", "room_id": "ballroom"})
     with pytest.raises(InvalidCorrectionError, match="room 'ballroom' of plan 'flat', which does not exist"):
         solve_album(ground, encoder(), [replace(photographs[0], correction=correction)])
+    with pytest.raises(InvalidInputError, match="same id"):
+        solve_album(ground, encoder(), [photographs[0], photographs[0]])
+    assert solve_album(ground, encoder(), []).pins == ()
 
 
 @pytest.mark.parametrize(
@@ -232,12 +235,6 @@ def test_impossible_corrections_are_refused(document: object, message: str) -> N
 def test_correction_survives_storage() -> None:
     correction = Correction(kind="confirmed", plan_id="p", x_m=1.0, y_m=2.0, heading_deg=3.0)
     assert read_correction(correction.to_document()) == correction
-
-
-def test_an_id_is_added_once(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
-    with pytest.raises(InvalidInputError, match="same id"):
-        solve_album(ground, encoder(), [photographs[0], photographs[0]])
-    assert solve_album(ground, encoder(), []).pins == ()
 
 
 def test_evidence_of_photographs_of_one_spot_counts_once() -> None:

@@ -248,10 +248,14 @@ class Points(Records):
     colour = Column(3)
 
 
-def test_columns_follow_the_order_of_their_names() -> None:
+def test_columns_have_the_order_of_their_names_and_no_others() -> None:
     points = Points.stacked([Points.row(weight=1.0, x_m=2.0, y_m=3.0, colour=(4.0, 5.0, 6.0))])
     np.testing.assert_array_equal(points.rows, [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
     assert Points.WIDTH == 6
+    with pytest.raises(ValueError, match="have 6 columns, not 5"):
+        Points(np.zeros(5))
+    with pytest.raises(KeyError, match="height"):
+        Points.row(height=1.0)
 
 
 def test_joined_columns_are_a_view_of_their_parts() -> None:
@@ -271,13 +275,6 @@ def test_columns_that_are_not_adjacent_cannot_be_joined() -> None:
             second = Column()
             third = Column()
             ends = Joined(first, third)
-
-
-def test_wrong_width_and_unknown_columns_are_refused() -> None:
-    with pytest.raises(ValueError, match="have 6 columns, not 5"):
-        Points(np.zeros(5))
-    with pytest.raises(KeyError, match="height"):
-        Points.row(height=1.0)
 
 
 ROWS, COLUMNS = 64, 128
@@ -339,10 +336,6 @@ def test_patch_stays_within_its_radius(kind: int, radius_deg: float) -> None:
     below = round(radius_deg / 180.0 * ROWS)
     assert torch.equal(covered[:, : ROWS - below - 1], picture[:, : ROWS - below - 1])
     assert not torch.equal(covered[:, -2:], picture[:, -2:])
-
-
-def test_no_patch_covers_nothing() -> None:
-    picture = noise_picture()
     assert torch.equal(cover_poles(picture.clone(), camera()), picture)
 
 
@@ -394,14 +387,11 @@ def test_supersampling_keeps_the_picture(materials: MaterialLibrary, rays: tuple
     assert rays[0] == 1 or steps[1] < steps[0]
 
 
-def test_single_supersample_applies_to_both_axes(materials: MaterialLibrary) -> None:
+def test_single_supersample_applies_to_both_axes_and_is_at_least_one(materials: MaterialLibrary) -> None:
     shots = sample_shots(generate_home(np.random.default_rng(1)), 1, np.random.default_rng(1))
     first, second = (
         SphereRenderer(materials, height=32, width=64, supersample=rays).render(shots) for rays in (2, (2, 2))
     )
     assert torch.equal(first, second)
-
-
-def test_supersample_below_one_is_refused(materials: MaterialLibrary) -> None:
     with pytest.raises(InvalidInputError, match="at least 1"):
         SphereRenderer(materials, supersample=(0, 1))
