@@ -54,13 +54,10 @@ def _commands() -> Iterator[list[str]]:
 COMMANDS = list(_commands())
 
 
-def test_make_commands_are_targets() -> None:
+def test_targets_and_modules_in_commands_exist() -> None:
     targets = {word for command in COMMANDS if command[0] == "make" for word in command[1:] if "=" not in word}
     assert targets >= {"demo", "serve", "test", "setup"}
     assert targets <= TARGETS
-
-
-def test_modules_in_commands_exist() -> None:
     modules = {command[command.index("-m") + 1] for command in COMMANDS if "python" in command[0] and "-m" in command}
     assert [name for name in sorted(modules) if importlib.util.find_spec(name) is None] == []
 

@@ -76,9 +76,6 @@ def test_torch_lock_is_for_the_pinned_version() -> None:
 
 def test_notice_lists_the_licences_of_all_that_ships() -> None:
     assert write_notice.notice_text() == write_notice.NOTICE.read_text(encoding="utf-8"), "run `make notice`"
-
-
-def test_licence_is_read_from_the_metadata() -> None:
     assert write_notice.licence_of("fastapi") == "MIT"
     assert write_notice.licence_of("no-such-package") is None
 

@@ -274,13 +274,11 @@ class TestAzimuths:
         assert measures.scale_ratio == pytest.approx(1.0, abs=0.03)
         assert measure_azimuths([np.ones(20_000)], rng.laplace(0.0, 3.0 * scale), np.log(scale)).scale_ratio > 2.8
 
-    def test_better_of_two_outlines_counts(self) -> None:
+    def test_better_of_two_outlines_counts_and_nan_is_an_infinite_error(self) -> None:
         near, far = np.full(8, 2.0), np.full(8, 5.0)
         measures = measure_azimuths([far, near], np.log(np.full(8, 2.2)), np.zeros(8))
         assert measures.outline == 1
         assert measures.median_error == measures.bias == pytest.approx(np.log(1.1))
-
-    def test_nan_prediction_is_an_infinite_error(self) -> None:
         log_profile = np.where(np.arange(8) < 5, np.nan, 0.0)
         measures = measure_azimuths([np.ones(8)], log_profile, np.zeros(8))
         assert np.isinf(measures.median_error)

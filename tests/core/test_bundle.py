@@ -180,19 +180,17 @@ class TestReading:
         with pytest.raises(BundleError, match=f"{name}.*SHA-256"):
             PoseRefiner.from_bundle(bundle) if name == LAYOUT_WEIGHTS else PhotographEncoder(bundle)
 
-    def test_missing_file_is_named(self, bundle_copy: Path) -> None:
+    def test_missing_file_and_bundle_are_named(self, bundle_copy: Path) -> None:
         (bundle_copy / IMAGE_ONNX).unlink()
         with pytest.raises(BundleError, match=IMAGE_ONNX):
             PhotographEncoder(Bundle.open(bundle_copy))
+        with pytest.raises(BundleError, match="no model bundle at"):
+            Bundle.open(bundle_copy / "nothing")
 
     @pytest.mark.parametrize("name", ["other.onnx", "../manifest.json", MANIFEST_NAME])
     def test_only_listed_files_are_read(self, opened_bundle: Bundle, name: str) -> None:
         with pytest.raises(BundleError, match="has no file"):
             opened_bundle.read(name)
-
-    def test_folder_without_bundle_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(BundleError, match="no model bundle at"):
-            Bundle.open(tmp_path / "nothing")
 
     @pytest.mark.parametrize(
         "changes",
@@ -255,14 +253,11 @@ class TestReading:
 
 
 class TestIdentity:
-    def test_metrics_and_name_do_not_change_the_digest(self, bundle_copy: Path) -> None:
+    def test_weights_change_the_digest_and_metrics_and_name_do_not(self, bundle_copy: Path) -> None:
         before = Bundle.open(bundle_copy)
         scored = dataclasses.replace(before.manifest, name="other", metrics={"within_1m": 0.5})
         after = write_manifest(bundle_copy, scored)
         assert after.sha256 == before.sha256 == Bundle.open(bundle_copy).sha256
-
-    def test_other_weights_change_the_digest(self, bundle_copy: Path) -> None:
-        before = Bundle.open(bundle_copy)
         (bundle_copy / HEAD_ONNX).write_bytes(b"other")
         assert write_manifest(bundle_copy, before.manifest).sha256 != before.sha256
 

@@ -157,10 +157,6 @@ def test_shade_is_logarithmic_in_probability() -> None:
     slope, start = np.polyfit(x_m[between], shade[between], 1)
     assert slope == pytest.approx(0.2, abs=0.01)
     np.testing.assert_allclose(shade[between], start + slope * x_m[between], atol=0.02)
-
-
-def test_equal_probabilities_have_equal_shades() -> None:
-    poses = pose_grid(PLAN, 0.5)
     heat = posterior_map(PLAN, all_places(np.ones(len(poses)), poses), 0.5)
     off_m = np.abs(heat.cells.poses.position_m[:, None] - poses.position_m).max(axis=2).min(axis=1)
     assert heat.shade[off_m <= 0.25].min() > 0.85
@@ -208,13 +204,10 @@ def test_answer_picture_has_all_parts(picture: Picture) -> None:
         assert image.height == int(root.attrib["height"])
 
 
-def test_photograph_picture_needs_a_photograph() -> None:
+def test_picture_without_photograph_or_confidence() -> None:
     with pytest.raises(ValueError, match="photograph is None; picture='both'"):
         draw_answer(answer())
     assert "<image" not in draw_answer(answer(), picture="plan")
-
-
-def test_picture_without_confidence() -> None:
     bare = answer(confidence=None, rivals=(rival(5.0, 4.0, 210.0, "kitchen", None),))
     words = " ".join(ElementTree.fromstring(draw_answer(bare, picture="plan")).itertext())
     assert "within 1 m" not in words
@@ -231,12 +224,9 @@ def test_near_candidates_are_drawn_as_one_place() -> None:
     assert not {"10.0 %", "5.0 %"} & texts
 
 
-def test_ellipse_axes_match_the_covariance() -> None:
+def test_ellipse_axes_match_the_covariance_and_confidence_words_are_distinct() -> None:
     assert ellipse_m((0.01, 0.0, 0.04)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
     assert ellipse_m((0.025, 0.015, 0.025)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
-
-
-def test_confidence_words_are_distinct() -> None:
     descriptions = [confidence_words(value) for value in (1.0, 0.9, 0.6, 0.3, 0.0)]
     assert len(set(descriptions)) == 5
 

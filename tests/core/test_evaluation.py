@@ -131,10 +131,16 @@ class TestRunning:
         path.write_text(json.dumps(line) + "\n", encoding="utf-8")
         assert RunFolder(tmp_path).read_predictions() == [prediction]
 
-    def test_other_description_in_the_folder_is_refused(self, layout_run: RunInfo, tmp_path: Path) -> None:
+    def test_other_description_is_refused_and_split_without_queries_leaves_no_folder(
+        self, layout_run: RunInfo, tmp_path: Path
+    ) -> None:
         run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
         with pytest.raises(RunError, match=r"grid_step_m 0\.5, not 1\.0"):
             run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, grid_step_m=1.0), workers=0)
+        folder, silent = RunFolder(tmp_path / "run"), {"homes": 1, "shots_per_home": 0}
+        with pytest.raises(InvalidInputError, match="no queries"):
+            run_evaluation(folder, dataclasses.replace(layout_run, generated=silent), workers=0)
+        assert not folder.path.exists()
 
     def test_coarser_grid_is_less_accurate(self, layout_run: RunInfo, tmp_path: Path) -> None:
         medians = []
@@ -174,12 +180,6 @@ class TestCommandLine:
         assert "too few queries for an interval: 4; give at least 20" in table
         (row,) = [line for line in table.splitlines() if line.startswith("answer ")]
         assert f"{printed['final']['median_cm']['value']:.1f}" in row
-
-    def test_split_without_queries_leaves_no_folder(self, layout_run: RunInfo, tmp_path: Path) -> None:
-        folder, silent = RunFolder(tmp_path / "run"), {"homes": 1, "shots_per_home": 0}
-        with pytest.raises(InvalidInputError, match="no queries"):
-            run_evaluation(folder, dataclasses.replace(layout_run, generated=silent), workers=0)
-        assert not folder.path.exists()
 
 
 @pytest.mark.slow

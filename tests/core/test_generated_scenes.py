@@ -158,10 +158,12 @@ def test_only_the_picture_is_disturbed() -> None:
         assert not np.array_equal(picture, plain)
 
 
-def test_disturbance_depends_on_the_photograph_only() -> None:
+def test_disturbance_depends_on_the_photograph_only_and_leaves_no_depth() -> None:
     first, again, different = (DisturbedPhotograph(_Shaded(), seed).image(16, 32) for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, different)
+    with pytest.raises(DatasetError, match="no depth"):
+        DisturbedPhotograph(_Shaded(), 0).depth_m()
 
 
 def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,11 +178,6 @@ def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
         ratios.append(np.tan(np.pi / 4 + shift / width * 2.0 * np.pi))
     assert np.std(np.log(ratios)) == pytest.approx(0.1 * np.sqrt(2.0), rel=0.2)
     assert np.mean(np.log(ratios)) == pytest.approx(0.0, abs=0.04)
-
-
-def test_disturbed_photograph_has_no_depth() -> None:
-    with pytest.raises(DatasetError, match="no depth"):
-        DisturbedPhotograph(_Shaded(), 0).depth_m()
 
 
 def test_photographs_are_asked_for_in_other_buildings() -> None:

@@ -82,11 +82,9 @@ class TestOthers:
         assert losses.distance_scale(chamfer, chamfer, 0.5).item() == pytest.approx(math.log(2.0) ** 2, rel=1e-3)
         assert losses.distance_scale(0.25 * chamfer, chamfer, 0.5).item() == pytest.approx(math.log(2.0) ** 2, rel=1e-3)
 
-    def test_decode_is_the_mean_absolute_error(self) -> None:
+    def test_decode_is_the_mean_absolute_error_and_l2_is_not_squared(self) -> None:
         decoded = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]])
         assert losses.decode(decoded, decoded + torch.tensor([[[1.0, -1.0], [0.0, 2.0]]])).item() == 1.0
-
-    def test_l2_is_not_squared(self) -> None:
         first = torch.tensor([[3.0, 0.0], [0.0, 0.0]])
         assert losses.l2(first, torch.tensor([[0.0, 4.0], [0.0, 1.0]])).item() == 3.0
 
@@ -154,15 +152,14 @@ class TestStructure:
         assert nothing.item() == 0.0
 
     @pytest.mark.parametrize("log_error", [-0.3, 0.0, 0.2])
-    def test_ceiling_loss_is_minimal_at_the_truth(self, log_error: float) -> None:
+    def test_ceiling_loss_is_finite_and_minimal_at_the_truth(self, log_error: float) -> None:
         above = torch.tensor([0.8, 1.4])
         predicted = (above.log() + log_error).requires_grad_()
         loss = losses.ceiling(predicted, torch.full((2,), -2.0), above)
         assert loss.item() >= losses.ceiling(above.log(), torch.full((2,), -2.0), above).item()
         (gradient,) = torch.autograd.grad(loss, predicted)
         assert torch.equal(gradient.sign(), torch.full((2,), log_error).sign())
-
-    def test_camera_at_the_ceiling_has_a_finite_loss(self) -> None:
+        # Of a camera at the ceiling.
         assert torch.isfinite(losses.ceiling(torch.zeros(1), torch.zeros(1), torch.tensor([-0.1])))
 
     def test_teacher_openings_leave_passages_free(self) -> None:

@@ -85,13 +85,11 @@ class TestWalls:
         through, wrong = costs(query, hall_layouts(np.stack([door, other_room])), 0.0)[0]
         assert through < 0.5 * wrong
 
-    def test_reach_lowers_the_precision_most_beside_walls(self) -> None:
+    def test_precision_is_bounded_and_lowered_by_reach_most_beside_walls(self) -> None:
         profile = np.log(np.array([[0.3, 1.0, 4.0]])), np.full((1, 3), -3.0)
         fine, coarse = (precisions(*profile, reach_m, WEIGHTS.tail)[0] for reach_m in (0.05, 0.3))
         assert (coarse < fine).all()
         assert (np.diff(coarse / fine) > 0.0).all()
-
-    def test_precision_is_bounded(self) -> None:
         np.testing.assert_allclose(
             precisions(np.zeros((1, 4)), np.full((1, 4), -80.0), 0.0, WEIGHTS.tail), 1.0 / (2.0 * 1e-3)
         )

@@ -26,14 +26,14 @@ def layouts(count: int, columns: int) -> tuple[torch.Tensor, torch.Tensor, torch
 
 
 class TestResNet:
-    @pytest.mark.parametrize(("depth", "parameters", "channels"), [(18, 11_176_512, 512), (50, 23_508_032, 2048)])
-    def test_backbones_match_torchvision(self, depth: int, parameters: int, channels: int) -> None:
-        backbone = ResNet(depth)
-        assert sum(p.numel() for p in backbone.parameters()) == parameters
-        assert backbone.channels == channels
-
-    def test_parameters_match_torchvision(self) -> None:
-        state = {name: tuple(value.shape) for name, value in ResNet(18).state_dict().items()}
+    def test_backbones_match_torchvision(self) -> None:
+        backbones = ResNet(18), ResNet(50)
+        counts = [sum(p.numel() for p in backbone.parameters()) for backbone in backbones]
+        assert counts == [11_176_512, 23_508_032]
+        assert [backbone.channels for backbone in backbones] == [512, 2048]
+        state, deep = (
+            {name: tuple(value.shape) for name, value in backbone.state_dict().items()} for backbone in backbones
+        )
         expected = {
             "conv1.weight": (64, 3, 7, 7),
             "bn1.running_mean": (64,),
@@ -47,7 +47,6 @@ class TestResNet:
         assert {name: state.get(name) for name in expected} == expected
         assert not any(name.startswith("layer1.0.downsample") for name in state)
         assert len(state) == 120
-        deep = {name: tuple(value.shape) for name, value in ResNet(50).state_dict().items()}
         expected = {
             "layer1.0.downsample.0.weight": (256, 64, 1, 1),
             "layer1.0.conv3.weight": (256, 64, 1, 1),
@@ -57,9 +56,7 @@ class TestResNet:
         }
         assert {name: deep.get(name) for name in expected} == expected
         assert len(deep) == 318
-
-    def test_bottleneck_strides_in_its_middle_convolution(self) -> None:
-        block = ResNet(50).get_submodule("layer2.0")
+        block = backbones[1].get_submodule("layer2.0")
         strides = [block.get_submodule(name).stride for name in ("conv1", "conv2", "conv3")]
         assert strides == [(1, 1), (2, 2), (1, 1)]
 
@@ -175,12 +172,10 @@ class TestLoading:
         torch.testing.assert_close(loaded(*inputs), encoder(*inputs), atol=5e-3 if half else 1e-6, rtol=0.0)
         assert all(p.dtype == torch.float32 for p in loaded.parameters())
 
-    def test_missing_and_extra_weights_are_refused(self) -> None:
+    def test_other_weights_and_unknown_architecture_are_refused(self) -> None:
         state = RingLayoutEncoder(TINY).state_dict()
         for wrong in ({**state, "extra": torch.zeros(1)}, {k: v for k, v in state.items() if k != "head.fc.bias"}):
             with pytest.raises(RuntimeError, match="state_dict"):
                 load_layout_encoder("ring", dataclasses.asdict(TINY), safetensors.torch.save(wrong))
-
-    def test_unknown_architecture_is_refused(self) -> None:
         with pytest.raises(ValueError, match="'transformer'"):
             load_layout_encoder("transformer", {}, b"")

@@ -78,12 +78,10 @@ class TestProjection:
             with pytest.raises(InvalidPhotographError, match=r"not a full 360° sphere.*send hfov_deg"):
                 opened(jpeg(np.ascontiguousarray(pixels)))
 
-    def test_stated_field_of_view_makes_a_crop_usable(self) -> None:
+    def test_stated_field_of_view_and_projection_make_pictures_usable(self) -> None:
         crop = jpeg(view_of(Perspective.of_hfov(600, 300, math.radians(90.0))))
         view = opened(crop, hfov_deg=90.0)
         assert (view.projection, view.projection_source, view.hfov.source) == ("perspective", "assumed", "given")
-
-    def test_explicit_projection_overrides_the_picture(self) -> None:
         content = (EXAMPLES / "kitchen.jpg").read_bytes()
         assert opened(content, projection="cylindrical", hfov_deg=180.0).projection == "cylindrical"
         white = jpeg(np.full((256, 512, 3), 255, np.uint8))
@@ -255,10 +253,14 @@ def patch_error(view: Photograph, name: str, heading_deg: float = 0.0) -> float:
 
 
 class TestPatches:
-    def test_size_has_square_pixels(self) -> None:
+    def test_patch_has_square_pixels_and_the_size_of_the_encoder(self) -> None:
         size = PatchSize()
         assert (size.bottom_deg, size.top_deg) == (-45.0, 39.375)
         assert size.resolution == pytest.approx(size.height / math.radians(size.top_deg - size.bottom_deg))
+        config = ViewEncoderConfig()
+        ring = RingConfig(sectors=64)
+        assert (size.height, size.width, size.top_deg) == (config.image_height, config.image_width, config.top_deg)
+        assert size.hfov == pytest.approx(config.width_rad(ring))
 
     @pytest.mark.parametrize(
         ("camera", "stated"),
@@ -290,12 +292,6 @@ class TestPatches:
         view = opened(jpeg(strip), projection="cylindrical", hfov_deg=250.0, pitch_deg=8.0, roll_deg=0.0)
         assert patch_error(view, "living_room") < 6.0
         assert view.pitch.source == "given"
-
-    def test_patch_agrees_with_the_encoder_of_views(self) -> None:
-        size, config = PatchSize(), ViewEncoderConfig()
-        ring = RingConfig(sectors=64)
-        assert (size.height, size.width, size.top_deg) == (config.image_height, config.image_width, config.top_deg)
-        assert size.hfov == pytest.approx(config.width_rad(ring))
 
     def test_unseen_pixels_are_grey(self) -> None:
         (patch,) = opened(jpeg(view_of(MAIN), PHONE), pitch_deg=0.0, roll_deg=0.0).patches

@@ -150,14 +150,16 @@ class TestDrawing:
 
 
 class TestLoading:
-    def test_photographs_without_annotation_need_a_teacher(self, tmp_path: Path) -> None:
+    def test_photographs_and_teachers_need_each_other_and_openings(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="--teacher is for --photographs"):
+            TrainingData(teachers=(tmp_path,)).load_photographs(PRESETS["tiny-trunk"])
+        with pytest.raises(ConfigError, match="'ring' predicts no openings"):
+            TrainingData(photographs=(tmp_path,), teachers=(tmp_path / "t",)).load_photographs(PRESETS["tiny"])
+        with pytest.raises(DatasetError, match="no photographs"):
+            load_photographs([tmp_path], [tmp_path / "teacher.tflite"], 32, 64)
         Image.new("RGB", (64, 32)).save(tmp_path / "room.png")
         with pytest.raises(ConfigError, match="1 photographs without annotation need one segmenter"):
             TrainingData(photographs=(tmp_path,)).load_photographs(PRESETS["tiny-trunk"])
-
-    def test_teachers_need_photographs(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="--teacher is for --photographs"):
-            TrainingData(teachers=(tmp_path,)).load_photographs(PRESETS["tiny-trunk"])
 
     def test_annotations_are_exact_targets(self, tmp_path: Path) -> None:
         # A square room of two camera heights a side; a door in the middle of the wall ahead.
@@ -193,14 +195,6 @@ class TestLoading:
         mirrored = read_by_encoder(encoder, sphere.flip(2), width)
         torch.testing.assert_close(mirrored[1], log_distance.flip(1))
 
-    def test_photographs_need_an_architecture_with_openings(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="'ring' predicts no openings"):
-            TrainingData(photographs=(tmp_path,), teachers=(tmp_path / "t",)).load_photographs(PRESETS["tiny"])
-
-    def test_folder_without_photographs_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(DatasetError, match="no photographs"):
-            load_photographs([tmp_path], [tmp_path / "teacher.tflite"], 32, 64)
-
     @pytest.mark.skipif(not has_runtime, reason="ai-edge-litert is not installed")
     def test_invalid_teacher_is_refused(self, tmp_path: Path) -> None:
         Image.new("RGB", (64, 32)).save(tmp_path / "room.png")
@@ -213,16 +207,14 @@ class TestOptics:
     def pictures(self) -> torch.Tensor:
         return torch.rand(16, 16, 32, 3, generator=torch.Generator().manual_seed(2)) * 255.0
 
-    def test_zero_strength_changes_nothing(self) -> None:
-        changed = optics(self.pictures(), 0.0, torch.Generator().manual_seed(0))
-        torch.testing.assert_close(changed, self.pictures(), atol=1e-3, rtol=0.0)
-
-    def test_optics_change_most_pictures(self) -> None:
+    def test_optics_change_most_pictures_unless_their_strength_is_zero(self) -> None:
         changed = optics(self.pictures(), 1.0, torch.Generator().manual_seed(0))
         assert torch.equal(changed, optics(self.pictures(), 1.0, torch.Generator().manual_seed(0)))
         assert 0.0 <= changed.min() <= changed.max() <= 255.0
         differs = (changed - self.pictures()).abs().amax(dim=(1, 2, 3)) > 1.0
         assert int(differs.sum()) > 8
+        changed = optics(self.pictures(), 0.0, torch.Generator().manual_seed(0))
+        torch.testing.assert_close(changed, self.pictures(), atol=1e-3, rtol=0.0)
 
     @pytest.mark.parametrize("columns", [1, 13])
     def test_blur_wraps_around_the_horizon(self, columns: int) -> None:

@@ -73,6 +73,7 @@ class TestReading:
         dataset = PosedSpheres(rooms)
         scenes = [list(dataset.scenes(split)) for split in ("train", "validation", "test")]
         assert scenes == [["2003", "2004"], ["2005"], []]
+        assert isinstance(open_dataset(rooms), PosedSpheres)
 
     def test_house_validates_only(self, house: Path) -> None:
         dataset = PosedSpheres(house)
@@ -80,6 +81,9 @@ class TestReading:
         (name,) = dataset.scenes("validation")
         (camera,) = dataset.load(name).cameras
         assert (camera.position_m.tolist(), camera.heading) == ([1.0, 3.0], pytest.approx(HEADING))
+        # Not even without labels, by a teacher.
+        with pytest.raises(DatasetError, match="its photographs only validate"):
+            load_photographs([house], [default_bundle()], 32, 64)
 
     def test_annotation_is_in_the_frame_of_the_photograph(self, rooms: Path) -> None:
         (found,) = annotated(PosedSpheres(rooms), "validation")
@@ -110,9 +114,6 @@ class TestGalleries:
         assert len(scene.plan.rooms) == GALLERY_ROOMS
         assert scene.plan.room_index_at(scene.cameras[0].position_m[None])[0] == scene.cameras[0].room_index
 
-    def test_rooms_are_posed_spheres_unless_galleries_are_asked_for(self, rooms: Path) -> None:
-        assert isinstance(open_dataset(rooms), PosedSpheres)
-
 
 class TestTargets:
     def test_rooms_that_validate_are_not_trained_on(self, rooms: Path) -> None:
@@ -120,11 +121,6 @@ class TestTargets:
         assert len(found.images) == 2
         assert found.room_type.tolist() == [ROOM_TYPES.index("kitchen")] * 2
         assert bool((found.openings[:, 32, DOOR - 1] == 1.0).all())
-
-    def test_house_is_no_training_data(self, house: Path) -> None:
-        # Not even without labels, by a teacher.
-        with pytest.raises(DatasetError, match="its photographs only validate"):
-            load_photographs([house], [default_bundle()], 32, 64)
 
     def test_folders_have_their_shares(self, rooms: Path, tmp_path: Path) -> None:
         real = tmp_path / "real"

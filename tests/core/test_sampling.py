@@ -122,11 +122,9 @@ class TestRandomPoses:
         # The order is random: a prefix is a sample.
         assert 0.2 < (poses.room_index[:300] == 1).mean() < 0.47
 
-    def test_room_narrower_than_the_margin_has_no_poses(self) -> None:
+    def test_room_narrower_than_the_margin_has_no_poses_and_such_a_plan_is_refused(self) -> None:
         plan = plan_of(rectangle(3.0, 3.0), rectangle(0.25, 3.0, corner=(4.0, 0.0)))
         assert set(random_poses(plan, 200, np.random.default_rng(0), 0.15).room_index) == {0}
-
-    def test_plan_narrower_than_the_margin_is_refused(self) -> None:
         with pytest.raises(InvalidInputError, match=r"0\.15 m"):
             random_poses(plan_of(rectangle(0.25, 3.0)), 5, np.random.default_rng(0), 0.15)
 
@@ -153,9 +151,6 @@ class TestTriplets:
         assert drawn is not None
         assert (wall_distance(plan, drawn[0]) > 0.0).all()
 
-    def test_plan_too_small_for_negatives_gives_none(self) -> None:
-        assert sample_triplets(plan_of(rectangle(1.5, 1.2)), 1, TripletSampling(), np.random.default_rng(0)) is None
-
 
 class TestNeighbours:
     @given(seeds(), st.integers(0, 6), st.integers(1, 20))
@@ -174,6 +169,7 @@ class TestNeighbours:
         plan = plan_of(rectangle(1.5, 1.2))
         anchor = random_poses(plan, 1, np.random.default_rng(0))
         assert sample_neighbours(plan, anchor, TripletSampling(), np.random.default_rng(0)) is None
+        assert sample_triplets(plan, 1, TripletSampling(), np.random.default_rng(0)) is None
 
     @given(seeds())
     def test_low_rooms_are_excluded(self, seed: int) -> None:

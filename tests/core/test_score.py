@@ -73,7 +73,7 @@ class TestScores:
         assert (present(scores.layout_recall).value, present(scores.pose_recall).value) == pytest.approx((2 / 3, 1 / 3))
         assert scores.median_ms == {"retrieve": 1.0, "lpo": 10.0}
 
-    def test_missing_answer_is_a_miss_in_every_score(self) -> None:
+    def test_missing_answer_or_stage_is_a_miss_in_every_score(self) -> None:
         scores = score([prediction(0.001), prediction(), prediction()])
         assert scores.unanswered == 2
         assert scores.final.within_1m.value == pytest.approx(1 / 3)
@@ -81,18 +81,18 @@ class TestScores:
         assert scores.final.median_cm.value == np.inf
         assert scores.final.median_heading_error_deg.value == np.inf
         assert present(scores.layout_recall).value == pytest.approx(1 / 3)
-
-    def test_missing_stage_is_a_miss(self) -> None:
-        scores = score([prediction(0.1, 0.1, 0.1), prediction(0.1)])
-        assert scores.stages["lpo"].within_1m.value == 0.5
+        partial = score([prediction(0.1, 0.1, 0.1), prediction(0.1)])
+        assert partial.stages["lpo"].within_1m.value == 0.5
 
     def test_heading_error_wraps_around(self) -> None:
         assert heading_errors_deg([prediction(0.1, turned_deg=15.0)])[0] == pytest.approx(15.0)
         assert heading_errors_deg([prediction(0.1, turned_deg=-200.0)])[0] == pytest.approx(160.0)
         assert np.isnan(heading_errors_deg([prediction()])[0])
 
-    def test_method_without_retrieval_has_no_recall(self) -> None:
+    def test_method_without_retrieval_has_no_recall_and_no_predictions_are_refused(self) -> None:
         assert score([prediction_of(TRUTH)]).layout_recall is None
+        with pytest.raises(InvalidInputError, match="no predictions"):
+            score([])
 
     def test_slices_are_sorted_worst_first(self) -> None:
         both, query = ("corridor", "mirror"), ("corridor",)
@@ -127,10 +127,6 @@ class TestScores:
         both = score([prediction(0.1, scene="a"), prediction(0.2, scene="b")]).final.within_1m
         assert (both.value, both.high) == (1.0, 1.0)
         assert both.low == pytest.approx(0.342, abs=1e-3)
-
-    def test_no_predictions_are_refused(self) -> None:
-        with pytest.raises(InvalidInputError, match="no predictions"):
-            score([])
 
     @given(st.lists(st.floats(0.0, 30.0), min_size=1, max_size=30), st.integers(0, 5))
     def test_interval_contains_value_and_repeats_by_seed(self, errors: list[float], seed: int) -> None:
@@ -173,8 +169,7 @@ class TestCalibration:
         assert expected_calibration_error(np.array([0.0, 0.0, 1.0]), np.array([False, False, True])) == 0.0
         assert expected_calibration_error(np.ones(4), np.zeros(4, dtype=bool)) == 1.0
         assert expected_calibration_error(np.full(4, 0.75), np.array([True, True, True, False])) == 0.0
-
-    def test_bins_are_weighted_by_queries(self) -> None:
+        # Bins are weighted by queries.
         confidence = np.array([0.05, 0.95, 0.95, 0.95])
         correct = np.array([True, True, True, True])
         assert expected_calibration_error(confidence, correct) == pytest.approx(0.25 * 0.95 + 0.75 * 0.05)
@@ -263,16 +258,14 @@ class TestFailures:
     def test_mirrored_poses_are_recognised(self, x_m: float, y_m: float, symmetric: bool) -> None:
         assert is_symmetric(PLAN, found_at(x_m, y_m)) == symmetric
 
-    def test_wrong_room_is_not_mirrored(self) -> None:
-        assert not is_symmetric(PLAN, found_at(None))
-        assert not is_symmetric(PLAN, found_at(5.0, 1.0, room=1))
-
-    def test_chance_is_share_of_mirrored_positions(self) -> None:
+    def test_chance_is_share_of_mirrored_positions_in_the_right_room(self) -> None:
         rng = np.random.default_rng(0)
         everywhere = [found_at(x, y) for x, y in rng.uniform((0.0, 0.0), (6.0, 4.0), (2000, 2))]
         wrong = [pose for pose in everywhere if outcomes([pose]) == [Outcome.WRONG_ALIGNMENT]]
         share = np.mean([is_symmetric(PLAN, pose) for pose in wrong])
         assert symmetric_by_chance(PLAN, wrong[0]) == pytest.approx(share, abs=0.02)
+        assert not is_symmetric(PLAN, found_at(None))
+        assert not is_symmetric(PLAN, found_at(5.0, 1.0, room=1))
 
 
 class TestSummary:

@@ -60,14 +60,11 @@ def test_calibration_of_the_stored_picture_is_turned(orientation: int) -> None:
     np.testing.assert_allclose(upright.pixels(rays)[0], turned, atol=1e-6)
 
 
-def test_usual_optical_centres_are_left_alone() -> None:
+def test_only_optical_centres_far_from_the_middle_are_named() -> None:
     for cx, cy in ((320.0, 240.0), (340.0, 225.0), (370.0, 200.0)):
         stated = Intrinsics(fx=480.0, fy=480.0, cx=cx, cy=cy)
         assert fit_intrinsics(stated, 640, 480, 1) == (stated, ())
     assert fit_intrinsics(Intrinsics(fx=480.0, fy=480.0), 640, 480, 6)[1] == ()
-
-
-def test_optical_centre_far_from_the_middle_is_named() -> None:
     stated = Intrinsics(fx=480.0, fy=480.0, cx=500.0, cy=240.0)
     found, (text,) = fit_intrinsics(stated, 640, 480, 1)
     assert found == stated

@@ -309,11 +309,8 @@ def test_materials_work_with_and_without_textures(tmp_path: Path, materials: Mat
     assert drawn & photographs
     assert drawn - photographs
     np.testing.assert_allclose(library.mean_colours[min(photographs)], [1.0, 0.0, 0.0], atol=0.02)
-
-
-def test_textures_folder_without_pictures_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="contains no pictures"):
-        MaterialLibrary.create(np.random.default_rng(0), tmp_path)
+        MaterialLibrary.create(np.random.default_rng(0), folder)
 
 
 def test_odd_height_is_refused(materials: MaterialLibrary) -> None:

@@ -152,16 +152,14 @@ class TestBadFiles:
         assert all(sum(name in message for message in messages) == 1 for name in named)
         assert ["number 1" in messages[0], "number 2" in messages[1]] == [True, True]
 
-    def test_data_set_without_usable_scene_is_refused(self, data: OwnData) -> None:
+    def test_data_set_without_usable_or_training_scenes_is_refused(self, data: OwnData, tmp_path: Path) -> None:
         for number in range(SCENES):
             (data.root / f"scene {number}" / "plan.json").write_text("{}", encoding="utf-8")
         for stream in (LayoutBatches, SphereBatches):
             with pytest.raises(DatasetError, match="in a row"):
                 next(load_batches(stream(CONFIG, SceneSource(CONFIG, data, skip_bad=True)), 0))
-
-    def test_data_set_without_training_scenes_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no training scenes"):
-            SceneSource(CONFIG, OwnData(tmp_path))
+            SceneSource(CONFIG, OwnData(tmp_path / "empty"))
 
     @pytest.mark.slow
     def test_worker_errors_keep_their_attributes(self, data: OwnData) -> None:

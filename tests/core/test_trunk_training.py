@@ -105,6 +105,9 @@ class TestLabels:
         assert np.array_equal(np.isfinite(edges).all(axis=0), kind == WINDOW)
         # The window is two metres ahead, 0.6 m below the camera to 0.5 m above it.
         np.testing.assert_allclose(edges[:, 32], np.arctan2([-0.6, 0.5], 2.0 / np.cos(np.pi / 64)), rtol=1e-5)
+        # Walls are unknown in plans without all openings.
+        kind, _ = seen_openings(plan(opening_kinds=["window"]), camera(1.5), 0.0, 64)
+        assert set(kind) == {UNKNOWN, WINDOW}
 
     def test_renderings_tell_where_walls_are_seen(self) -> None:
         (sample, *_) = GeneratedSource(TINY).samples(0, 64, 128)
@@ -125,10 +128,6 @@ class TestLabels:
         assert float(losses.wall_seen(wrong, walls, seen)) > 2.0
         seen[0, 0] = False
         assert float(losses.wall_seen(wrong, walls, seen)) < 0.01
-
-    def test_walls_are_unknown_in_plans_without_all_openings(self) -> None:
-        kind, _ = seen_openings(plan(opening_kinds=["window"]), camera(1.5), 0.0, 64)
-        assert set(kind) == {UNKNOWN, WINDOW}
 
     def test_batches_hold_openings_and_room_types(self, batch: dict[str, torch.Tensor]) -> None:
         kind = batch["opening_kind"]
@@ -464,6 +463,9 @@ class TestBest:
         assert Checkpoint.load(tmp_path / "a" / "line.pt").step == 3
         assert self.best_of(tmp_path / "b", 0.5, 0.7, 0.7).step == 3
         assert not list(tmp_path.rglob("*.part"))
+        # A new run deletes the previous best.
+        self.best_of(tmp_path / "c", 0.9)
+        assert self.best_of(tmp_path / "c", 0.1, 0.2).step == 2
 
     def test_likelihood_ranks_checkpoints(self, tmp_path: Path) -> None:
         scores = Scores(0.5, 0.7, 0.6)
@@ -484,10 +486,6 @@ class TestBest:
         run_stage(LineStage(5), tmp_path, device=CPU, checkpoint_minutes=0.0, validate=again, resume=True)
         assert same_weights({"line": again.seen[0]}, first.weights)
         assert Checkpoint.load(tmp_path / "line.best.pt").step == 4
-
-    def test_new_run_deletes_the_previous_best(self, tmp_path: Path) -> None:
-        self.best_of(tmp_path, 0.9)
-        assert self.best_of(tmp_path, 0.1, 0.2).step == 2
 
     @pytest.mark.slow
     def test_export_uses_the_best_or_the_last(self, tiny_run: Path, tmp_path: Path) -> None:

@@ -38,9 +38,7 @@ def test_instants_of_different_zones_are_one_order() -> None:
     assert found.order.tolist() == [0, 3, 1, 4, 2]
     assert found.follows.tolist() == [False, True, True, True, True]
     assert found.warnings == ()
-
-
-def test_photograph_without_zone_has_that_of_its_camera() -> None:
+    # A photograph without a zone has that of its camera.
     at = [*_minutes(0, 2, zone_h=2), *_minutes(1)]
     assert walk_order(_album(*(("A", time) for time in at)), {}).order.tolist() == [0, 2, 1]
 
