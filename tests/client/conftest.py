@@ -25,6 +25,7 @@ from tests.service.conftest import (  # noqa: F401, fixtures
     postgres,
     sphere,
     start_app,
+    upload,
 )
 from tests.service.conftest import client as app
 
@@ -119,6 +120,12 @@ def _blocking(*arguments: Any, **options: Any) -> Iterator[_BlockingAdapter]:
 def make_client(request: pytest.FixtureRequest) -> MakeClient:
     """Return a function that creates a client of either kind."""
     return Client if request.param == "sync" else _blocking
+
+
+@pytest.fixture(scope="module")
+def plan_id(app: httpx.Client) -> str:
+    """Return the id of `FLAT` in the module's app."""
+    return upload(app)
 
 
 @pytest.fixture

@@ -16,18 +16,13 @@ from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
 from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from tests.client.conftest import FailingServer, Planned
 from tests.client.test_retries import LOCALISATION
-from tests.service.conftest import FLAT, metric, upload
+from tests.service.conftest import metric
 
 COUNT = 14
 REJECTED = 'lalaloc_rejections_total{reason="overloaded"}'
 ONCE = RetryPolicy(attempts=1)
 # Four concurrent queries, three of them per client, and no queue.
 APP_SETTINGS = {"max_queries": 4, "max_waiting_queries": 0}
-
-
-@pytest.fixture(scope="module")
-def plan_id(app: httpx.Client) -> str:
-    return upload(app, FLAT)
 
 
 def query_on_threads(client: Client, plan_id: str, sphere: bytes) -> list[Any]:

@@ -20,8 +20,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from tests.client.conftest import MakeClient
 from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
-from tests.core.taken import EXAMPLES
-from tests.service.conftest import FLAT, StartApp
+from tests.service.conftest import FLAT, HOME, StartApp, upload
 
 APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
@@ -124,8 +123,9 @@ def test_events_end_when_the_plan_is_ready(service: Any) -> None:
         list(service.events("0" * 32))
 
 
-def test_answer_has_every_field(service: Any, app: httpx.Client, sphere: bytes) -> None:
-    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+def test_answer_has_every_field_and_the_posterior_on_request(
+    service: Any, plan_id: str, app: httpx.Client, sphere: bytes
+) -> None:
     options = {"heading_deg": 90.0, "heading_tolerance_deg": 10.0, "refine": "vdr", "top_k": 2}
     answer = service.localise(plan_id, sphere, **options)
     data = {"floorplan_id": plan_id} | {name: str(value) for name, value in options.items()}
@@ -135,10 +135,6 @@ def test_answer_has_every_field(service: Any, app: httpx.Client, sphere: bytes) 
     assert {name: value for name, value in json.loads(json.dumps(known)).items() if name in document} == document
     assert answer.stage == "vdr"
     assert answer.candidates[0].position == answer.position
-
-
-def test_posterior_comes_on_request(service: Any, sphere: bytes) -> None:
-    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
     posterior = service.localise(plan_id, sphere, refine="none", posterior=True).posterior
     assert len(posterior.x_m) == len(posterior.y_m) == len(posterior.probability) > 10
     assert sum(posterior.probability) == pytest.approx(1.0, abs=1e-4)
@@ -181,8 +177,7 @@ def test_sphere_is_bytes_a_file_or_an_image(service: Any, sphere: bytes, tmp_pat
     assert answer.cost == pytest.approx(answers[0].cost, rel=0.1)
 
 
-def test_invalid_request_names_the_fields(service: Any, sphere: bytes) -> None:
-    plan_id = service.upload_floorplan(FLAT).id
+def test_invalid_request_names_the_fields(service: Any, plan_id: str, sphere: bytes) -> None:
     with pytest.raises(InvalidError, match="top_k") as caught:
         service.localise(plan_id, sphere, top_k=99)
     assert caught.value.status == 422
@@ -208,8 +203,7 @@ def test_readiness(service: Any, app: httpx.Client) -> None:
     assert state.model.sha256 == app.get("/readyz").json()["model"]["sha256"]
 
 
-def test_sequence_is_one_query(service: Any, app: httpx.Client, sphere: bytes) -> None:
-    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+def test_sequence_is_one_query(service: Any, plan_id: str, app: httpx.Client, sphere: bytes) -> None:
     answer = service.localise_sequence(
         plan_id, [sphere, sphere], motion="turn", headings_deg=[90.0, None], refine="none", top_k=2
     )
@@ -223,8 +217,7 @@ def test_sequence_is_one_query(service: Any, app: httpx.Client, sphere: bytes) -
         service.localise_sequence(plan_id, [sphere, sphere], motion="turn", headings_deg=[float("nan"), None])
 
 
-def test_options_are_sent(service: Any, sphere: bytes) -> None:
-    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+def test_options_are_sent(service: Any, plan_id: str, sphere: bytes) -> None:
     assert service.localise(plan_id, sphere, rooms="kitchen", strict=True, refine="none").room == "kitchen"
     near = {"x_m": 2.0, "y_m": 1.0}
     answer = service.localise(plan_id, sphere, near=near, radius_m=1.0, strict=True, refine="none")
@@ -237,13 +230,12 @@ def test_options_are_sent(service: Any, sphere: bytes) -> None:
         service.localise(plan_id, sphere, headng_deg=90.0)
 
 
-def test_batch_yields_an_answer_per_photograph(service: Any, sphere: bytes, tmp_path: Path) -> None:
+def test_batch_yields_an_answer_per_photograph(service: Any, plan_id: str, sphere: bytes, tmp_path: Path) -> None:
     (tmp_path / "hall.jpg").write_bytes(sphere)
-    plan = service.wait_until_ready(service.upload_floorplan(FLAT).id, timeout_s=60.0)
-    answers = list(service.localise_batch(plan.id, [tmp_path / "hall.jpg", b"no picture", sphere], refine="none"))
+    answers = list(service.localise_batch(plan_id, [tmp_path / "hall.jpg", b"no picture", sphere], refine="none"))
     found = [(answer.index, answer.name, answer.status) for answer in answers]
     assert found == [(0, "hall.jpg", 200), (1, "photo", 422), (2, "photo", 200)]
-    assert answers[0].result().floorplan_id == plan.id
+    assert answers[0].result().floorplan_id == plan_id
     with pytest.raises(InvalidError) as caught:
         answers[1].result()
     assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
@@ -257,25 +249,28 @@ def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
         yield started
 
 
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    return upload(shipped, HOME)
+
+
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if not fault.fields], ids=fault_id)
 def test_faulty_photograph_gives_its_warning_or_a_named_error(
-    shipped: httpx.Client, make_client: MakeClient, fault: Fault
+    shipped: httpx.Client, home: str, make_client: MakeClient, fault: Fault
 ) -> None:
     with make_client(str(shipped.base_url), timeout_s=100.0) as client:
-        plan = client.upload_floorplan(EXAMPLES / "flat.json")
         if fault.is_usable:
-            answer = client.localise(plan.id, FOLDER / fault.name)
+            answer = client.localise(home, FOLDER / fault.name)
             fault.check(dataclasses.asdict(answer))
             assert fault.said is None or any(fault.said in text for text in answer.warnings)
             return
         with pytest.raises(InvalidError) as caught:
-            client.localise(plan.id, FOLDER / fault.name)
+            client.localise(home, FOLDER / fault.name)
         assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
         fault.check_refusal(str(caught.value))
 
 
-def test_earlier_names_of_arguments_are_accepted(service: Any, sphere: bytes) -> None:
-    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+def test_earlier_names_of_arguments_are_accepted(service: Any, plan_id: str, sphere: bytes) -> None:
     with pytest.warns(DeprecationWarning, match="'panorama' is now 'photograph'"):
         earlier = service.localise(plan_id, panorama=sphere, refine="none")
     assert earlier.position == service.localise(plan_id, photograph=sphere, refine="none").position

@@ -24,7 +24,6 @@ from lalaloc_client import (
     world_from_plan,
     yaw_of,
 )
-from tests.service.conftest import upload
 
 COVARIANCE = ((0.04, 0.01, 0.3), (0.01, 0.09, -0.2), (0.3, -0.2, 4.0))
 
@@ -33,8 +32,7 @@ def pose_at(heading_deg: float) -> TrackedPose:
     return TrackedPose(1, Position(2.0, 3.0), heading_deg, "hall", "hall", COVARIANCE, 0.9, 1.5, (), (), (), {})
 
 
-def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(app)
+def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
     with Client(str(app.base_url)) as service, service.track(plan_id, camera_height_m=1.5) as tracker:
         session_id = tracker.session.id
         first = tracker.add(sphere)
@@ -54,8 +52,7 @@ def test_tracker_follows_a_camera_and_ends_its_session(app: httpx.Client, sphere
             tracker.add(sphere)
 
 
-def test_tracker_follows_a_camera_in_a_venue(app: httpx.Client, sphere: bytes) -> None:
-    plan_id = upload(app)
+def test_tracker_follows_a_camera_in_a_venue(app: httpx.Client, plan_id: str, sphere: bytes) -> None:
     venue = app.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 2}]}).json()
     with Client(str(app.base_url)) as service, service.track(venue_id=venue["id"], level=2.0) as tracker:
         session = tracker.add(sphere)
@@ -65,8 +62,7 @@ def test_tracker_follows_a_camera_in_a_venue(app: httpx.Client, sphere: bytes) -
         assert (session.path[0].floorplan_id, session.path[0].level) == (plan_id, 2.0)
 
 
-def test_tracker_of_asyncio_follows_a_camera(app: httpx.Client, sphere: bytes, tmp_path: Path) -> None:
-    plan_id = upload(app)
+def test_tracker_of_asyncio_follows_a_camera(app: httpx.Client, plan_id: str, sphere: bytes, tmp_path: Path) -> None:
     path = tmp_path / "photograph.jpg"
     path.write_bytes(sphere)
 
