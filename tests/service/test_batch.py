@@ -54,9 +54,7 @@ def test_refusals_of_the_whole_batch_precede_the_lines(client: httpx.Client, fla
     assert_problem(ask(client, "f" * 32, [sphere]), 404, "unknown-floorplan")
     assert_problem(ask(client, flat, 9 * [bytes(480_000)]), 413, "upload-too-large")
     assert_problem(ask(client, flat, [sphere], heading_deg="x"), 422, "invalid-request")
-
-
-def test_error_about_the_plan_is_the_error_of_all_photographs(client: httpx.Client, flat: str, sphere: bytes) -> None:
+    # An error about the plan is that of all photographs.
     lines = lines_of(ask(client, flat, 5 * [sphere], rooms="attic"))
     assert {line["problem"]["type"] for line in lines} == {"urn:lalaloc:problem:invalid-hint"}
 

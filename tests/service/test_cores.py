@@ -20,12 +20,9 @@ def test_open_shares_use_every_core_once(cores: int) -> None:
     assert min(shares.workers, shares.compute_threads) >= 1
 
 
-@pytest.mark.parametrize("cores", [1, 2, 3])
-def test_single_lpo_worker_takes_no_core_of_few(cores: int) -> None:
-    assert share_cores(cores, workers=None, compute_threads=0, onnx_threads=0) == CoreShares(1, cores, 1)
-
-
-def test_given_numbers_are_kept() -> None:
+def test_few_cores_are_not_divided_and_given_numbers_are_kept() -> None:
+    for cores in (1, 2, 3):
+        assert share_cores(cores, workers=None, compute_threads=0, onnx_threads=0) == CoreShares(1, cores, 1)
     assert share_cores(8, workers=0, compute_threads=0, onnx_threads=2) == CoreShares(0, 4, 2)
     assert share_cores(2, workers=3, compute_threads=5, onnx_threads=1) == CoreShares(3, 5, 1)
 

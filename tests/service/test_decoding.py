@@ -123,23 +123,19 @@ class TestBombs:
     # Pages that were mapped before the limit, but not yet resident. Without a limit the pictures take at least 140 MiB.
     MAPPED = 16 * MIB
 
-    @pytest.mark.parametrize(
-        ("kind", "options"),
-        [("PNG", {}), ("WEBP", {"lossless": True, "method": 0}), ("JPEG", {"progressive": True, "subsampling": 0})],
-    )
-    def test_memory_limit_rejects_the_picture_only(
-        self, start_app: StartApp, tmp_path: Path, sphere: bytes, kind: str, options: dict[str, object]
-    ) -> None:
-        bomb = black_png(7_000, 3_500) if kind == "PNG" else black(7_000, 3_500, kind, **options)
-        assert len(bomb) < MIB
+    def test_memory_limit_rejects_the_pictures_only(self, start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
+        webp, jpeg = {"lossless": True, "method": 0}, {"progressive": True, "subsampling": 0}
+        bombs = [black_png(7_000, 3_500), black(7_000, 3_500, "WEBP", **webp), black(7_000, 3_500, "JPEG", **jpeg)]
         with start_app(tmp_path, decode_memory_bytes=self.CAP) as client:
             plan_id = upload(client)
             ready(client)
             pid, before = decoder(), most_memory(decoder())
-            assert_problem(localise(client, plan_id, bomb, **BLACK), 422, "invalid-photograph")
-            assert localise(client, plan_id, sphere, **QUICK).status_code == 200
-            assert decoder() == pid, "it did not have to die for that"
-            assert most_memory(pid) < before + self.CAP + self.MAPPED
+            for bomb in bombs:
+                assert len(bomb) < MIB
+                assert_problem(localise(client, plan_id, bomb, **BLACK), 422, "invalid-photograph")
+                assert localise(client, plan_id, sphere, **QUICK).status_code == 200
+                assert decoder() == pid, "it did not have to die for that"
+                assert most_memory(pid) < before + self.CAP + self.MAPPED
 
     def test_pixel_limit_is_checked_on_the_header(self, start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
         bombs = {kind: black(4_000, 2_000, kind) for kind in ("PNG", "WEBP", "JPEG")}

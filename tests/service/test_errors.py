@@ -30,12 +30,9 @@ def test_every_error_has_a_table_entry(error: type[Exception]) -> None:
     assert error in PROBLEMS
 
 
-def test_equal_types_have_equal_titles_and_statuses() -> None:
+def test_equal_types_have_equal_titles_and_only_internal_errors_are_500_and_hidden() -> None:
     meanings = {kind.type: (kind.title, kind.status) for kind in PROBLEMS.values()}
     assert all(meanings[kind.type] == (kind.title, kind.status) for kind in PROBLEMS.values())
-
-
-def test_only_internal_errors_are_500_and_hidden() -> None:
     assert all(kind.public == (kind.status != 500) for kind in PROBLEMS.values())
 
 

@@ -162,11 +162,14 @@ def test_body_in_many_chunks_arrives_as_a_whole(port: int) -> None:
     assert answers.endswith(b'"me"')
 
 
-def test_pipelined_requests_are_all_answered(port: int) -> None:
+def test_pipelined_requests_are_all_answered_and_other_versions_refused(port: int) -> None:
     request = b"GET /who HTTP/1.1\r\n" + HOST
     with _connected(port) as connection:
         connection.sendall(199 * (request + b"\r\n") + request + b"Connection: close\r\n\r\n")
         assert _read_all(connection).count(b"HTTP/1.1 200 OK") == 200
+    with _connected(port) as connection:
+        connection.sendall(b"GET /who HTTP/9.9\r\n" + HOST + b"\r\n")
+        assert _read_all(connection).startswith(b"HTTP/1.1 505 ")
 
 
 @pytest.mark.parametrize("parts", [1, 2])
@@ -194,12 +197,6 @@ def test_upgrade_to_a_websocket_is_ignored_without_a_line_of_log(port: int, capl
         connection.sendall(b"GET /who HTTP/1.1\r\n" + HOST + upgrade + b"\r\n")
         assert _read_all(connection).startswith(b"HTTP/1.1 200 OK")
     assert not caplog.records
-
-
-def test_other_version_of_http_is_refused(port: int) -> None:
-    with _connected(port) as connection:
-        connection.sendall(b"GET /who HTTP/9.9\r\n" + HOST + b"\r\n")
-        assert _read_all(connection).startswith(b"HTTP/1.1 505 ")
 
 
 class _Admission:

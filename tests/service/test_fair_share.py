@@ -330,19 +330,10 @@ def test_silent_reads_of_a_tenant_leave_a_thread_for_others() -> None:
             ended = await asyncio.gather(*silent, return_exceptions=True)
             assert [type(error) for error in ended] == [StoreUnavailableError] * 8
             goes_on.set()
+            # Work on what was read has no timeout.
+            assert await reads.process("a", lambda: sleep(0.4) or "parsed") == "parsed"
         finally:
             goes_on.set()
-            reads.close()
-
-    asyncio.run(scenario())
-
-
-def test_work_on_a_read_has_no_timeout() -> None:
-    async def scenario() -> None:
-        reads = BoundedReads(threads=4, max_pending=20, wait_s=0.05)
-        try:
-            assert await reads.process("a", lambda: sleep(0.2) or "parsed") == "parsed"
-        finally:
             reads.close()
 
     asyncio.run(scenario())

@@ -14,6 +14,7 @@ import struct
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,7 @@ class Device:
         manifest = self.bundle.manifest
         return open_photograph(photograph, sphere_size=sphere_size(manifest), patch_size=patch_size(manifest))
 
+    @cache  # noqa: B019, it lives as long as the module.
     def features(self, photograph: bytes) -> bytes:
         return self._encoder.features(self.view(photograph))
 

@@ -15,6 +15,7 @@ import trimesh
 
 from lalaloc_core.floorplan import FloorPlan
 from tests.service.conftest import FLAT, StartApp, assert_problem, document_of, localise, upload, wait_for
+from tests.service.test_events import follow
 from tests.strategies import rectangle
 
 
@@ -166,6 +167,9 @@ def test_failed_grid_is_reported_and_retried_at_start(start_app: StartApp, tmp_p
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "failed")
         assert "the limit is 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]
         assert_problem(localise(client, plan_id, sphere), 409, "floorplan-failed")
+        name, event = follow(client, plan_id)[-1]
+        assert name == event["status"] == "failed"
+        assert "the limit is 146" in event["reason"]
     with start_app(tmp_path, grid_step_m=0.25) as client:
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
         assert client.get(f"/floorplans/{plan_id}").json()["reason"] is None

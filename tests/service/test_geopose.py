@@ -158,11 +158,6 @@ def test_invalid_earth_hint_is_refused(
     assert words in problem["detail"]
 
 
-def test_earth_hint_needs_an_anchor(client: httpx.Client, flat: str, sphere: bytes) -> None:
-    response = localise(client, flat, sphere, near='{"latitude": 48, "longitude": 11}', radius_m=5)
-    assert "the plan has no anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
-
-
 def test_plan_keeps_its_anchor_and_north(client: httpx.Client) -> None:
     twice = client.post("/floorplans", json=FLAT | {"north_deg": 10, "anchor": ANCHOR | {"north_deg": 25}})
     assert "give one of them" in assert_problem(twice, 422, "invalid-floorplan")["detail"]
@@ -261,17 +256,18 @@ def test_plan_anchor_precedes_venue_anchor(client: httpx.Client, placed: str, fl
     assert feature["geometry"] == point_at(feature["properties"]["geopose"])
 
 
-def test_unanchored_venue_has_no_geopose(client: httpx.Client, flat: str, sphere: bytes) -> None:
+def test_without_an_anchor_there_are_no_geoposes_and_earth_hints(
+    client: httpx.Client, flat: str, sphere: bytes
+) -> None:
+    assert localise(client, flat, sphere, refine="none").json()["geopose"] is None
+    assert_problem(client.get(f"/floorplans/{flat}/export", params={"format": "imdf"}), 409, "floorplan-unanchored")
     venue_id = client.post("/venues", json={"plans": [{"floorplan_id": flat}]}).json()["id"]
     response = ask(client, sphere, GEOJSON, venue_id=venue_id)
     assert "nor has venue" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
     picture = ask(client, sphere, "image/png", venue_id=venue_id)
     assert "a picture shows one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
-
-
-def test_unanchored_plan_has_no_geopose(client: httpx.Client, flat: str, sphere: bytes) -> None:
-    assert localise(client, flat, sphere, refine="none").json()["geopose"] is None
-    assert_problem(client.get(f"/floorplans/{flat}/export", params={"format": "imdf"}), 409, "floorplan-unanchored")
+    response = localise(client, flat, sphere, near='{"latitude": 48, "longitude": 11}', radius_m=5)
+    assert "the plan has no anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
 
 
 @pytest.mark.parametrize(

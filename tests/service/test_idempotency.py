@@ -118,9 +118,9 @@ def test_visible_ascii_keys_are_accepted(client: httpx.Client, key: str) -> None
     assert _same(_post(client, key), _post(client, key))
 
 
-@pytest.mark.parametrize("key", ["", "x" * 256, "a b", "a\tb", "é"])
-def test_invalid_key_is_refused(client: httpx.Client, sphere: bytes, key: str) -> None:
-    headers = [(b"Idempotency-Key", key.encode("latin-1"))]
+@pytest.mark.parametrize("keys", [[""], ["x" * 256], ["a b"], ["a\tb"], ["é"], ["a", "b"]])
+def test_invalid_and_second_keys_are_refused(client: httpx.Client, sphere: bytes, keys: list[str]) -> None:
+    headers = [(b"Idempotency-Key", key.encode("latin-1")) for key in keys]
     form = {"data": {"floorplan_id": "x"}, "files": {"photo": ("p.jpg", sphere)}}
     for response in (
         client.post("/floorplans", json=FLAT, headers=headers),
@@ -129,11 +129,6 @@ def test_invalid_key_is_refused(client: httpx.Client, sphere: bytes, key: str) -
         problem = assert_problem(response, 422, "invalid-request")
         assert [fault["field"] for fault in problem["errors"]] == ["Idempotency-Key"]
         assert "1 to 255" in problem["detail"]
-
-
-def test_two_keys_are_refused(client: httpx.Client) -> None:
-    headers = [("Idempotency-Key", "a"), ("Idempotency-Key", "b")]
-    assert_problem(client.post("/floorplans", json=FLAT, headers=headers), 422, "invalid-request")
 
 
 def test_repeated_query_returns_the_same_answer(own: httpx.Client, sphere: bytes) -> None:

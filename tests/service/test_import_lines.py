@@ -52,16 +52,13 @@ def test_levels_of_a_venue_are_counted(client: httpx.Client) -> None:
     assert {(line["done"], line["total"]) for line in steps if "total" in line} <= {(0, 2), (1, 2)}
 
 
-def test_refusal_is_the_last_line(client: httpx.Client) -> None:
+def test_refusal_is_the_last_line_or_precedes_them(client: httpx.Client) -> None:
     *steps, last = send(client, "/floorplans", _WITHOUT_SCALE)
     alone = client.post("/floorplans", files={"file": ("plan", _WITHOUT_SCALE)})
     problem = assert_problem(alone, 422, "invalid-floorplan")
     assert steps
     assert last["status"] == 422
     assert last["problem"] | {"request_id": problem["request_id"]} == problem
-
-
-def test_refusal_of_the_request_precedes_the_lines(client: httpx.Client) -> None:
     response = client.post("/floorplans", files={"file": ("plan", b"x")}, data={"units": "cubits"}, headers=LINES)
     assert_problem(response, 422, "invalid-request")
 

@@ -103,14 +103,11 @@ def test_torch_is_loaded_with_the_first_job_by_latents(
         assert loaded()
 
 
-def test_failing_job_leaves_the_worker_alive(pool: LpoPool, job: RefinementJob) -> None:
+def test_failing_job_and_one_without_time_leave_the_worker_alive(pool: LpoPool, job: RefinementJob) -> None:
     workers = set(_workers())
     assert _refine(pool, replace(job, targets=np.ones((2, 3), np.float32)), _LONG_S) is None
     assert _refine(pool, job, _LONG_S) is not None
     assert set(_workers()) == workers
-
-
-def test_no_time_returns_none_at_once(pool: LpoPool, job: RefinementJob) -> None:
     assert _refine(pool, job, 0.0) is None
     assert _refine(pool, job, -1.0) is None
 

@@ -65,7 +65,7 @@ def test_phone_photograph_is_localised(client: httpx.Client, flat: str) -> None:
     assert (answer["confidence"] or 0.0) >= 0.5 or view["advice"].startswith("turn around: 6")
 
 
-def test_sphere_is_read_as_before(client: httpx.Client, flat: str) -> None:
+def test_spheres_and_heic_are_read(client: httpx.Client, flat: str) -> None:
     content = (EXAMPLES / "kitchen.jpg").read_bytes()
     data = {"floorplan_id": flat} | {name: str(value) for name, value in QUICK.items()}
     renamed, usual = (client.post("/localise", data=data, files={name: content}) for name in ("panorama", "photo"))
@@ -77,6 +77,8 @@ def test_sphere_is_read_as_before(client: httpx.Client, flat: str) -> None:
     assert view["advice"] is None
     both = client.post("/localise", data=data, files=[("panorama", content), ("photo", content)])
     assert assert_problem(both, 422, "invalid-request")["errors"][0]["field"] == "photo"
+    heic = ask(client, flat, (FOLDER / "phone.heic").read_bytes()).json()["view"]
+    assert heic["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -96,11 +98,6 @@ def test_statements_are_used(
     assert view["hfov"]["value_deg"] == pytest.approx(hfov_deg, abs=3.0)
     tilt = {"std_deg": 0.5, "source": "given"}
     assert (view["pitch"], view["roll"]) == ({"value_deg": 2.0, **tilt}, {"value_deg": -1.0, **tilt})
-
-
-def test_heic_is_read(client: httpx.Client, flat: str) -> None:
-    view = ask(client, flat, (FOLDER / "phone.heic").read_bytes()).json()["view"]
-    assert view["hfov"]["value_deg"] == pytest.approx(67.3, abs=0.2)
 
 
 @pytest.mark.parametrize(

@@ -288,17 +288,13 @@ class TestHostileFiles:
         assert words in problem["detail"]
         assert store_plan(client, plan_file("svg"))["rooms"]
 
-    def test_zip_above_the_unpacked_limit(self, strict: httpx.Client) -> None:
+    def test_files_above_the_limits(self, strict: httpx.Client) -> None:
         self.assert_rejected(strict, ZIP_BOMB, "more than 1000000 bytes (max_unpacked_bytes)")
-
-    def test_drawing_with_too_many_lines(self, strict: httpx.Client) -> None:
+        self.assert_rejected(strict, large_picture(30_000), "pixels")
         document = new_dxf()
         for x in range(4000):
             document.modelspace().add_line((x, 0), (x, 1))
         self.assert_rejected(strict, dxf_file(document), "more than 3000 entities (max_entities)")
-
-    def test_picture_with_too_many_pixels(self, strict: httpx.Client) -> None:
-        self.assert_rejected(strict, large_picture(30_000), "pixels")
 
     @pytest.mark.slow
     def test_nested_forms_of_a_pdf(self, strict: httpx.Client) -> None:

@@ -116,11 +116,7 @@ def test_each_caller_gets_its_own_result(log: Path) -> None:
         assert [answer.result() for answer in answers] == list(range(50))
         assert {_reason(future) for future in broken} == {"fault"}
         assert _count(log, "start") == 2
-
-
-def test_large_arrays_of_a_job_arrive(log: Path) -> None:
-    picture = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
-    with _warm_pool(log) as pool:
+        picture = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
         np.testing.assert_array_equal(_run(pool, ("echo", picture), _LONG_S), picture)
 
 

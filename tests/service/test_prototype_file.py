@@ -99,7 +99,7 @@ def test_full_file_is_replaced_and_maps_stay_valid(path: Path) -> None:
     assert content(opened(path), 2) == rows_of(2, 15).tobytes()
 
 
-def test_second_process_gets_its_own_file(path: Path) -> None:
+def test_second_process_and_no_path_get_their_own_file(path: Path) -> None:
     first = opened(path)
     first.add({key(1): rows_of(1, 5)})
     second = opened(path)
@@ -109,9 +109,6 @@ def test_second_process_gets_its_own_file(path: Path) -> None:
     assert path.stat().st_size == 6 * ROW.itemsize
     second.close()
     first.close()
-
-
-def test_file_without_a_path_is_temporary() -> None:
     file = opened(None)
     file.add({key(1): rows_of(1, 5)})
     assert content(file, 1) == rows_of(1, 5).tobytes()

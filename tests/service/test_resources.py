@@ -235,15 +235,12 @@ def test_running_queries_survive_a_replacement(client: httpx.Client, sphere: byt
     assert len(known) > 2
 
 
-def test_put_does_not_create_plans(client: httpx.Client) -> None:
+def test_put_creates_no_plans_and_an_invalid_plan_replaces_nothing(client: httpx.Client) -> None:
     for plan_id in (NEVER, "x"):
         assert_problem(client.put(f"/floorplans/{plan_id}", json=FLAT), 404, "unknown-floorplan")
     plan_id = upload(client)
     assert client.delete(f"/floorplans/{plan_id}").status_code == 204
     assert_problem(client.put(f"/floorplans/{plan_id}", json=FLAT), 404, "unknown-floorplan")
-
-
-def test_invalid_plan_replaces_nothing(client: httpx.Client) -> None:
     url = f"/floorplans/{upload(client)}"
     before = client.get(url).json()
     assert_problem(client.put(url, json={"rooms": []}), 422, "invalid-floorplan")

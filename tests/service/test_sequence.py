@@ -93,13 +93,10 @@ def test_invalid_sequence_is_rejected(
     assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
 
 
-def test_invalid_sphere_is_rejected(client: httpx.Client, flat: str, sphere: bytes) -> None:
-    assert_problem(ask(client, flat, [sphere, b"no picture"]), 422, "invalid-photograph")
-    assert_problem(ask(client, "f" * 32, [sphere] * 2), 404, "unknown-floorplan")
-
-
-def test_sequence_limits_are_enforced_and_reported(client: httpx.Client, flat: str, sphere: bytes) -> None:
+def test_invalid_sphere_and_sequence_limits_are_refused(client: httpx.Client, flat: str, sphere: bytes) -> None:
     problem = assert_problem(ask(client, flat, [sphere, bytes(370_000)]), 413, "upload-too-large")
     assert "LALALOC_MAX_SEQUENCE_BYTES" in problem["detail"]
     limits = client.get("/limits").json()
     assert (limits["max_sequence_photographs"], limits["max_sequence_bytes"]) == (30, 300_000)
+    assert_problem(ask(client, flat, [sphere, b"no picture"]), 422, "invalid-photograph")
+    assert_problem(ask(client, "f" * 32, [sphere] * 2), 404, "unknown-floorplan")

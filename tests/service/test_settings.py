@@ -70,8 +70,11 @@ def test_settings_named_in_pages_and_in_messages_exist() -> None:
             assert {name.lower() for name in named} <= known, path
 
 
-def test_settings_are_few() -> None:
+def test_settings_are_few_and_all_in_the_table() -> None:
     assert len(SETTING_NAMES) <= 55
+    rows = [line for line in settings_table().splitlines() if line.startswith("| `")]
+    assert len(rows) == len(SETTING_NAMES)
+    assert all(len(row.split("|")[3].strip()) > 10 for row in rows)
 
 
 def test_earlier_name_of_a_setting_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,9 +95,3 @@ def test_settings_cannot_change_once_read() -> None:
 def test_default_bundle_is_independent_of_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     assert Settings.load().bundle == Path(__file__).parents[2] / "models" / "default"
-
-
-def test_settings_table_is_complete() -> None:
-    rows = [line for line in settings_table().splitlines() if line.startswith("| `")]
-    assert len(rows) == len(SETTING_NAMES)
-    assert all(len(row.split("|")[3].strip()) > 10 for row in rows)

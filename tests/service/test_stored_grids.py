@@ -75,11 +75,9 @@ def test_own_grid_is_never_dropped(store: Store) -> None:
     assert {height_mm for _, height_mm in store.grids.poses("m1", 0.5)} == {1500, 1640, 1660}
 
 
-def test_grid_of_deleted_plan_is_not_stored(store: Store) -> None:
-    revision_id = _add(store, "p")
-    store.plans.delete("default", "p")
-    assert not _put(store, _key(revision_id))
-    assert _rows(store, LATENT_GRIDS) == 0
+def _swapped_poses(content: bytes) -> bytes:
+    """Return a valid grid, but not the one that was computed."""
+    return content[:16] + content[32:48] + content[16:32] + content[48:]
 
 
 @pytest.mark.parametrize(
@@ -94,28 +92,19 @@ def test_grid_of_deleted_plan_is_not_stored(store: Store) -> None:
         lambda content: content[:16] + struct.pack("<d", math.nan) + content[24:],
         # Last value of the last profile, before the room indices.
         lambda content: content[: -7 * 4 - 4] + struct.pack("<f", math.inf) + content[-7 * 4 :],
+        _swapped_poses,
     ],
-    ids=["cut off", "too long", "another format", "more poses", "empty", "no number", "infinite"],
+    ids=["cut off", "too long", "another format", "more poses", "empty", "no number", "infinite", "another digest"],
 )
 def test_damaged_grid_counts_as_missing(store: Store, damage: Callable[[bytes], bytes]) -> None:
-    # Size and digest agree, so that only the content is wrong.
-    _assert_unread(store, damage, fits=True)
-
-
-def test_grid_with_wrong_digest_is_not_read(store: Store) -> None:
-    # Two poses are swapped: a valid grid, but not the one that was computed.
-    _assert_unread(store, lambda content: content[:16] + content[32:48] + content[16:32] + content[48:], fits=False)
-
-
-def _assert_unread(store: Store, damage: Callable[[bytes], bytes], *, fits: bool) -> None:
-    """Check that a damaged grid counts as missing and can be stored anew; `fits`: with its size and digest."""
     key = _key(_add(store))
     _put(store, key)
     with store.database.writing() as connection:
         content = present(connection.scalar(select(GRID_CHUNKS.c.content)))
         damaged = damage(bytes(content))
         connection.execute(update(GRID_CHUNKS).values(content=damaged))
-        if fits:
+        # Size and digest agree, so that only the content is wrong.
+        if damage is not _swapped_poses:
             digest = hashlib.sha256(damaged).hexdigest()
             connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged), sha256=digest))
     assert store.grids.get(key) is None
@@ -159,7 +148,7 @@ def test_lease_without_length_holds_until_its_end(store: Store) -> None:
     assert store.leases.claim(key, "me", 60.0) is None
 
 
-def test_lease_counts_attempts_until_released(store: Store) -> None:
+def test_lease_counts_attempts_until_released_or_its_grid_is_stored(store: Store) -> None:
     key, counts = _key(_add(store)), []
     for owner in ("one", "two", "one"):
         counts.append(store.leases.claim(key, owner, 0.001))
@@ -167,6 +156,8 @@ def test_lease_counts_attempts_until_released(store: Store) -> None:
     assert counts == [1, 2, 3]
     store.leases.release(key, "one")
     assert store.leases.claim(key, "two", 60.0) == 1
+    _put(store, key)
+    assert _rows(store, GRID_LEASES) == 0
 
 
 def test_lease_is_exclusive_until_it_expires(open_store: OpenStore) -> None:
@@ -196,19 +187,14 @@ def test_concurrent_claims_give_one_lease(open_store: OpenStore) -> None:
         assert sum(threads.map(claim, range(8))) == 1
 
 
-def test_deleted_plan_has_no_lease(store: Store) -> None:
+def test_deleted_plan_has_no_lease_and_gets_no_grid(store: Store) -> None:
     key = _key(_add(store, "p"))
     assert store.leases.claim(key, "me", 60.0)
     store.plans.delete("default", "p")
+    assert not _put(store, key)
+    assert _rows(store, LATENT_GRIDS) == 0
     assert not store.leases.renew(key, "me", 60.0, 0.5)
     assert not store.leases.claim(key, "me", 60.0)
-
-
-def test_storing_a_grid_ends_its_lease(store: Store) -> None:
-    key = _key(_add(store))
-    store.leases.claim(key, "me", 60.0)
-    _put(store, key)
-    assert _rows(store, GRID_LEASES) == 0
 
 
 def test_missing_grids_exclude_leased_and_failed(store: Store) -> None:

@@ -89,10 +89,6 @@ def test_query_has_one_log_line(client: httpx.Client, log: Log, sphere: bytes) -
     assert set(line["stages_ms"]) == {"upload", "decode", "encode", "grid", "retrieve", "vdr"}
     assert 0.0 < sum(line["stages_ms"].values()) <= line["ms"] + 1.0
     assert line["stages_ms"]["encode"] == pytest.approx(response.json()["timings_ms"]["encode"], abs=0.1)
-
-
-def test_log_has_route_template_and_plan_id(client: httpx.Client, log: Log) -> None:
-    plan_id = upload(client)
     (line,) = log.of_request(client.get(f"/floorplans/{plan_id}").headers["x-request-id"])
     assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", plan_id)
     (line,) = log.of_request(client.get("/floorplans/not-an-id").headers["x-request-id"])

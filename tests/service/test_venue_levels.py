@@ -287,7 +287,7 @@ def assert_stored_once(attempt: Callable[[], tuple[VenueRecord, list[PlanRecord]
     assert sorted(len(records) for _, records in found) == [0, 0, 0, 3]
 
 
-def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
+def test_attempts_at_the_same_time_extend_and_store_once(app_store: Store) -> None:
     token, limits = uuid.uuid4().hex, dict[str, Any](max_plans=9, max_venue_plans=9)
     venue, _ = app_store.venue_imports.add("t", uuid.uuid4().hex, "house", new_plans(1), max_plans=9, max_venues=9)
     assert_stored_once(lambda: app_store.venue_imports.extend("t", venue.id, token, new_plans(), **limits))
@@ -297,6 +297,11 @@ def test_attempts_at_the_same_time_extend_once(app_store: Store) -> None:
     assert app_store.quota.account("t").used == used
     with pytest.raises(UnknownVenueError):
         app_store.venue_imports.extend("other", venue.id, "f" * 32, new_plans(), **limits)
+    venue_id = uuid.uuid4().hex
+    assert_stored_once(
+        lambda: app_store.venue_imports.add("u", venue_id, "house", new_plans(), max_plans=9, max_venues=9)
+    )
+    assert len(app_store.plans.list_plans("u", limit=99)) == 3
 
 
 def new_plans(count: int = 3) -> list[NewPlan]:
@@ -332,10 +337,3 @@ def test_failure_between_two_plans_stores_none(tmp_path: Path, database_of: Data
     assert store.quota.account("t").used.total == 0
     database.close()
     store.close()
-
-
-def test_attempts_at_the_same_time_store_one_venue(app_store: Store) -> None:
-    venue_id = uuid.uuid4().hex
-    limits = {"max_plans": 9, "max_venues": 9}
-    assert_stored_once(lambda: app_store.venue_imports.add("t", venue_id, "house", new_plans(), **limits))
-    assert len(app_store.plans.list_plans("t", limit=99)) == 3
