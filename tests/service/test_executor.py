@@ -59,25 +59,26 @@ def test_walls_are_refined_without_a_worker(runner_of: Callable[[int], StepRunne
     assert not np.array_equal(result.position_m, job.position_m)
 
 
-@pytest.mark.parametrize("changes", [{"log_profile": None}, {"latent_weight": 0.5}])
-def test_latents_are_left_to_a_worker(
-    runner_of: Callable[[int], StepRunner], job: RefinementJob, changes: dict[str, float | None]
+@pytest.mark.parametrize(("workers", "changes"), [(1, {"log_profile": None}), (1, {"latent_weight": 0.5}), (0, {})])
+def test_latents_are_left_to_a_worker_and_lpo_is_off_without_workers(
+    runner_of: Callable[[int], StepRunner], job: RefinementJob, workers: int, changes: dict[str, float | None]
 ) -> None:
     job = replace(job, **changes)  # pyright: ignore[reportArgumentType]
-    assert runner_of(1).next(_search(job), None, lambda: 1e3) is job
+    assert runner_of(workers).next(_search(job), None, lambda: 1e3) is job
 
 
-def test_lpo_is_off_without_workers(runner_of: Callable[[int], StepRunner], job: RefinementJob) -> None:
-    assert runner_of(0).next(_search(job), None, lambda: 1e3) is job
-
-
-def test_late_refinement_has_no_result(
-    runner_of: Callable[[int], StepRunner], job: RefinementJob, telemetry: Telemetry
+def test_late_refinement_stops_without_a_result(
+    runner_of: Callable[[int], StepRunner], job: RefinementJob, telemetry: Telemetry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert runner_of(1).next(_search(job), None, lambda: 0.0) is None
     assert _missed(telemetry, "deadline") == 0
     assert runner_of(1).next(_search(job), None, lambda: 1e-9) is None
     assert _missed(telemetry, "deadline") == 1
+    # A clock that passes a second whenever it is read.
+    seconds = iter(range(1000))
+    monkeypatch.setattr(executor, "monotonic", lambda: float(next(seconds)))
+    assert runner_of(1).next(_search(job), None, lambda: 1.5) is None
+    assert _missed(telemetry, "deadline") == 2
 
 
 def test_failed_refinement_has_no_result(
@@ -91,16 +92,6 @@ def test_failed_refinement_has_no_result(
     assert runner_of(1).next(_search(job), None, lambda: 1e3) is None
     assert _missed(telemetry, "fault") == 1
     assert "pose refinement failed" in caplog.text
-
-
-def test_refinement_stops_at_its_timeout(
-    runner_of: Callable[[int], StepRunner], job: RefinementJob, telemetry: Telemetry, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A clock that passes a second whenever it is read.
-    seconds = iter(range(1000))
-    monkeypatch.setattr(executor, "monotonic", lambda: float(next(seconds)))
-    assert runner_of(1).next(_search(job), None, lambda: 1.5) is None
-    assert _missed(telemetry, "deadline") == 1
 
 
 def test_what_follows_a_search_gets_its_result(runner_of: Callable[[int], StepRunner], job: RefinementJob) -> None:
