@@ -214,18 +214,15 @@ def test_package_docstring_names_its_first_file_and_no_missing_ones(package: str
     assert [name for name in named if not any((base / name).exists() for base in (folder, folder.parent, ROOT))] == []
 
 
-def test_layer_table_lists_existing_modules() -> None:
+def test_tables_list_existing_modules_and_packages_with_torch() -> None:
     assert [name for name in LAYERS if name not in MODULES] == []
+    lazy = [name for name in TORCH_PACKAGES if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(name))]
+    assert lazy == [], "these packages do not load torch, so remove them from TORCH_PACKAGES"
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if not _in_torch_package(name)])
 def test_torch_is_imported_in_torch_packages_only(module: str) -> None:
     assert not _reaches_torch(module, set())
-
-
-def test_torch_packages_import_torch() -> None:
-    lazy = [name for name in TORCH_PACKAGES if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(name))]
-    assert lazy == [], "these packages do not load torch, so remove them from TORCH_PACKAGES"
 
 
 def test_client_imports_httpx_and_pydantic_only() -> None:
@@ -236,13 +233,9 @@ def test_client_imports_httpx_and_pydantic_only() -> None:
     assert tops == {"httpx", "httpx_sse", "pydantic", "lalaloc_client"}
 
 
-@pytest.mark.parametrize("package", ["lalaloc_core", "service"])
-def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
-    names = [
-        name
-        for name in MODULES
-        if name.split(".")[0] == package and not _in_torch_package(name) and not name.endswith("__main__")
-    ]
+def test_importing_the_numpy_side_leaves_torch_unloaded() -> None:
+    ours = [name for name in MODULES if name.split(".")[0] != "lalaloc_client"]
+    names = [name for name in ours if not _in_torch_package(name) and not name.endswith("__main__")]
     if importlib.util.find_spec("ray") is None:
         names = [name for name in names if not name.startswith("service.on_ray")]
     program = (

@@ -23,7 +23,7 @@ from lalaloc_core.localise.album.entry import (
 from lalaloc_core.localise.album.evidence import AlbumMemory, shared_cameras
 from lalaloc_core.localise.album.ground import AlbumGround
 from lalaloc_core.localise.album.links import pair_odds
-from lalaloc_core.localise.album.pins import Pin, PinPose, RoomShare, moved_pins
+from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, moved_pins
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
 from lalaloc_core.localise.album.solve import MAX_ROOMS, calibrated, misread_share, solve_album
 from lalaloc_core.localise.album.solve import _pin as _pin_of
@@ -61,6 +61,13 @@ def photographs() -> list[AlbumPhotograph]:
     return found
 
 
+@pytest.fixture(scope="module")
+def solved(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> tuple[Album, AlbumMemory, list[int]]:
+    """Return the solved album, its memory, and the steps of its progress."""
+    memory, seen = AlbumMemory(), list[int]()
+    return solve_album(ground, encoder(), photographs, memory=memory, progress=seen.append), memory, seen
+
+
 def test_entry_is_small_and_read_as_it_was(photographs: list[AlbumPhotograph]) -> None:
     for photograph in photographs:
         content = photograph.to_bytes(bundle())
@@ -90,9 +97,10 @@ def test_damaged_entries_are_refused(photographs: list[AlbumPhotograph]) -> None
             read_entry(hostile, bundle())
 
 
-def test_all_photographs_are_pinned_to_their_rooms(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
-    seen: list[int] = []
-    album = solve_album(ground, encoder(), photographs, progress=seen.append)
+def test_all_photographs_are_pinned_to_their_rooms(
+    photographs: list[AlbumPhotograph], solved: tuple[Album, AlbumMemory, list[int]]
+) -> None:
+    album, _, seen = solved
     assert seen == [1, 2, 3, 4, 5]
     assert [pin.photograph_id for pin in album.pins] == list(NAMES)
     assert [pin.pose.room_id for pin in album.pins if pin.pose] == list(ROOMS)
@@ -114,15 +122,11 @@ def test_field_of_view_of_a_strip_is_its_own(photographs: list[AlbumPhotograph])
 
 
 @pytest.mark.slow
-def test_solve_does_not_depend_on_the_order_of_arrival(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
-    pins = solve_album(ground, encoder(), photographs).pins
-    assert solve_album(ground, encoder(), photographs[::-1]).pins == pins[::-1]
-
-
-@pytest.mark.slow
-def test_memory_gives_the_same_pins(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
-    memory = AlbumMemory()
-    album = solve_album(ground, encoder(), photographs, memory=memory)
+def test_order_of_arrival_and_memory_give_the_same_pins(
+    ground: AlbumGround, photographs: list[AlbumPhotograph], solved: tuple[Album, AlbumMemory, list[int]]
+) -> None:
+    album, memory, _ = solved
+    assert solve_album(ground, encoder(), photographs[::-1]).pins == album.pins[::-1]
     seen: list[int] = []
     again = solve_album(ground, encoder(), photographs, memory=memory, progress=seen.append)
     assert seen == []
@@ -195,10 +199,9 @@ def test_photograph_that_shows_no_wall_is_not_sure(ground: AlbumGround, photogra
 
 
 def test_photograph_of_an_album_that_fits_badly_is_uncertain_and_not_set_aside(
-    ground: AlbumGround, photographs: list[AlbumPhotograph]
+    ground: AlbumGround, photographs: list[AlbumPhotograph], solved: tuple[Album, AlbumMemory, list[int]]
 ) -> None:
-    memory, kitchen = AlbumMemory(), photographs[0]
-    solve_album(ground, encoder(), [kitchen], memory=memory)
+    memory, kitchen = solved[1], photographs[0]
     states = States.of(memory.evidence[kitchen.id], encoder().manifest.ring_sectors)
     rooms = len(ground.plan.rooms)
     share = np.append(np.full(rooms, 0.3 / rooms), 0.7)

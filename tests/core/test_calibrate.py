@@ -154,12 +154,6 @@ class TestConfidence:
             fit_confidence(Answers(own=own), Answers(own=own)).position_factor
         )
 
-    def test_predictions_without_signals_are_refused(self) -> None:
-        stored = result(0.2)
-        del stored.signals["lpo"]["answer_to_chance"]
-        with pytest.raises(InvalidInputError, match="lack the signals answer_to_chance"):
-            fitted([result(0.2), stored])
-
     def test_older_models_use_their_own_signals(self) -> None:
         weights = {"cost": -2.0, "uncertainty": -0.5, "latent_distance": -4.0, "cost_to_chance": -3.0}
         model = LogisticModel(bias=1.0, log_odds=0.0, **weights)
@@ -247,9 +241,13 @@ class TestConfidence:
         assert (probabilities["lpo", False] or 1.0) < 0.5
         assert probabilities["retrieval", False] is None
 
-    def test_unanswered_queries_are_ignored(self) -> None:
+    def test_unanswered_queries_are_ignored_and_lacking_signals_refused(self) -> None:
         some = believable(100, 0)
         assert fitted(some + [result(math.nan)] * 50) == fitted(some)
+        stored = result(0.2)
+        del stored.signals["lpo"]["answer_to_chance"]
+        with pytest.raises(InvalidInputError, match="lack the signals answer_to_chance"):
+            fitted([result(0.2), stored])
 
     def test_calibration_keeps_the_model_identity(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
         try:

@@ -151,8 +151,6 @@ class TestFailures:
         assert outcomes([query]) == [Outcome.LOCATED]
         assert outcomes([query], "retrieval") == [Outcome.WRONG_ALIGNMENT]
         assert outcomes([query], "vdr") == [Outcome.NO_ANSWER]
-
-    def test_outcome_counts_sum_to_all_queries(self) -> None:
         assert [outcomes(mixed()).count(kind) for kind in Outcome] == [7, 2, 2, 1]
         assert outcomes([]) == []
 
@@ -181,20 +179,32 @@ class TestFigures:
         page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
         assert [row[0] for row in page.table("Accuracy")] == ["stage", "retrieval", "lpo", "answer"]
 
-    def test_curves_have_a_table(self, page: Page) -> None:
+    def test_curves_and_worst_queries_have_tables(self, page: Page) -> None:
         head, retrieval, lpo = page.table("Queries within")
         errors_m = position_errors_m(mixed(), "lpo")
         assert lpo[0] == "lpo"
         within_1m = 100 * np.mean(np.nan_to_num(errors_m, nan=np.inf) <= 1.0)
         assert lpo[head.index("1 m")] == f"{within_1m:.1f} %"
         assert retrieval[0] == "retrieval"
+        head, *rows = page.table("Queries without an answer")
+        assert head == ["query", "room", "outcome", "position error", "heading error", "confidence"]
+        assert [row[2] for row in rows[:4]] == ["no answer", "wrong room", "wrong room", "wrong alignment"]
+        assert [row[3] for row in rows[:4]] == ["–", "6.00 m", "3.00 m", "1.50 m"]
 
-    def test_failures_are_counted_with_the_limit(self, page: Page) -> None:
+    def test_failures_times_and_calibration_are_shown_and_charts_described(self, page: Page) -> None:
         head, retrieval, answer = page.table("Queries by outcome")
         assert head[1:] == [kind.value for kind in Outcome]
         assert answer == ["answer", "7", "2", "2", "1"]
         assert retrieval[1:] == [str(outcomes(mixed(), "retrieval").count(kind)) for kind in Outcome]
         assert f"more than {ALIGNMENT_LIMIT_M:g} m" in page.text
+        rows = {row[0]: row for row in page.table("Milliseconds")}
+        assert rows["retrieve"][1:] == ["12", "6.50", "11.4"]
+        assert rows[TOTAL][1] == "12"
+        assert f"“within 1 m”: {score(mixed()).calibration_error:.3f}" in page.text
+        assert len(page.table("Confidence and share")) == 1 + len(score(mixed()).reliability)
+        drawings = [attributes for tag, attributes in page.tags if tag == "img"]
+        assert len(drawings) == 2
+        assert all(drawing["src"].startswith("data:image/svg+xml;base64,") and drawing["alt"] for drawing in drawings)
 
     def test_slices_have_a_table_worst_first(self, tmp_path: Path, page: Page) -> None:
         known = [
@@ -208,13 +218,6 @@ class TestFigures:
         assert [row[1].split()[0] for row in rows[1:]] == ["1", "2", "3"]
         assert not any(caption.startswith("Accuracy by difficulty of the photograph") for caption in page.tables)
 
-    def test_times_and_calibration_are_shown(self, page: Page) -> None:
-        rows = {row[0]: row for row in page.table("Milliseconds")}
-        assert rows["retrieve"][1:] == ["12", "6.50", "11.4"]
-        assert rows[TOTAL][1] == "12"
-        assert f"“within 1 m”: {score(mixed()).calibration_error:.3f}" in page.text
-        assert len(page.table("Confidence and share")) == 1 + len(score(mixed()).reliability)
-
     def test_run_description_is_shown(self, page: Page) -> None:
         for words in (
             "Somewhere3D, test split",
@@ -224,11 +227,9 @@ class TestFigures:
         ):
             assert words in page.text
 
-    def test_numbers_have_three_digits(self) -> None:
+    def test_numbers_have_three_digits_and_distances_their_unit(self) -> None:
         expected = {0.0: "0.00", 0.004: "< 0.01", 0.006: "0.01", 9.87: "9.87", 98.76: "98.8", 987.6: "988", np.inf: "∞"}
         assert {value: number(value) for value in expected} == expected
-
-    def test_distances_from_one_metre_are_in_metres(self) -> None:
         assert (distance(0.0312), distance(1.0), distance(10.38)) == ("3.12 cm", "1.00 m", "10.4 m")
 
     def test_stage_times_skip_other_queries(self) -> None:
@@ -255,11 +256,6 @@ class TestPage:
         assert used
         for colours in (day, night):
             assert used <= set(re.findall(r"(--[\w-]+):", colours))
-
-    def test_charts_have_descriptions(self, page: Page) -> None:
-        drawings = [attributes for tag, attributes in page.tags if tag == "img"]
-        assert len(drawings) == 2
-        assert all(drawing["src"].startswith("data:image/svg+xml;base64,") and drawing["alt"] for drawing in drawings)
 
     def test_text_from_files_is_escaped(self, tmp_path: Path) -> None:
         query = prediction(scene=NASTY, room=NASTY, camera=NASTY, timings_ms={NASTY: 1.0})
@@ -330,12 +326,6 @@ class TestRuns:
 
 
 class TestWorst:
-    def test_worst_queries_are_listed(self, page: Page) -> None:
-        head, *rows = page.table("Queries without an answer")
-        assert head == ["query", "room", "outcome", "position error", "heading error", "confidence"]
-        assert [row[2] for row in rows[:4]] == ["no answer", "wrong room", "wrong room", "wrong alignment"]
-        assert [row[3] for row in rows[:4]] == ["–", "6.00 m", "3.00 m", "1.50 m"]
-
     def test_charts_are_written_as_files(self, tmp_path: Path) -> None:
         write_report([run_folder(tmp_path / "run", mixed())], tmp_path / "report.html", pictures=tmp_path / "charts")
         drawn = {path.stem: ElementTree.parse(path).getroot().tag for path in (tmp_path / "charts").iterdir()}
