@@ -66,7 +66,9 @@ def _said(result: Any) -> Any:
     return json.loads(_texts(result)[0])
 
 
-def test_plan_is_imported_and_photographs_are_localised(app: httpx.Client, flat: Path, photograph: Path) -> None:
+def test_plan_is_imported_and_photographs_and_turns_are_localised(
+    app: httpx.Client, flat: Path, photograph: Path
+) -> None:
     async def talk(client: Any) -> None:
         tools = {tool.name: tool for tool in (await client.list_tools()).tools}
         names = {"import_plan", "list_plans", "localise_photograph", "localise_turn", "pin_folder", "next_step"}
@@ -86,13 +88,6 @@ def test_plan_is_imported_and_photographs_are_localised(app: httpx.Client, flat:
         assert base64.b64decode(picture.data).startswith(b"\x89PNG")
         step = _said(await client.call_tool("next_step", {"photograph": str(photograph), "floorplan_id": plan["id"]}))
         assert "confidence" in step
-
-    _over_stdio(str(app.base_url), talk)
-
-
-def test_turn_of_photographs_is_localised(app: httpx.Client, flat: Path) -> None:
-    async def talk(client: Any) -> None:
-        plan = _said(await client.call_tool("import_plan", {"plan": str(flat)}))
         shown = _JPEG + base64.b64encode(encode_picture(640, 480, "JPEG")).decode()
         asked = {"photographs": [shown, shown], "floorplan_id": plan["id"], "hfov_deg": 70.0}
         assert len(_said(await client.call_tool("localise_turn", asked))["poses"]) == 2
