@@ -53,7 +53,12 @@ def pinned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Path]) -> None:
     pins = json.loads((pinned[1] / "pins.json").read_text())
     rooms = {entry["photograph"]: entry["room"] for entry in pins["photographs"]}
-    places = {"kitchen.jpg": "kitchen", "phone.jpg": "living room", "study \ufffd\ufffd.jpg": "study", "study.jpg": "study"}
+    places = {
+        "kitchen.jpg": "kitchen",
+        "phone.jpg": "living room",
+        "study.jpg": "study",
+        "study \ufffd\ufffd.jpg": "study",
+    }
     assert rooms == {"broken.jpg": None} | places
     notes = " ".join(pins["notes"])
     assert "'broken.jpg' is set aside: the photograph is not a readable JPEG" in notes
