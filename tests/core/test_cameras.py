@@ -52,16 +52,13 @@ def test_pixels_undo_rays(camera: Camera, across: float, down: float) -> None:
         assert seen.all()
 
 
-def test_perspective_agrees_with_opencv() -> None:
+def test_perspective_and_fisheye_agree_with_opencv() -> None:
     rays = DISTORTED.rays(np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (50, 2)))
     (k1, k2, k3), (p1, p2) = DISTORTED.radial, DISTORTED.tangential
     expected, _ = cv2.projectPoints(
         opencv_points(rays), np.zeros(3), np.zeros(3), matrix(DISTORTED), np.array([k1, k2, p1, p2, k3])
     )
     np.testing.assert_allclose(DISTORTED.pixels(rays)[0], expected[:, 0] + 0.5, atol=1e-6)
-
-
-def test_fisheye_agrees_with_opencv() -> None:
     rays = FISHEYE.rays(np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (50, 2)))
     rays = rays[rays[:, 1] > 0.1]
     expected, _ = cv2.fisheye.projectPoints(

@@ -240,9 +240,7 @@ def test_deep_nesting_is_refused_before_it_is_parsed(text: str) -> None:
     for form in (text, text.encode("utf-8"), text.encode("utf-16")):
         with pytest.raises(InvalidFloorPlanError, match=r"nested \d+ levels deep; the limit is 8"):
             FloorPlan.from_json(form)
-
-
-def test_brackets_in_strings_are_not_nesting() -> None:
+    # Brackets in strings are not nesting.
     name = '[[[[[[[[[[ {{{{{{{{{{ \\" \\\\'
     assert FloorPlan.from_json(json.dumps(EXAMPLE | {"name": name})).name == name
 

@@ -331,11 +331,9 @@ def test_synthetic_home_plan_has_its_openings(seed: int) -> None:
 
 
 class TestJson:
-    def test_repeated_key_is_refused(self) -> None:
+    def test_repeated_keys_and_numbers_with_thousands_of_digits_are_refused(self) -> None:
         text = json.dumps(ROOMS)[:-1] + ', "name": "other"}'
         assert "the key 'name' occurs twice" in refused(FloorPlan.from_json, text)
-
-    def test_number_with_thousands_of_digits_is_refused(self) -> None:
         message = refused(FloorPlan.from_json, '{"ceiling_height_m": ' + "9" * 5000 + "}")
         assert message == "a number has 5000 digits; the limit is 300"
 
