@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,31 @@ import pytest
 from service.capacity.fair_share import max_per_client
 from service.schemas.service_state import LimitsAnswer
 from service.settings import Settings
-from tests.service.conftest import FLAT, StartApp, assert_problem, document_of, encode_picture, localise, upload
+from tests.service.conftest import StartApp, assert_problem, document_of, encode_picture, localise, upload
+
+LIMITS = {
+    "max_rooms": 2,
+    "max_vertices": 8,
+    "max_plan_vertices": 12,
+    "max_extent_m": 30.0,
+    "max_area_m2": 50.0,
+    "max_grid_poses": 60,
+    "max_plan_bytes": 2000,
+    "max_floorplans": 1,
+}
 
 
-def room(x: float, width: float = 3.0) -> dict[str, Any]:
-    return {"polygon": [[x, 0], [x + width, 0], [x + width, 3], [x, 3]], "ceiling_height_m": 2.5}
+def room(x: float, width: float = 3.0, corners: int = 4) -> dict[str, Any]:
+    """Return a room of 3 m depth; corners beyond four lie on one of its walls."""
+    wall = [[x + width * k / (corners - 3), 0.0] for k in range(corners - 2)]
+    return {"polygon": [*wall, [x + width, 3.0], [x, 3.0]], "ceiling_height_m": 2.5}
 
 
-TWO_ROOMS = {"rooms": [room(0.0), room(4.0)]}
+@pytest.fixture(scope="module")
+def limited(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """Yield an app with `LIMITS`."""
+    with start_app(tmp_path_factory.mktemp("limited"), **LIMITS) as client:
+        yield client
 
 
 def test_limits_match_the_settings(client: httpx.Client) -> None:
@@ -35,33 +53,33 @@ def test_limits_match_the_settings(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "status", "slug"),
+    ("name", "rooms", "status", "slug"),
     [
-        ("max_rooms", 1, 422, "invalid-floorplan"),
-        ("max_vertices", 3, 422, "invalid-floorplan"),
-        ("max_plan_vertices", 7, 422, "invalid-floorplan"),
-        ("max_extent_m", 6.5, 422, "invalid-floorplan"),
-        ("max_area_m2", 17.5, 422, "invalid-floorplan"),
-        ("max_grid_poses", 3, 422, "floorplan-too-large"),
-        ("max_plan_bytes", 100, 413, "upload-too-large"),
+        ("max_rooms", [room(0.0), room(4.0), room(8.0)], 422, "invalid-floorplan"),
+        ("max_vertices", [room(0.0, corners=9)], 422, "invalid-floorplan"),
+        ("max_plan_vertices", [room(0.0, corners=7), room(4.0, corners=6)], 422, "invalid-floorplan"),
+        ("max_extent_m", [room(0.0), room(28.0)], 422, "invalid-floorplan"),
+        ("max_area_m2", [room(0.0, width=17.0)], 422, "invalid-floorplan"),
+        ("max_grid_poses", [room(0.0, width=9.0)], 422, "floorplan-too-large"),
+        ("max_plan_bytes", [room(0.0) | {"name": "x" * 2000}], 413, "upload-too-large"),
     ],
 )
 def test_plan_over_a_limit_is_refused(
-    start_app: StartApp, tmp_path: Path, name: str, value: float, status: int, slug: str
+    limited: httpx.Client, name: str, rooms: list[dict[str, Any]], status: int, slug: str
 ) -> None:
-    with start_app(tmp_path, **{name: value}) as client:
-        assert client.get("/limits").json()[name] == value
-        detail = assert_problem(client.post("/floorplans", json=TWO_ROOMS), status, slug)["detail"]
-        assert re.search(rf"\((LALALOC_)?{name}\)", detail, re.IGNORECASE)
-        assert re.search(rf"(at most|limit is) {value:g}", detail)
-        assert client.get("/floorplans").json()["floorplans"] == []
+    assert limited.get("/limits").json()[name] == LIMITS[name]
+    detail = assert_problem(limited.post("/floorplans", json={"rooms": rooms}), status, slug)["detail"]
+    assert re.search(rf"\((LALALOC_)?{name}\)", detail, re.IGNORECASE)
+    assert re.search(rf"(at most|limit is) {LIMITS[name]:g}", detail)
+    assert limited.get("/floorplans").json()["floorplans"] == []
 
 
-def test_plan_quota_is_enforced(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, max_floorplans=1) as client:
-        upload(client)
-        problem = assert_problem(client.post("/floorplans", json=FLAT), 507, "too-many-floorplans")
-        assert re.search(r"\((LALALOC_)?max_floorplans\)", problem["detail"], re.IGNORECASE)
+def test_plan_quota_is_enforced(limited: httpx.Client) -> None:
+    plan = {"rooms": [room(0.0)]}
+    plan_id = upload(limited, plan)
+    problem = assert_problem(limited.post("/floorplans", json=plan), 507, "too-many-floorplans")
+    assert re.search(r"\((LALALOC_)?max_floorplans\)", problem["detail"], re.IGNORECASE)
+    assert limited.delete(f"/floorplans/{plan_id}").status_code == 204
 
 
 def test_query_over_a_limit_is_refused(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
