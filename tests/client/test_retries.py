@@ -174,13 +174,12 @@ def test_deletion_with_a_lost_answer_succeeds(failing: FailingServer, make_clien
             client.delete_floorplan("p")
 
 
-def test_unreachable_service_is_a_connection_error(make_client: MakeClient) -> None:
+def test_unreachable_service_is_an_error_and_one_that_is_not_ready_is_none(
+    failing: FailingServer, make_client: MakeClient
+) -> None:
     connection_error = pytest.raises(ConnectionFailedError, match="after 4 attempts: ConnectError")
     with make_client("http://127.0.0.1:1", retry=QUICK) as client, connection_error:
         client.ready()
-
-
-def test_not_ready_is_not_an_error(failing: FailingServer, make_client: MakeClient) -> None:
     failing.plan = [Planned(503, READY | {"ready": False}, {"Retry-After": "1"})]
     with make_client(failing.url) as client:
         assert client.ready().ready is False

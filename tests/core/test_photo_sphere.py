@@ -151,9 +151,10 @@ class TestParts:
         pixels = opened(encoded(small, "PNG", packet)).astype(int)
         np.testing.assert_allclose(pixels[10:46, 26:102], level_world(128, 640)[10:46, 26:102], atol=5)
 
-    def test_explicit_full_sphere_changes_nothing(self) -> None:
+    def test_explicit_full_sphere_and_level_pose_change_nothing(self) -> None:
         explicit = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512))))
         np.testing.assert_array_equal(explicit, opened(encoded(FULL)))
+        np.testing.assert_array_equal(level(FULL, pitch=0.0, roll=0.0), FULL)
 
     @pytest.mark.parametrize(
         ("changes", "reason"),
@@ -226,9 +227,6 @@ class TestLevelling:
         picture = tilted(256, 512, math.degrees(pitch), math.degrees(roll))
         expected = world(directions(256, 512)).astype(int)
         np.testing.assert_allclose(level(picture, pitch=pitch, roll=roll).astype(int), expected, atol=4)
-
-    def test_level_pose_changes_nothing(self) -> None:
-        np.testing.assert_array_equal(level(FULL, pitch=0.0, roll=0.0), FULL)
 
     def test_tilted_part_is_placed_first(self) -> None:
         whole = tilted(FULL_HEIGHT, FULL_WIDTH, 10, 5)

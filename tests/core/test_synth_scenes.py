@@ -258,16 +258,13 @@ def test_columns_have_the_order_of_their_names_and_no_others() -> None:
         Points.row(height=1.0)
 
 
-def test_joined_columns_are_a_view_of_their_parts() -> None:
+def test_joined_columns_are_a_view_of_their_adjacent_parts() -> None:
     points = Points(np.zeros((2, 6)))
     points.place_m += np.array([1.0, 2.0])
     np.testing.assert_array_equal(points.x_m, [1.0, 1.0])
     np.testing.assert_array_equal(points.y_m, [2.0, 2.0])
     assert not points.colour.any()
     assert not points.weight.any()
-
-
-def test_columns_that_are_not_adjacent_cannot_be_joined() -> None:
     with pytest.raises(ValueError, match="not neighbours"):
 
         class Scattered(Records):
