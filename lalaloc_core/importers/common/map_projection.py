@@ -99,8 +99,9 @@ def _order(shapes: Sequence[BaseGeometry], low: np.ndarray, high: np.ndarray) ->
     if x > _MAX_LATITUDE or y > 180.0:
         return False, ""
     longitude, latitude = (0.5 * (low + high)).tolist()
-    if y > _MAX_LATITUDE:
-        return True, f"in the order of GeoJSON, longitude first, the latitude would be {latitude:g}°"
+    beyond = f"in the order of GeoJSON, longitude first, the latitude would be {latitude:g}°"
+    if y > 90.0:
+        return True, beyond
     frame, swapped = LocalFrame(longitude, latitude), LocalFrame(latitude, longitude)
     as_stated, exchanged = (
         _square_share([shapely.transform(shape, change) for shape in shapes])
@@ -110,6 +111,9 @@ def _order(shapes: Sequence[BaseGeometry], low: np.ndarray, high: np.ndarray) ->
         return True, "in the order of GeoJSON, longitude first, the rooms would not be square"
     if exchanged < _OBLIQUE and as_stated > _SQUARE:
         return False, ""
+    # Near a pole a plan spans many longitudes, which would be many latitudes.
+    if y > _MAX_LATITUDE and np.abs(swapped.to_local(np.array([low, high])[:, ::-1])).max() <= _MAX_REACH_M:
+        return True, beyond
     return False, (
         f"the positions are taken for longitude {longitude:.3f}° and latitude {latitude:.3f}°, as GeoJSON orders them; "
         "if the place is wrong and the plan mirrored, exchange the two"
