@@ -14,7 +14,8 @@ const PLAIN_TEXTS: Record<string, string> = {
   "features-required":
     "This service takes no photographs. Load the page again: it then computes features in the browser.",
   overloaded: "The service is overloaded.",
-  "floorplan-unanchored": "The plan’s place on Earth is unknown: give it on the first page by “Edit”, “Place on Earth”.",
+  "floorplan-unanchored":
+    "The plan’s place on Earth is unknown: give it on the first page by “Edit”, “Place on Earth”.",
   "unknown-album": "The folder is no longer stored. Choose its plan, and add the photographs again.",
   "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
 };
