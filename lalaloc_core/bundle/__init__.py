@@ -8,6 +8,7 @@ from lalaloc_core.bundle.bundle import (
     BUNDLE_FILES,
     COHORT,
     DECODER_WEIGHTS,
+    DETECTOR_ONNX,
     HEAD_ONNX,
     IMAGE_ONNX,
     IMAGE_WEIGHTS,

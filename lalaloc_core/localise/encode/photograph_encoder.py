@@ -40,7 +40,8 @@ class PhotographEncoder:
         self.layouts = LayoutEncoder(bundle, threads=threads)
         self.spheres = SphereEncoder(bundle, threads=threads)
         self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
-        self._objects = None if bundle.manifest.objects is None else ObjectEncoder(bundle, threads=threads)
+        has_objects = bundle.manifest.objects is not None
+        self._objects = ObjectEncoder(bundle, threads=threads, detects=True) if has_objects else None
 
     @property
     def predicts_profile(self) -> bool:
@@ -100,7 +101,7 @@ class PhotographEncoder:
         return replace(query, **several, searched=searched)
 
     def with_features(self, photograph: Photograph) -> Photograph:
-        """Return a decoded photograph with its features, as for albums: those of spheres have an empty ring.
+        """Return a decoded photograph with its features, as for albums: detected objects too, no ring of spheres.
 
         Raises:
             InvalidPhotographError: the model cannot encode the photograph.
@@ -125,7 +126,7 @@ class PhotographEncoder:
         return partial(work, argument) if helper is None else helper.submit(work, argument).result
 
     def _object_outputs(self, photograph: Photograph) -> dict[str, np.ndarray]:
-        return {} if self._objects is None else self._objects.outputs(photograph)
+        return {} if self._objects is None else self._objects.outputs(photograph, detects=True)
 
     def _patches(self, turned: Sequence[tuple[Photograph, float]]) -> list[tuple[Patch, float]]:
         """Return the patches of photographs of one spot, and the standard deviations (radians) of their tilt.

@@ -1,4 +1,4 @@
-"""Exported networks of photographs that show a part of the horizon: the encoder of views, the classifier of objects."""
+"""Exported networks of photographs that show a part of the horizon: the encoder of views, and those of objects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.bundle import OBJECTS_ONNX, VIEW_ONNX, Bundle, ObjectsManifest
+from lalaloc_core.bundle import DETECTOR_ONNX, OBJECTS_ONNX, VIEW_ONNX, Bundle, ObjectsManifest
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.encode.exported_network import (
@@ -132,24 +132,34 @@ def _widened(
 
 
 class ObjectEncoder:
-    """Classifier of objects of one bundle, ready to run; safe to share between threads."""
+    """Classifier, and if `detects` also detector, of objects of one bundle; safe to share between threads."""
 
-    def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
+    def __init__(self, bundle: Bundle, *, threads: int = 0, detects: bool = False) -> None:
+        assert bundle.manifest.objects is not None
+        self._manifest = bundle.manifest.objects
         self._session = open_session(bundle.read(OBJECTS_ONNX), threads)
+        detects = detects and self._manifest.detected > 0
+        self._detector = open_session(bundle.read(DETECTOR_ONNX), threads) if detects else None
 
-    def outputs(self, photograph: Photograph) -> dict[str, Float[np.ndarray, "n"]]:
+    def outputs(self, photograph: Photograph, *, detects: bool = False) -> dict[str, Float[np.ndarray, "n"]]:
         """Return the probability of each object, and its azimuth (radians) relative to the photograph's centre.
 
-        The photograph has a thumbnail, a camera and axes.
+        The photograph has a thumbnail, a camera and axes. The detector takes three times as long as the classifier, so
+        it runs only if asked for; without it, its objects have the probability 0.
         """
         thumbnail = photograph.thumbnail
         assert thumbnail is not None
-        probability, by_column = map(
-            as_array, self._session.run(["probability", "by_column"], {"image": thumbnail[None]})
-        )
+        inputs = {"image": thumbnail[None]}
+        probability, by_column = map(as_array, self._session.run(["probability", "by_column"], inputs))
+        score = np.zeros((1, self._manifest.detected, by_column.shape[2]), np.float32)
+        if detects and self._detector is not None:
+            score = as_array(self._detector.run(["by_column"], inputs)[0])
+        excess = np.maximum(score[0].max(axis=1) - self._manifest.detected_floor, 0.0)
+        detected = self._manifest.detected_weight / (1.0 - self._manifest.detected_floor) * excess
+        column = np.concatenate([by_column[0].argmax(axis=1), score[0].argmax(axis=1)])
         return {
-            "object_probability": probability[0],
-            "object_azimuth": _column_azimuths(photograph, by_column.shape[2])[by_column[0].argmax(axis=1)],
+            "object_probability": np.concatenate([probability[0], detected]).astype(np.float32),
+            "object_azimuth": _column_azimuths(photograph, by_column.shape[2])[column],
         }
 
     def warm_up(self) -> None:
@@ -165,12 +175,12 @@ def objects_of_views(
 
     `views` are the probabilities of the objects in each photograph, and their azimuths (radians) relative to the centre
     of the first one. The likelihood of a type is a mixture: by each object that can be there, and 1 if none is, so that
-    a blank wall tells no type.
+    a blank wall tells no type. Classifier and detector each have a mixture.
     """
-    probability = np.stack([share for share, _ in views])
-    present = np.maximum(probability.mean(axis=0) - manifest.floor, 0.0)
-    types = np.array(manifest.shares).shape[1] - 1
-    likelihood = 1.0 - min(float(present.sum()), _MOST_SEEN) + types * present @ np.array(manifest.shares)
+    probability, shares = np.stack([share for share, _ in views]), np.array(manifest.shares)
+    mean, types, recognised = probability.mean(axis=0), shares.shape[1] - 1, len(shares) - manifest.detected
+    present = np.maximum(mean[:recognised] - manifest.floor, 0.0)
+    likelihood = _mixture(present, shares[:recognised]) * _mixture(mean[recognised:], shares[recognised:])
     # Objects are never those of the unknown type.
     likelihood[0] = _NEVER
     room_type = PredictedRoomType(np.log(likelihood / likelihood.sum()), np.full(types + 1, 1.0 / types))
@@ -182,11 +192,17 @@ def objects_of_views(
         )
         for number in named
     )
-    return SeenObjects(room_type, objects, min(outside_odds(share) for share in probability))
+    return SeenObjects(room_type, objects, min(outside_odds(share[:recognised]) for share in probability))
+
+
+def _mixture(present: Float[np.ndarray, "n"], shares: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "t"]:
+    """Return the likelihood of every type by objects that are each present with a probability."""
+    present = present * min(1.0, _MOST_SEEN / max(float(present.sum()), _NEVER))
+    return 1.0 - present.sum() + (shares.shape[1] - 1) * present @ shares
 
 
 def outside_odds(probability: Float[np.ndarray, "n"]) -> float:
-    """Return the log likelihood ratio of a photograph taken outside to one of a room, by what its objects are."""
+    """Return the log likelihood ratio of a photograph taken outside to one of a room, by the objects recognised."""
     return float(np.interp(probability.sum(), _HOUSEHOLD, _OUTSIDE))
 
 

@@ -36,9 +36,9 @@ from lalaloc_core.localise.query import Hints, Query, SeenObject, WallDirection
 
 # Names of recognised objects that are fixtures; the others tell the type of the room alone.
 _FIXTURES = {
-    "stove": "stove", "refrigerator": "fridge", "bathtub": "bath", "tub": "bath", "toilet seat": "toilet",
-    "washbasin": "basin", "shower curtain": "shower", "washing machine": "washer", "four-poster bed": "bed", "quilt":
-    "bed", "couch": "sofa", "banister": "stairs",
+    "stove": "stove", "oven": "stove", "refrigerator": "fridge", "bathtub": "bath", "tub": "bath", "toilet seat":
+    "toilet", "toilet": "toilet", "washbasin": "basin", "shower curtain": "shower", "washing machine": "washer",
+    "four-poster bed": "bed", "quilt": "bed", "bed": "bed", "couch": "sofa", "banister": "stairs",
 }  # fmt: skip
 # m, and the q at which an object is as likely present as not.
 _ELSEWHERE, _EVEN = 0.5, 0.15

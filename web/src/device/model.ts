@@ -123,11 +123,14 @@ export class Model {
     const probability = outputs.probability!,
       byColumn = outputs.by_column!,
       columns = azimuths.length;
-    const places = Float32Array.from(probability, (_, object) => {
+    // The last ones are the detector's, which does not run here, so they have the probability 0.
+    const all = this.manifest.objects.names,
+      share = Float32Array.from(all, (_, object) => probability[object] ?? 0);
+    const places = Float32Array.from(all, (_, object) => {
       const row = byColumn.subarray(object * columns, (object + 1) * columns);
-      return azimuths[row.indexOf(Math.max(...row))]!;
+      return azimuths[row.indexOf(Math.max(...row))] ?? 0;
     });
-    return [probability, places];
+    return [share, places];
   }
 
   private async run(
