@@ -115,7 +115,7 @@ export class Model {
     return names.map((name) => Float32Array.from(parts.flatMap((part) => [...part[name]!])));
   }
 
-  /** Return probability and azimuth of each object in a picture with the given azimuths of columns; none without a classifier. */
+  /** Return probability and azimuth of each object in a picture with the given azimuths of columns; 0 for those of the detector, which does not run here. */
   async objects(rgb: Uint8ClampedArray, { width, height }: Size, azimuths: number[]): Promise<Float32Array[]> {
     if (!this.manifest.objects) return [];
     const names = ["probability", "by_column"],
@@ -123,14 +123,11 @@ export class Model {
     const probability = outputs.probability!,
       byColumn = outputs.by_column!,
       columns = azimuths.length;
-    // The last ones are the detector's, which does not run here, so they have the probability 0.
-    const all = this.manifest.objects.names,
-      share = Float32Array.from(all, (_, object) => probability[object] ?? 0);
-    const places = Float32Array.from(all, (_, object) => {
+    const places = Float32Array.from(this.manifest.objects.names, (_, object) => {
       const row = byColumn.subarray(object * columns, (object + 1) * columns);
       return azimuths[row.indexOf(Math.max(...row))] ?? 0;
     });
-    return [share, places];
+    return [places.map((_, object) => probability[object] ?? 0), places];
   }
 
   private async run(
