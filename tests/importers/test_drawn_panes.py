@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
+from pathlib import Path
 
-import numpy as np
 import pytest
-import shapely
 
-from benchmarks.drawn_files import FILE_FORMATS, FILE_STYLES, LANGUAGES, FileFormat, FileStyle, draw_file, draw_home
-from benchmarks.plan_drawing import Model, OpeningSymbol
 from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan
 
 
@@ -88,28 +84,13 @@ def test_one_name_is_that_of_one_room(text: str) -> None:
     assert room.type == "living"
 
 
-def _model() -> Model:
-    """Return a home of two rooms with a window of 3 m in each, and a door between them."""
-    rooms = [shapely.box(1.5, 1.5, 6.0, 5.5), shapely.box(6.2, 1.5, 11.0, 5.5)]
-    panes = [shapely.box(x, 5.5, x + 3.0, 5.7) for x in (2.0, 7.0)]
-    windows = [OpeningSymbol("window", p, (p.bounds[0], 5.6), (p.bounds[2], 5.6), p) for p in panes]
-    side = shapely.Polygon([(6.0, 3.0), (6.0, 3.9), (6.2, 3.9), (6.2, 3.0)])
-    door = OpeningSymbol("door", side, (6.1, 3.0), (6.1, 3.9), side)
-    openings = [*windows, door]
-    inside = shapely.union_all(rooms)
-    around = shapely.union_all([room.buffer(0.2, join_style="mitre") for room in rooms])
-    walls = around.difference(inside).difference(
-        shapely.union_all([o.cut.buffer(1e-4, join_style="mitre") for o in openings])
-    )
-    return Model(rooms, ["kitchen", "bedroom"], openings, walls, (12.5, 7.2))
+# A home of two rooms, a door and two windows by format and style, named in one of twelve languages each.
+DRAWN = sorted((Path(__file__).parent / "drawn").iterdir())
 
 
-@pytest.mark.parametrize(("format", "style"), itertools.product(FILE_FORMATS, FILE_STYLES))
-def test_drawn_home_is_imported_untouched(format: FileFormat, style: FileStyle) -> None:
-    number = len(FILE_STYLES) * (1 + FILE_FORMATS.index(format)) + FILE_STYLES.index(style)
-    drawing = draw_home(_model(), style, LANGUAGES[number % len(LANGUAGES)], np.random.default_rng(0))
-    content, options = draw_file(format, drawing)
-    plan = import_plan(content, ImportOptions.from_text(options))
+@pytest.mark.parametrize("path", DRAWN, ids=lambda path: path.name)
+def test_drawn_home_is_imported_untouched(path: Path) -> None:
+    plan = import_plan(path.read_bytes(), ImportOptions(scale=None if path.suffix == ".dxf" else 100.0))
     areas = sorted(room.area_m2 for room in plan.plan().rooms)
     assert areas == pytest.approx([4.5 * 4.0, 4.8 * 4.0], rel=0.03)
     assert sorted(opening["kind"] for opening in plan.document["openings"]) == ["door", "window", "window"]
