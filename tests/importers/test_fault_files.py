@@ -76,7 +76,10 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", EXPECTED)
+# The control of `half_size_a3.pdf`; a large page takes seconds.
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "right_a1.pdf" else []) for name in EXPECTED]
+)
 def test_file_is_read_right(name: str):
     expected = EXPECTED[name]
     plan = import_plan(content_of(name))

@@ -210,7 +210,7 @@ def test_two_names_in_a_room_are_reported():
 
 
 def test_without_the_extra_texts_are_not_read(monkeypatch: pytest.MonkeyPatch):
-    page = PrintedPlan()
+    page = PrintedPlan(40.0, 13)
     monkeypatch.setattr(lettering, "find_spec", lambda name: None)
     with pytest.raises(InvalidFloorPlanError, match="the picture gives no scale"):
         import_plan(page.file())
@@ -222,7 +222,7 @@ def test_without_the_extra_texts_are_not_read(monkeypatch: pytest.MonkeyPatch):
 def test_models_are_not_downloaded(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(socket.socket, "connect", pytest.fail)
     lettering._reader.cache_clear()
-    texts = read_texts(np.asarray(PrintedPlan().picture), ReportBuilder(), Budget(LIMITS))
+    texts = read_texts(np.asarray(PrintedPlan(40.0, 13).picture), ReportBuilder(), Budget(LIMITS))
     assert {"Küche", "9.30"} <= {text.text for text in texts.drawing.letterings}
 
 
@@ -233,12 +233,12 @@ def test_reading_texts_ends_with_its_share_of_the_time():
         for x in range(0, 1200, 300):
             pen.text((x + 20, y + 10), f"Room {x // 300} {y // 60}", font=font, fill=0)
     clock, builder = count(), ReportBuilder()
-    budget = Budget(ImportLimits(max_import_s=15.0), lambda: float(next(clock)))
+    budget = Budget(ImportLimits(max_import_s=9.0), lambda: float(next(clock)))
     texts = read_texts(np.asarray(picture), builder, budget).drawing.letterings
     (warning,) = builder.warnings
     assert f"{len(texts)} of 60 texts were read" in warning
     assert 0 < len(texts) < 60
-    assert budget.elapsed_s < 15.0
+    assert budget.elapsed_s < 9.0
 
 
 def test_lines_that_are_both_beside_a_high_text_are_joined_from_left_to_right():
