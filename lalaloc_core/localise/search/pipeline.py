@@ -189,20 +189,16 @@ def localise(
     top_k: int = 5,
     refiner: Refiner | None = None,
     config: LocaliseConfig | None = None,
-    clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Localisation:
     """Localise an encoded photograph in a plan.
 
     The grid is the plan's, made for the query's camera height. `refine` is the last stage: "lpo" without a `refiner`,
-    or with one that returns None, ends at "vdr". `clock` times the stages. With strict hints, a known heading is not
-    doubted.
+    or with one that returns None, ends at "vdr". With strict hints, a known heading is not doubted.
     """
     if refiner is None and refine == "lpo":
         refine = "vdr"
-    steps = localise_steps(
-        plan, grid, encoder, query, refine=refine, top_k=top_k, config=config, clock=clock, hints=hints
-    )
+    steps = localise_steps(plan, grid, encoder, query, refine=refine, top_k=top_k, config=config, hints=hints)
     return run_steps(steps, refiner)
 
 
@@ -218,7 +214,10 @@ def localise_steps(
     clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Steps:
-    """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `next_step`."""
+    """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `next_step`.
+
+    `clock` times the stages.
+    """
     config, clock = config or LocaliseConfig(), clock or StageClock()
     hints.check(plan)
     search = _Search(plan, grid, encoder, query, config=config, clock=clock, hints=hints, top_k=top_k)
