@@ -143,6 +143,7 @@ def _at_import_time(node: ast.AST) -> Iterator[ast.AST]:
             yield from _at_import_time(child)
 
 
+@cache
 def _layer(module: str) -> int | None:
     prefixes = [prefix for prefix in LAYERS if module == prefix or module.startswith(prefix + ".")]
     return LAYERS[max(prefixes, key=len)] if prefixes else None
