@@ -40,8 +40,7 @@ class PhotographEncoder:
         self.layouts = LayoutEncoder(bundle, threads=threads)
         self.spheres = SphereEncoder(bundle, threads=threads)
         self._views = None if bundle.manifest.view is None else ViewEncoder(bundle, threads=threads)
-        has_objects = bundle.manifest.objects is not None
-        self._objects = ObjectEncoder(bundle, threads=threads, detects=True) if has_objects else None
+        self._objects = None if bundle.manifest.objects is None else ObjectEncoder(bundle, threads=threads)
 
     @property
     def predicts_profile(self) -> bool:

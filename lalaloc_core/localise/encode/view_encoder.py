@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from onnxruntime import InferenceSession
 
 from lalaloc_core.bundle import DETECTOR_ONNX, OBJECTS_ONNX, VIEW_ONNX, Bundle, ObjectsManifest
 from lalaloc_core.conventions import TWO_PI
@@ -132,14 +134,17 @@ def _widened(
 
 
 class ObjectEncoder:
-    """Classifier, and if `detects` also detector, of objects of one bundle; safe to share between threads."""
+    """Classifier and detector of objects of one bundle; safe to share between threads."""
 
-    def __init__(self, bundle: Bundle, *, threads: int = 0, detects: bool = False) -> None:
+    def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
         assert bundle.manifest.objects is not None
-        self._manifest = bundle.manifest.objects
+        self._bundle, self._threads, self._manifest = bundle, threads, bundle.manifest.objects
         self._session = open_session(bundle.read(OBJECTS_ONNX), threads)
-        detects = detects and self._manifest.detected > 0
-        self._detector = open_session(bundle.read(DETECTOR_ONNX), threads) if detects else None
+
+    @cached_property
+    def _detector(self) -> InferenceSession:
+        # Loaded by the first album, because others do without.
+        return open_session(self._bundle.read(DETECTOR_ONNX), self._threads)
 
     def outputs(self, photograph: Photograph, *, detects: bool = False) -> dict[str, Float[np.ndarray, "n"]]:
         """Return the probability of each object, and its azimuth (radians) relative to the photograph's centre.
@@ -152,7 +157,7 @@ class ObjectEncoder:
         inputs = {"image": thumbnail[None]}
         probability, by_column = map(as_array, self._session.run(["probability", "by_column"], inputs))
         score = np.zeros((1, self._manifest.detected, by_column.shape[2]), np.float32)
-        if detects and self._detector is not None:
+        if detects and self._manifest.detected:
             score = as_array(self._detector.run(["by_column"], inputs)[0])
         excess = np.maximum(score[0].max(axis=1) - self._manifest.detected_floor, 0.0)
         detected = self._manifest.detected_weight / (1.0 - self._manifest.detected_floor) * excess
