@@ -30,6 +30,7 @@ from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
 from lalaloc_core.photograph.projection import find_lens
+from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, between_bars
 from lalaloc_core.photograph.stated_camera import StatedCamera
 from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
@@ -57,9 +58,9 @@ _FLOW_SD = math.radians(3.0)
 _MOST_TURN = 1.5 * TWO_PI
 # Turn (radians) that a film shows at least, a nod that nobody makes, and how much larger it is if a film is sideways.
 _LEAST_TURN, _MOST_NOD, _SIDEWAYS = math.radians(30.0), math.radians(100.0), 3.0
-# Black bars: grey levels, share of a row that is brighter beside them, their least share of the picture, the largest
-# difference of two, and pixels and ratio of the sides of what is between them.
-_BLACK, _SEEN, _LEAST_BARS, _UNEVEN, _LEAST_SIDE, _LONGEST = 10, 0.02, 0.08, 0.02, 100, 3.0
+# Bars: their least share of the picture, pixels and ratio of the sides of what is between them, and samples from one to
+# the next that they are looked for in, first in so many.
+_LEAST_BARS, _LEAST_SIDE, _LONGEST, _LOOKED_AT, _FIRST_LOOKS = 0.08, 100, 3.0, 8, 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,11 +90,12 @@ class _Sample:
 
 @dataclass(eq=False)
 class _Samples:
-    """Sharpest frames by angle, the part of them within black bars (rows, columns), and what became of the others."""
+    """Sharpest frames by angle, the part of them within bars (rows, columns), and what became of the others."""
 
     stored_size: tuple[int, int] = (0, 0)
-    inside: tuple[slice, slice] | None = None
-    lit_bars: int = 0
+    inside: tuple[slice, slice] = _WHOLE
+    looks: list[UInt8[np.ndarray, "h w 3"]] = field(default_factory=list)
+    is_barred: bool = False
     best: dict[int, _Sample] = field(default_factory=dict)
     dropped: Counter[str] = field(default_factory=Counter)
     frames: int = 0
@@ -102,7 +104,7 @@ class _Samples:
     @property
     def full_size(self) -> tuple[int, int]:
         """Width and height of the part of frames within the bars."""
-        rows, columns = self.inside or _WHOLE
+        rows, columns = self.inside
         return len(range(self.stored_size[0])[columns]), len(range(self.stored_size[1])[rows])
 
     def add(self, sample: _Sample, step: float) -> None:
@@ -141,9 +143,9 @@ def read_film(
     hfov = None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
     tracker, samples, begin = FlowTracker(hfov), _Samples(), process_time()
     _sample_film(content, tracker, samples, limits, begin)
-    if samples.lit_bars:
-        # What was black in the first frame is none of bars.
-        tracker, samples = FlowTracker(hfov), _Samples(inside=_WHOLE)
+    inside = _inside_bars(samples)
+    if inside != _WHOLE:
+        tracker, samples = FlowTracker(hfov), _Samples(inside=inside)
         _sample_film(content, tracker, samples, limits, begin)
     kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
     if not kept:
@@ -220,7 +222,7 @@ def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
     warnings = []
     inside = math.prod(samples.full_size) / math.prod(samples.stored_size)
     if inside < 1.0:
-        warnings.append(f"the film has black bars, {1.0 - inside:.0%} of its picture: they were cut off")
+        warnings.append(f"the film has bars, {1.0 - inside:.0%} of its picture: they were cut off")
     if tracker.nodded > max(_LEAST_TURN, _SIDEWAYS * tracker.turned):
         warnings.append(_on_side(tracker, "may lie on its side"))
     if tracker.turned < _LEAST_TURN:
@@ -270,6 +272,8 @@ def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits
                 samples.dropped["damaged"] += 1
                 continue
             _sample(frame, time_s, samples, tracker)
+            if samples.is_barred:
+                break
     if not samples.frames:
         raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
 
@@ -281,16 +285,18 @@ def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples,
     if samples.stored_size != (width, height):
         samples.dropped["of another size"] += 1
         return
-    if samples.inside is None and frame.mean() >= _DARK:
-        samples.inside = _inside_bars(frame)
-    samples.lit_bars += _is_lit_beside(frame, samples.inside)
-    frame = frame[samples.inside or _WHOLE]
+    frame = frame[samples.inside]
     share = min(_LONG_SIDE / max(frame.shape), 1.0)
     picture = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else frame
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     if float(grey.mean()) < _DARK:
         samples.dropped["dark"] += 1
         return
+    if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
+        share = min(THUMBNAIL_SIDE / max(frame.shape), 1.0)
+        samples.looks.append(cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+        # A film with bars is read once more, within them.
+        samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
     samples.add(
@@ -298,27 +304,21 @@ def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples,
     )
 
 
-def _inside_bars(frame: UInt8[np.ndarray, "h w 3"]) -> tuple[slice, slice]:
-    """Return the rows and columns of a frame between two equal black bars; all of them without such bars."""
-    is_seen, parts = frame.max(axis=2) > _BLACK, []
-    for axis, side in ((1, frame.shape[0]), (0, frame.shape[1])):
-        places = np.flatnonzero(is_seen.mean(axis=axis) > _SEEN)
-        before, after = (int(places[0]), side - 1 - int(places[-1])) if len(places) else (0, 0)
+def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
+    """Return the rows and columns of frames between bars, by some of all frames; all of them without bars."""
+    if not samples.looks:
+        return _WHOLE
+    looks, parts = np.stack(samples.looks), []
+    for side, pictures in zip(samples.stored_size[::-1], (looks, looks.transpose(0, 2, 1, 3)), strict=True):
+        begin, end = between_bars(pictures)
+        rows = pictures.shape[1]
         # A row at each bar can be mixed with it.
-        bar = max(before, after) + 1 if abs(before - after) <= _UNEVEN * side and max(before, after) > 0 else 0
-        parts.append(slice(bar, side - bar))
+        begin, end = begin + (begin > 0), end - (end < rows)
+        parts.append(slice(round(begin * side / rows), round(end * side / rows)))
     inside = [part.stop - part.start for part in parts]
     is_picture = min(inside) >= _LEAST_SIDE and max(inside) <= _LONGEST * min(inside)
-    return (parts[0], parts[1]) if is_picture and math.prod(inside) <= (1.0 - _LEAST_BARS) * is_seen.size else _WHOLE
-
-
-def _is_lit_beside(frame: UInt8[np.ndarray, "h w 3"], inside: tuple[slice, slice] | None) -> bool:
-    """Return whether a frame shows something in what is taken for bars."""
-    if inside is None or inside == _WHOLE:
-        return False
-    is_seen = np.maximum.reduce(cv2.split(frame)) > 2 * _BLACK
-    is_seen[inside] = False
-    return float(is_seen.mean()) > _SEEN
+    is_barred = math.prod(inside) <= (1.0 - _LEAST_BARS) * math.prod(samples.stored_size)
+    return (parts[0], parts[1]) if is_picture and is_barred else _WHOLE
 
 
 @contextmanager

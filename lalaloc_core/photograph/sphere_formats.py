@@ -28,6 +28,9 @@ _EYE, _MIN_CORRELATION, _MAX_SHIFT = (64, 128), 0.75, 6
 # Bars: largest spread of grey levels along a row, share of a row that is of the bar, beside texts, and least share of
 # the height; shares of the picture that bars around photographs have, and fewest rows between them.
 _MAX_BAR_SPREAD, _OF_BAR, _MIN_BARS, _PHOTOGRAPH_BARS, _FEWEST_ROWS = 4.0, 0.8, 0.02, (0.08, 0.85), 48
+# Bars that are not alike: largest difference from their colour. All: share of a row beside their edge that is of them.
+# Blurred ones: ratio of the step at their edge to those beside it, and of the detail within to theirs; largest step.
+_EXACT_SPREAD, _WHOLE_ROW, _EDGE_OF_BLUR, _MAX_STEP = 2.0, 0.98, 2.5, 40
 # Circles: side (pixels) of judged squares, radii of the ring inside and of the corners, and grey levels of the corners.
 _CIRCLE = 64
 _RING, _CORNERS = (0.8, 0.93), 1.12
@@ -80,8 +83,8 @@ class Thumbnail:
 
     @cached_property
     def between_bars(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """`_bars` of its rows, and of its columns."""
-        return _bars(self.pixels), _bars(self.pixels.transpose(1, 0, 2))
+        """`between_bars` of its rows, and of its columns."""
+        return between_bars(self.pixels[None]), between_bars(self.pixels.transpose(1, 0, 2)[None])
 
 
 def find_sphere_format(thumbnail: Thumbnail) -> SphereFormat | None:
@@ -245,17 +248,49 @@ def _find_photograph_in_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     )
 
 
-def _bars(pixels: UInt8[np.ndarray, "n m 3"]) -> tuple[int, int]:
-    """Return the first row and the end of the rows between bars of one colour at the top and bottom."""
-    mean, spread = cv2.meanStdDev(np.ascontiguousarray(pixels[[0, -1]]))
-    if spread.max() > 2.0 * _MAX_BAR_SPREAD:
-        return 0, len(pixels)
-    lowest, highest = np.floor(mean - 2.0 * _MAX_BAR_SPREAD) + 1.0, np.ceil(mean + 2.0 * _MAX_BAR_SPREAD) - 1.0
-    is_colour = cv2.inRange(np.ascontiguousarray(pixels), lowest, highest)
-    is_bar = cv2.reduce(is_colour, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] >= 255.0 * _OF_BAR
-    if is_bar.all():
-        return 0, len(pixels)
-    return int(np.argmin(is_bar)), len(pixels) - int(np.argmin(is_bar[::-1]))
+def between_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[int, int]:
+    """Return the first row and the end of the rows between bars at the top and bottom of one or several pictures.
+
+    Bars have one colour, or are a blurred copy of the picture.
+    """
+    rows = pictures.shape[1]
+    ends = pictures, pictures[:, ::-1]
+    (top, colour), (bottom, other) = (_plain_rows(end, 2.0 * _MAX_BAR_SPREAD) for end in ends)
+    if not top or not bottom or np.abs(colour - other).max() > 2.0 * _MAX_BAR_SPREAD:
+        top, bottom = (_plain_rows(end, _EXACT_SPREAD)[0] for end in ends)
+    if not top and not bottom:
+        top = bottom = _blurred_rows(np.stack([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]))
+    return top, rows - bottom
+
+
+def _plain_rows(pictures: UInt8[np.ndarray, "f n m 3"], spread: float) -> tuple[int, Float[np.ndarray, "3"]]:
+    """Return the number of rows at the top that have one colour, up to a straight edge, and the colour."""
+    mean, found = cv2.meanStdDev(np.ascontiguousarray(pictures[:, :1]).reshape(-1, 1, 3))
+    if found.max() > 0.5 * spread:
+        return 0, mean.ravel()
+    lowest, highest = np.floor(mean - spread) + 1.0, np.ceil(mean + spread) - 1.0
+    masks = [cv2.inRange(np.ascontiguousarray(picture), lowest, highest) for picture in pictures]
+    shares = np.min([cv2.reduce(mask, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] for mask in masks], axis=0) / 255.0
+    rows = int(np.argmax(shares < _OF_BAR))
+    is_sharp = 2 < rows < len(shares) - 2 and shares[rows - 2] > _WHOLE_ROW and shares[rows + 2] < 0.5
+    return rows if is_sharp else 0, mean.ravel()
+
+
+def _blurred_rows(greys: UInt8[np.ndarray, "f n m"]) -> int:
+    """Return the number of rows of each of two equal bars, which are smooth and end at straight edges; 0 without."""
+    # Few edges are not to outweigh many small steps.
+    changes = [cv2.min(cv2.absdiff(grey[1:], grey[:-1]), _MAX_STEP) for grey in greys]
+    steps = np.mean([cv2.reduce(change, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] for change in changes], axis=0)
+    wide = np.max([steps[:-2], steps[1:-1], steps[2:]], axis=0)
+    edges = np.minimum(wide, wide[::-1])[: len(wide) // 2]
+    rows = int(np.argmax(edges)) + 2
+    if not _MIN_BARS * len(steps) < rows - 3 < 0.5 * len(steps) - 6:
+        return 0
+    is_edged = np.maximum(steps, steps[::-1])[: rows - 3].max() * _EDGE_OF_BLUR < edges.max()
+    details = [np.abs(np.diff(grey.astype(np.float32), 2, axis=1)).mean(axis=1) for grey in greys] if is_edged else []
+    beside = [(detail + detail[::-1])[: rows - 2].mean() / 2.0 for detail in details]
+    inside = [detail[rows:-rows].mean() for detail in details]
+    return rows if is_edged and np.mean(beside) * _EDGE_OF_BLUR < np.mean(inside) else 0
 
 
 def _find_cube(thumbnail: Thumbnail) -> SphereFormat | None:

@@ -53,6 +53,7 @@ _FILES = (
     JSON, "application/geo+json", "application/zip", "application/pdf", "application/xml", "image/svg+xml",
     "image/png", "image/jpeg", "image/vnd.dxf", "application/dxf", "application/x-step", "application/octet-stream",
 )  # fmt: skip
+_PICTURES = ("image/png", "image/jpeg")
 _BYTES = {"schema": BINARY}
 
 
@@ -197,7 +198,10 @@ def prepare_levels(uploaded: PlanUpload, call: ApiCall, name: str, on_step: OnSt
     for file in files:
         check_size(file.plan, call.settings, None if file.level is None else file.level.name)
     grids = call.runtime.grids.prepare_all([file.plan for file in files], call.client)
-    originals = [_original(file, content if len(files) == 1 else None) for file in files]
+    # Every storey of a picture keeps it, to be corrected over it.
+    originals = [
+        _original(file, content if len(files) == 1 or file.media_type in _PICTURES else None) for file in files
+    ]
     return [_new_plan(*values, call) for values in zip(files, originals, grids, _level_numbers(files), strict=True)]
 
 

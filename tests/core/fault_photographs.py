@@ -74,10 +74,12 @@ class Fault:
 
 
 _LIVING = {"room": "living room", "x_m": 2.15, "y_m": 2.3, "heading_deg": 30.0}
+_TURNED = _LIVING | {"heading_deg": 335.0}
 _CORNER = {"room": "living room", "x_m": 3.0, "y_m": 1.54, "heading_deg": 335.0}
 _SMALL = '{"fx":232.4,"fy":232.4,"cx":319.5,"cy":239.5}'
 _SIDEWAYS = '{"fx":581,"fy":581,"cx":799.5,"cy":599.5}'
 FAULTS = (
+    Fault(name="crop_half.jpg", said="was cropped after it was taken", within_m=0.5, **_CORNER),
     Fault(name="crop_over_seam.jpg", room=None, said="(800, 100) is not within the full sphere of 1024 x 512"),
     Fault(name="cube_3x2.jpg", room=None, said="a cube map, 3 x 2 faces: convert it to equirectangular"),
     Fault(name="cylinder_full_is_crop.jpg", room=None, said="the borders do not continue each other; send hfov_deg"),
@@ -92,6 +94,7 @@ FAULTS = (
     Fault(name="screenshot_bars.jpg", said="is within bars, 65% of the picture", **_CORNER),
     Fault(name="sphere_letterbox.jpg", said="a sphere with bars at its borders"),
     Fault(name="sphere_orientation6.jpg", said="the Exif orientation 6, which is ignored"),
+    Fault(name="stale_orientation.jpg", said="because the picture was turned after it was taken", **_TURNED),
     Fault(name="stereo_top_bottom.jpg", room=None, said="a stereo sphere, one eye above the other: cut out one"),
     Fault(name="two_xmp.jpg"),
 )

@@ -3,21 +3,36 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 
 from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.photograph.film import read_film
 from tests.core.fault_photographs import FOLDER
+from tests.core.filmed import encode, needs_ffmpeg, turn
+from tests.core.taken import within_bars
 
 
-def test_black_bars_are_cut_off() -> None:
+def test_black_bars_beside_a_film_are_cut_off() -> None:
     film = read_film((FOLDER / "pillarbox_black.mp4").read_bytes())
-    assert film.warnings[0] == "the film has black bars, 69% of its picture: they were cut off"
+    assert film.warnings[0] == "the film has bars, 68% of its picture: they were cut off"
     assert math.degrees(film.turned) > 320.0
     camera = film.photographs[0].camera
     assert camera is not None
     assert camera.width < camera.height
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("kind", ["unequal", "of two colours", "blurred"])
+def test_bars_above_and_below_a_film_are_cut_off(tmp_path: Path, kind: str) -> None:
+    film = read_film(encode([within_bars(frame, kind) for frame in turn()[:31]], tmp_path / "barred.mp4"))
+    assert re.fullmatch(r"the film has bars, \d\d% of its picture: they were cut off", film.warnings[0])
+    assert math.degrees(film.turned) == pytest.approx(180.0, abs=15.0)
+    camera = film.photographs[0].camera
+    assert camera is not None
+    assert (camera.width, camera.height) == pytest.approx((270, 480), abs=8)
 
 
 def test_film_on_its_side_is_named() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import random
 import re
@@ -11,10 +12,11 @@ from unittest.mock import Mock
 import cv2
 import pypdfium2
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from benchmarks.hostile_drawings import HOSTILE_PLANS, ifc_space, pdf
 from benchmarks.hostile_files import boxes, chords
+from benchmarks.plan_drawing import STYLES, draw_plan
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
@@ -110,6 +112,32 @@ def test_page_that_is_painted_over_and_over_is_refused_before_it_is_rendered(mon
     monkeypatch.setattr(pypdfium2.PdfPage, "render", pytest.fail)
     with pytest.raises(InvalidInputError, match="cover it more than 1000 times"):
         import_plans(pdf(b"0 0 800 800 re f " * 1100), _SCALE)
+
+
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=[pytest.mark.slow] * (seed > 1)) for seed in range(10)])
+def test_changed_picture_of_a_plan_is_read_or_refused(seed: int):
+    chance = random.Random(seed)
+    page = Image.open(io.BytesIO(draw_plan(STYLES[seed % len(STYLES)], seed).png())).convert("RGB")
+    page.thumbnail((chance.choice([300, 500, 700]),) * 2)
+    sides = page.width // 3, page.height // 3
+    changes = {
+        "turned": lambda: page.rotate(chance.uniform(-180.0, 180.0), expand=True, fillcolor="white"),
+        "cropped": lambda: page.crop(
+            (chance.randint(0, sides[0]), chance.randint(0, sides[1]), page.width - sides[0], page.height)
+        ),
+        "inverted": lambda: ImageOps.invert(page),
+        "JPEG": lambda: Image.open(io.BytesIO(picture_file(page, "JPEG", quality=chance.randint(5, 30)))),
+    }
+    for change in chance.sample(sorted(changes), 2):
+        page = changes[change]()
+    if chance.random() < 0.4:
+        page.putalpha(ImageOps.invert(page.convert("L")))
+    refused = ""
+    try:
+        import_plans(picture_file(page), ImportOptions(metres_per_pixel=chance.choice([None, 0.01, 0.03])))
+    except InvalidInputError as error:
+        refused = str(error)
+    assert INTERNAL.search(refused) is None
 
 
 def test_error_of_a_step_on_a_picture_is_a_refusal(monkeypatch: pytest.MonkeyPatch):

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 import shapely
 
-from lalaloc_core.importers import ImportOptions, import_plan
+from lalaloc_core.importers import ImportOptions, ImportStep, import_plan
 from lalaloc_core.importers.common.import_limits import Budget, ImportLimits
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
@@ -49,8 +49,9 @@ def test_too_few_parts_give_no_scale(measures: Measures):
 
 
 def test_drawing_is_read_again_at_the_scale_that_was_found():
-    sketch = Mock(return_value=Measures(leaves=[82.0, 84.0, 88.0, 90.0]))
-    guess = present(guess_scale(sketch, 0.02, Budget()))
+    sketch, on_step = Mock(return_value=Measures(leaves=[82.0, 84.0, 88.0, 90.0])), Mock()
+    guess = present(guess_scale(sketch, 0.02, Budget(on_step=on_step)))
+    on_step.assert_called_once_with(ImportStep("estimating the scale"))
     assert sketch.call_count == 2
     assert abs(math.log(sketch.call_args.args[0] / guess.metres_per_unit)) < 0.04
 

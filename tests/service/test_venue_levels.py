@@ -23,8 +23,10 @@ from service.storage.plan_rows import plan_bytes
 from service.storage.records import NewPlan, Original, PlanRecord, VenueRecord
 from service.storage.store import Store
 from tests.importers.conftest import zip_file
+from tests.importers.test_crop import SCALE, _storeys
 from tests.importers.test_ifc import ifc_flat, ifc_house
 from tests.importers.test_roomplan import two_stories
+from tests.painted import picture_file
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, document_of, wait_for
 from tests.service.test_security import bearer, make_key
 from tests.service.test_venues import plans_of
@@ -125,6 +127,18 @@ def test_levels_keep_their_plan_as_a_file(client: httpx.Client) -> None:
         assert original.headers["content-type"] == "application/json"
         again = client.post("/floorplans", content=original.content, headers={"content-type": "application/json"})
         assert again.json()["plan"] == client.get(f"/floorplans/{entry['floorplan_id']}").json()["plan"]
+
+
+def test_storeys_of_a_picture_become_a_venue_and_keep_it(client: httpx.Client) -> None:
+    picture = picture_file(_storeys())
+    venue = send(client, picture, "House.png", metres_per_pixel=str(SCALE)).json()
+    entries = plans_of(client, venue["id"])
+    assert sorted((entry["name"], entry["rooms"]) for entry in entries) == [
+        ("House – Storey 1", 2),
+        ("House – Storey 2", 1),
+    ]
+    for entry in entries:
+        assert client.get(f"/floorplans/{entry['floorplan_id']}/original").content == picture
 
 
 def test_file_without_levels_becomes_a_venue_of_one_plan(client: httpx.Client) -> None:

@@ -235,6 +235,12 @@ def test_other_files_than_photographs_are_rejected(desktop: Visit, tmp_path: Pat
     page.locator("#photo-file").set_input_files(tmp_path / "notes.txt")
     expect(page.locator("#photo-error")).to_contain_text("must be JPEG, PNG, WebP or HEIC files")
     expect(page.locator("#photo-strip li")).to_have_count(4)
+    paths = [tmp_path / name for name in ("10.jpg", "2.jpg", "._2.jpg", "empty.jpg")]
+    for path in paths:
+        path.write_bytes((EXAMPLES / "turn_1.jpg").read_bytes() if path.stem.isdecimal() else b"")
+    page.locator("#photo-file").set_input_files(paths)
+    expect(page.locator("#photo-error")).to_contain_text("“._2.jpg”, “empty.jpg”: ")
+    expect(page.locator("#photo-strip .thumb")).to_have_text(["2.jpg", "10.jpg"])
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff no picture")
     page.locator("#photo-file").set_input_files(tmp_path / "broken.jpg")
     page.get_by_role("button", name="Find the place").click()

@@ -7,6 +7,27 @@ const PHONE_FILES = /\.hei[cf]$/i;
 /** Return true for a file that can be a photograph. */
 export const isPicture = (file: File): boolean => PICTURES.test(file.type) || PHONE_FILES.test(file.name);
 
+/** Return a key of a name by which files are in the order of the command line: digits count as numbers. */
+export const nameKey = ({ name }: File): string =>
+  name.replace(/\d+/g, (digits) => `\0${digits.padStart(20, "0")}\0`);
+
+/** Sort files by keys, letters by their codes. */
+export const sorted = (files: File[], key: (file: File) => string): File[] =>
+  [...files].sort((a, b) => (key(a) < key(b) ? -1 : Number(key(a) > key(b))));
+
+/** Return files in the order of their times, if all have different ones, else of their names. */
+export async function inOrder(files: File[]): Promise<File[]> {
+  const times = new Map(await Promise.all(files.map(async (file) => [file, await takenAt(file)] as const)));
+  const known = new Set(times.values());
+  return sorted(files, known.size < files.length || known.has("") ? nameKey : (file) => times.get(file)!);
+}
+
+/** Return the earliest time in the head of a file, its Exif metadata; empty without one. */
+async function takenAt(file: File): Promise<string> {
+  const head = new TextDecoder("latin1").decode(await file.slice(0, 65_536).arrayBuffer());
+  return (head.match(/\d{4}:\d\d:\d\d \d\d:\d\d:\d\d/g) ?? []).sort()[0] ?? "";
+}
+
 /** Accept the files that are chosen in a field, at least one; the same can be chosen again. */
 export function acceptChoice(field: HTMLInputElement, take: (files: File[]) => void): void {
   field.addEventListener("change", () => {

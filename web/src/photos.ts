@@ -2,7 +2,7 @@
 
 import { Compass } from "./compass";
 import { button, byId, h, show } from "./dom";
-import { acceptChoice, acceptDrops, isPicture } from "./drops";
+import { acceptChoice, acceptDrops, inOrder, isPicture } from "./drops";
 import { NO_HINTS } from "./hints";
 import { clearErrors, InputError, showError } from "./notices";
 import type { Answer, Hints } from "./types";
@@ -58,8 +58,9 @@ export class Photos {
     byId("compass-place").append(this.compass.element);
     for (const field of Object.values(this.inputs)) field.addEventListener("input", () => this.read());
     this.choice.addEventListener("change", () => this.onMotion());
-    acceptChoice(byId("photo-file"), (files) => this.add(files));
-    acceptDrops(byId("photo-panel"), (files) => this.add(files));
+    const take = async (files: File[]): Promise<void> => this.add(await inOrder(files));
+    acceptChoice(byId("photo-file"), (files) => void take(files));
+    acceptDrops(byId("photo-panel"), (files) => void take(files));
   }
 
   get list(): readonly Photo[] {
@@ -77,10 +78,11 @@ export class Photos {
 
   /** Add pictures and choose the first of them; those of an example give way to others. */
   add(files: File[], isExample = false, directions: readonly number[] | null = null, isTurn = false): void {
-    const rejected = files.filter((file) => !isPicture(file));
+    const isUsed = (file: File): boolean => isPicture(file) && file.size > 0 && !file.name.startsWith(".");
+    const rejected = files.filter((file) => !isUsed(file));
     clearErrors();
     const added = files
-      .filter(isPicture)
+      .filter(isUsed)
       .map((file, index): Photo => ({
         file,
         isExample,
@@ -102,7 +104,7 @@ export class Photos {
     }
     if (rejected.length === 0) return;
     const names = rejected.map((file) => `“${file.name}”`).join(", ");
-    showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files.`));
+    showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files, neither empty nor hidden.`));
   }
 
   /** Take the frames of a guided turn instead of all photographs. */

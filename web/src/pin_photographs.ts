@@ -4,7 +4,7 @@ import type { Picture, Schemas } from "../../clients/typescript/src/index";
 import { api } from "./api";
 import { device } from "./device/device";
 import { download, h } from "./dom";
-import { isPicture } from "./drops";
+import { isPicture, nameKey, sorted } from "./drops";
 import { InputError, say } from "./notices";
 import type { Row } from "./pin_floors";
 
@@ -23,10 +23,8 @@ const PORTION_BYTES = 60e6;
 /** Return the photographs among some files in the order of their names, and a sentence on the others. */
 export function photographsOf(files: File[]): { photographs: File[]; note: string | null } {
   const seen = files.filter((file) => !file.name.startsWith("."));
-  const photographs = seen.filter((file) => isPicture(file));
-  // As on the command line, whose numbers the photographs then have: digits count as numbers, letters by their codes.
-  const key = ({ name }: File): string => name.replace(/\d+/g, (digits) => `\0${digits.padStart(20, "0")}\0`);
-  photographs.sort((a, b) => (key(a) < key(b) ? -1 : Number(key(a) > key(b))));
+  // As on the command line, whose numbers the photographs then have.
+  const photographs = sorted(seen.filter(isPicture), nameKey);
   const others = seen.length - photographs.length;
   const note = others === 0 ? null : `Files that are no JPEG, PNG, WebP or HEIC, which are left out: ${others}`;
   return { photographs, note };

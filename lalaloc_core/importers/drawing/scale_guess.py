@@ -114,7 +114,9 @@ def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budge
     `sketch` reads the drawing at a scale, in metres per unit, and returns the sizes of its parts; the first scale is
     `start`, and others follow until one leads to a certain scale. The guess takes at most a part of the import's time.
     """
-    trace, budget.trace = budget.trace, None
+    budget.begin("estimating the scale")
+    # The readings on the way are no steps of their own.
+    (trace, budget.trace), (on_step, budget.on_step) = (budget.trace, None), (budget.on_step, None)
     end_s = budget.elapsed_s + _SHARE_OF_TIME * budget.limits.max_import_s
     try:
         for share in _FIRST_SHARES:
@@ -122,7 +124,7 @@ def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budge
             if guess is not None or budget.elapsed_s > end_s:
                 return guess
     finally:
-        budget.trace = trace
+        budget.trace, budget.on_step = trace, on_step
     return None
 
 
