@@ -76,12 +76,10 @@ def opened(content: bytes, **stated: Any) -> Photograph:
 
 def within_bars(picture: np.ndarray, kind: str) -> np.ndarray:
     """Return a picture between bars above and below, as videos and screenshots have them."""
-    if kind == "blurred":
-        barred = cv2.GaussianBlur(cv2.resize(picture, None, fx=1.0, fy=1.5), (0, 0), 0.03 * max(picture.shape))
-        first = (len(barred) - len(picture)) // 2
-        barred[first : first + len(picture)] = picture
-        return barred
-    rows = {"black": (60, 60), "unequal": (30, 120), "of two colours": (60, 80), "on one side": (100, 0)}[kind]
-    ends = [np.full((count, *picture.shape[1:]), 0, np.uint8) for count in rows]
-    ends[0] += 255 * (kind == "of two colours")
-    return np.concatenate([ends[0], picture, ends[1]])
+    above, below = {"unequal": (30, 120), "on one side": (100, 0)}.get(kind, (80, 80))
+    border = cv2.BORDER_WRAP if kind == "blurred" else cv2.BORDER_CONSTANT
+    barred = cv2.GaussianBlur(cv2.copyMakeBorder(picture, above, below, 0, 0, border), (0, 0), 15.0)
+    barred[above : above + len(picture)] = picture
+    if kind != "blurred":
+        barred[:above], barred[above + len(picture) :] = 255 * (kind == "of two colours"), 0
+    return barred

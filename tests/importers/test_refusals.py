@@ -119,25 +119,15 @@ def test_changed_picture_of_a_plan_is_read_or_refused(seed: int):
     chance = random.Random(seed)
     page = Image.open(io.BytesIO(draw_plan(STYLES[seed % len(STYLES)], seed).png())).convert("RGB")
     page.thumbnail((chance.choice([300, 500, 700]),) * 2)
-    sides = page.width // 3, page.height // 3
-    changes = {
-        "turned": lambda: page.rotate(chance.uniform(-180.0, 180.0), expand=True, fillcolor="white"),
-        "cropped": lambda: page.crop(
-            (chance.randint(0, sides[0]), chance.randint(0, sides[1]), page.width - sides[0], page.height)
-        ),
-        "inverted": lambda: ImageOps.invert(page),
-        "JPEG": lambda: Image.open(io.BytesIO(picture_file(page, "JPEG", quality=chance.randint(5, 30)))),
-    }
-    for change in chance.sample(sorted(changes), 2):
-        page = changes[change]()
-    if chance.random() < 0.4:
+    page = page.rotate(chance.choice([0.0, 90.0, chance.uniform(-180.0, 180.0)]), expand=True, fillcolor="white")
+    page = page.crop((chance.randint(0, page.width // 3), 0, page.width, chance.randint(page.height // 2, page.height)))
+    page = ImageOps.invert(page) if seed % 2 else Image.open(io.BytesIO(picture_file(page, "JPEG", quality=8)))
+    if seed % 3 == 0:
         page.putalpha(ImageOps.invert(page.convert("L")))
-    refused = ""
     try:
         import_plans(picture_file(page), ImportOptions(metres_per_pixel=chance.choice([None, 0.01, 0.03])))
     except InvalidInputError as error:
-        refused = str(error)
-    assert INTERNAL.search(refused) is None
+        assert not INTERNAL.search(str(error))  # noqa: PT017
 
 
 def test_error_of_a_step_on_a_picture_is_a_refusal(monkeypatch: pytest.MonkeyPatch):

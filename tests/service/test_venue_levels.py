@@ -132,12 +132,9 @@ def test_levels_keep_their_plan_as_a_file(client: httpx.Client) -> None:
 def test_storeys_of_a_picture_become_a_venue_and_keep_it(client: httpx.Client) -> None:
     picture = picture_file(_storeys())
     venue = send(client, picture, "House.png", metres_per_pixel=str(SCALE)).json()
-    entries = plans_of(client, venue["id"])
-    assert sorted((entry["name"], entry["rooms"]) for entry in entries) == [
-        ("House – Storey 1", 2),
-        ("House – Storey 2", 1),
-    ]
-    for entry in entries:
+    found = [(entry["name"], entry["rooms"]) for entry in plans_of(client, venue["id"])]
+    assert sorted(found) == [("House – Storey 1", 2), ("House – Storey 2", 1)]
+    for entry in plans_of(client, venue["id"]):
         assert client.get(f"/floorplans/{entry['floorplan_id']}/original").content == picture
 
 

@@ -4,22 +4,22 @@ const PICTURES = /^image\/(jpeg|png|webp|heic|heif)$/;
 // Some systems do not know the type of phones' files.
 const PHONE_FILES = /\.hei[cf]$/i;
 
-/** Return true for a file that can be a photograph. */
-export const isPicture = (file: File): boolean => PICTURES.test(file.type) || PHONE_FILES.test(file.name);
+/** Return true for a file that can be a photograph; empty and hidden ones are none. */
+export const isPicture = ({ name, size, type }: File): boolean =>
+  (PICTURES.test(type) || PHONE_FILES.test(name)) && size > 0 && !name.startsWith(".");
 
 /** Return a key of a name by which files are in the order of the command line: digits count as numbers. */
-export const nameKey = ({ name }: File): string =>
-  name.replace(/\d+/g, (digits) => `\0${digits.padStart(20, "0")}\0`);
+export const nameKey = ({ name }: File): string => name.replace(/\d+/g, (digits) => `\0${digits.padStart(20, "0")}\0`);
 
-/** Sort files by keys, letters by their codes. */
+/** Return files by their keys, letters by their codes. */
 export const sorted = (files: File[], key: (file: File) => string): File[] =>
   [...files].sort((a, b) => (key(a) < key(b) ? -1 : Number(key(a) > key(b))));
 
 /** Return files in the order of their times, if all have different ones, else of their names. */
 export async function inOrder(files: File[]): Promise<File[]> {
   const times = new Map(await Promise.all(files.map(async (file) => [file, await takenAt(file)] as const)));
-  const known = new Set(times.values());
-  return sorted(files, known.size < files.length || known.has("") ? nameKey : (file) => times.get(file)!);
+  const isTold = new Set(times.values()).size === files.length && ![...times.values()].includes("");
+  return sorted(files, isTold ? (file) => times.get(file)! : nameKey);
 }
 
 /** Return the earliest time in the head of a file, its Exif metadata; empty without one. */

@@ -58,9 +58,8 @@ export class Photos {
     byId("compass-place").append(this.compass.element);
     for (const field of Object.values(this.inputs)) field.addEventListener("input", () => this.read());
     this.choice.addEventListener("change", () => this.onMotion());
-    const take = async (files: File[]): Promise<void> => this.add(await inOrder(files));
-    acceptChoice(byId("photo-file"), (files) => void take(files));
-    acceptDrops(byId("photo-panel"), (files) => void take(files));
+    acceptChoice(byId("photo-file"), async (files) => this.add(await inOrder(files)));
+    acceptDrops(byId("photo-panel"), async (files) => this.add(await inOrder(files)));
   }
 
   get list(): readonly Photo[] {
@@ -78,11 +77,10 @@ export class Photos {
 
   /** Add pictures and choose the first of them; those of an example give way to others. */
   add(files: File[], isExample = false, directions: readonly number[] | null = null, isTurn = false): void {
-    const isUsed = (file: File): boolean => isPicture(file) && file.size > 0 && !file.name.startsWith(".");
-    const rejected = files.filter((file) => !isUsed(file));
+    const rejected = files.filter((file) => !isPicture(file));
     clearErrors();
     const added = files
-      .filter(isUsed)
+      .filter(isPicture)
       .map((file, index): Photo => ({
         file,
         isExample,
@@ -104,7 +102,8 @@ export class Photos {
     }
     if (rejected.length === 0) return;
     const names = rejected.map((file) => `“${file.name}”`).join(", ");
-    showError(this.error, new InputError(`${names}: photographs must be JPEG, PNG, WebP or HEIC files, neither empty nor hidden.`));
+    const limits = "must be JPEG, PNG, WebP or HEIC files, neither empty nor hidden.";
+    showError(this.error, new InputError(`${names}: photographs ${limits}`));
   }
 
   /** Take the frames of a guided turn instead of all photographs. */

@@ -26,7 +26,7 @@ export function photographsOf(files: File[]): { photographs: File[]; note: strin
   // As on the command line, whose numbers the photographs then have.
   const photographs = sorted(seen.filter(isPicture), nameKey);
   const others = seen.length - photographs.length;
-  const note = others === 0 ? null : `Files that are no JPEG, PNG, WebP or HEIC, which are left out: ${others}`;
+  const note = others === 0 ? null : `Files that are empty or no JPEG, PNG, WebP or HEIC, left out: ${others}`;
   return { photographs, note };
 }
 

@@ -123,7 +123,8 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
         ]
     _add_trust(document, sketch, builder)
     # Coordinates on Earth have no unit that could be mistaken.
-    builder.warnings.extend(check_document(document, is_scale_certain=sketch.anchor is not None))
+    is_certain, metres_per_unit = sketch.anchor is not None, builder.metres_per_unit
+    builder.warnings += check_document(document, is_scale_certain=is_certain, metres_per_unit=metres_per_unit)
     # Validate now, while the error can still refer to the file.
     plan = FloorPlan.from_dict(document, limits)
     builder.warnings += [warning for warning in plan.warnings if " overlap" in warning]

@@ -53,17 +53,19 @@ _MAX_ROOMS = 400
 _SHARES = (np.arange(200) + 0.5) / 200
 
 
-def check_document(document: Mapping[str, Any], *, is_scale_certain: bool = False) -> list[str]:
+def check_document(
+    document: Mapping[str, Any], *, is_scale_certain: bool = False, metres_per_unit: float = 1.0
+) -> list[str]:
     """Return warnings about a plan as `FloorPlan.from_dict` expects it, except overlaps, of which `FloorPlan` warns.
 
-    Values of the document may be out of range. With `is_scale_certain`, rooms and doors of unusual size give no
-    warning.
+    Values of the document may be out of range; those of the file were multiplied by `metres_per_unit`. With
+    `is_scale_certain`, rooms and doors of unusual size give no warning.
     """
     rooms = [shapely.Polygon(room["polygon"]) for room in document["rooms"]]
     names = [room.get("name", f"room {index + 1}") for index, room in enumerate(document["rooms"])]
     warnings = _ceiling_warnings(document, names)
     if not is_scale_certain:
-        warnings += _door_warnings(document) + _size_warnings(rooms)
+        warnings += _door_warnings(document, metres_per_unit) + _size_warnings(rooms, metres_per_unit)
     duplicates = [name for name, count in Counter(names).items() if count > 1]
     if duplicates:
         warnings.append(f"rooms share a name: {_list_names(duplicates)}; answers distinguish them by id only")
@@ -105,14 +107,15 @@ def unit_by_parts(doors: Sequence[float], extent: float, sides: Sequence[float] 
     return best if score(best)[0] == sum(bool(values) for values, _ in measures) else None
 
 
-def _unit_hints(subject: str, value: float, usual_m: tuple[float, float]) -> list[str]:
-    """Return a warning about a length if it is unusual in metres."""
+def _unit_hints(subject: str, value: float, usual_m: tuple[float, float], metres_per_unit: float = 1.0) -> list[str]:
+    """Return a warning about a length if it is unusual in metres, with the unit in which that of the file is not."""
     low, high = usual_m
     if low <= value <= high:
         return []
-    unit = likely_unit(value, usual_m)
+    stated = value / metres_per_unit
+    unit = likely_unit(stated, usual_m) if metres_per_unit in METRES_PER_UNIT.values() else None
     advice = (
-        f"it looks like {UNIT_NAMES[unit]} (with units={unit} it is {value * METRES_PER_UNIT[unit]:.2f} m)"
+        f"it looks like {UNIT_NAMES[unit]} (with units={unit} it is {stated * METRES_PER_UNIT[unit]:.2f} m)"
         if unit is not None
         else "check the scale"
     )
@@ -130,20 +133,20 @@ def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list
     return list(chain.from_iterable(hints))[:_MAX_NAMED]
 
 
-def _door_warnings(document: Mapping[str, Any]) -> list[str]:
+def _door_warnings(document: Mapping[str, Any], metres_per_unit: float) -> list[str]:
     widths = [line.length for line in _lines(document, "door")]
     if not widths:
         return []
-    return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M)
+    return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M, metres_per_unit)
 
 
-def _size_warnings(rooms: Sequence[shapely.Polygon]) -> list[str]:
+def _size_warnings(rooms: Sequence[shapely.Polygon], metres_per_unit: float) -> list[str]:
     """Detect a wrong unit by the size of rooms, which works without doors."""
     areas = np.sort([room.area for room in rooms])
     # Median weighted by area, so that closets and ducts hardly count.
     side = float(np.sqrt(areas[np.searchsorted(np.cumsum(areas), 0.5 * areas.sum())]))
     low, high = (float(np.sqrt(area)) for area in _USUAL_ROOM_M2)
-    return _unit_hints("the side of a typical room", round(side, 3), (low, high))
+    return _unit_hints("the side of a typical room", round(side, 3), (low, high), metres_per_unit)
 
 
 def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:

@@ -99,6 +99,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
     pictures = sum(local_name(element) == "image" for element in root.iter())
+    texts = sum(local_name(element) == "foreignObject" and _has_text(element) for element in root.iter())
     for parent in root.iter():
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
     check_work(root, budget)
@@ -108,7 +109,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         if element is not root and title and title.strip():
             element.attrib.setdefault("data-name", title.strip())
     with _naming_pictures(pictures):
-        return _read_plan(root, pictures, options, budget)
+        warnings = [_picture_text(pictures)] * (pictures > 0) + [_html_text(texts)] * (texts > 0)
+        return _read_plan(root, warnings, options, budget)
 
 
 @contextmanager
@@ -127,10 +129,18 @@ def _picture_text(pictures: int) -> str:
     return f"the SVG has {subject}, not read: if the plan is a picture, send that PNG or JPEG itself"
 
 
-def _read_plan(root: Element, pictures: int, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """Read the plan, without embedded pictures."""
+def _has_text(element: Element) -> bool:
+    return any(text.strip() for text in element.itertext())
+
+
+def _html_text(texts: int) -> str:
+    return f"{texts} texts are HTML (foreignObject) and are not read, such as names of rooms: export them as plain text"
+
+
+def _read_plan(root: Element, warnings: list[str], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read the plan; `warnings` are about what is left out."""
     (unit_m, paper_m), own = _size_on_paper(root), _own_scale(root)
-    builder = ReportBuilder("svg", warnings=[_picture_text(pictures)] if pictures else [])
+    builder = ReportBuilder("svg", warnings=warnings)
     drawing = _read_drawing(root, options, builder, budget)
     if options.crop is not None:
         drawing = drawing.cropped(options.crop)
