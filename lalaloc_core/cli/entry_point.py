@@ -76,6 +76,10 @@ def _check_written(values: Mapping[str, object]) -> None:
     given = [(name, path) for name, value in values.items() for path in (value if isinstance(value, list) else [value])]
     paths = [(name, path) for name, path in given if isinstance(path, Path) and os.path.exists(path)]
     read = [path for name, path in paths if name not in (*_WRITTEN, "bundle")]
+    for path in [path for path in read if path.suffix.lower() in (".yaml", ".yml") and path.is_file()]:
+        from lalaloc_core.importers.formats.ros import map_picture
+
+        read += [picture] if (picture := map_picture(path)).exists() else []
     for out in (path for name, path in paths if name in _WRITTEN and os.path.isfile(path)):
         # Of a folder, the pictures are read.
         folder = out.parent if out.suffix.lower() == ".png" else out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,6 +95,16 @@ def write_file(path: Path, content: str | bytes) -> None:
         path.write_bytes(content if isinstance(content, bytes) else content.encode(errors="replace"))
     except OSError as error:
         raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error
+
+
+def check_overwritten(files: Iterable[Path], read: Iterable[Path], *, replace: bool = True) -> None:
+    """Refuse to write over files that are read, and over others that exist unless they may be replaced."""
+    sources = [path for path in read if path.exists()]
+    for file in filter(Path.exists, files):
+        if any(map(file.samefile, sources)):
+            raise InvalidInputError(f"'{file}' is read and never changed; write another file")
+        if not replace:
+            raise InvalidInputError(f"'{file}' exists; choose another name, or add --replace to write over it")
 
 
 def check_picture_name(out: Path, option: str = "--out") -> None:

@@ -12,7 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.options import BUNDLE, add_options
-from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
+from lalaloc_core.cli.plan_files import (
+    add_plan_options,
+    check_overwritten,
+    check_picture_name,
+    read_plan,
+    read_plans,
+    write_picture,
+)
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 from lalaloc_core.shown_text import printable
@@ -26,6 +33,7 @@ _IMPORT_OPTIONS = """
 -o, --out FILE: file to write (default: standard output)
 --all-levels: write a plan of every level with rooms to the folder --out
 --debug PICTURE: draw what was read from a drawing or picture, .png or .svg
+--replace: write over files that exist, with --all-levels or --debug
 """
 _CHECK_OPTIONS = f"""
 --json: print JSON
@@ -65,12 +73,18 @@ def _import(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--all-levels needs a folder for the plans; add --out FOLDER")
     from lalaloc_core.importers import without_storeys_beside
 
+    if arguments.debug is not None:
+        check_picture_name(arguments.debug, "--debug")
+        check_overwritten([arguments.debug], [], replace=arguments.replace)
     plans: Sequence[ImportedPlan] = (
         _read_traced(arguments) if arguments.debug else read_plans(arguments.file, arguments)
     )
     plans = plans if arguments.all_levels else without_storeys_beside(plans)
     # Write before printing: a reader such as `head` may close the pipe.
-    written = [] if arguments.out is None else _write_plans(plans, _files(plans, arguments))
+    written = [] if arguments.out is None else _files(plans, arguments)
+    # A single file has the name that was asked for.
+    check_overwritten(written, [arguments.file], replace=arguments.replace or written == [arguments.out])
+    _write_plans(plans, written)
     for plan in plans:
         heading = "" if plan.level is None else f"level '{plan.level.name}': "
         print(f"{heading}{json.dumps(plan.report.to_dict(), ensure_ascii=False, indent=1)}", file=sys.stderr)
@@ -85,7 +99,6 @@ def _read_traced(arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
     from lalaloc_core.draw.plan_overlays import trace_svg
     from lalaloc_core.importers import Trace
 
-    check_picture_name(arguments.debug, "--debug")
     trace = Trace()
     try:
         return read_plans(arguments.file, arguments, trace)
@@ -111,14 +124,13 @@ def _file_name(text: str) -> str:
     return re.sub(r"[^\w-]+", "-", text.casefold()).strip("-") or "level"
 
 
-def _write_plans(plans: Sequence[ImportedPlan], files: Sequence[Path]) -> Sequence[Path]:
+def _write_plans(plans: Sequence[ImportedPlan], files: Sequence[Path]) -> None:
     try:
-        files[0].parent.mkdir(parents=True, exist_ok=True)
-        for file, plan in zip(files, plans, strict=True):
+        for file, plan in zip(files, plans, strict=False):
+            file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(json.dumps(plan.document, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise InvalidInputError(f"'{error.filename}' cannot be written: {error.strerror}") from error
-    return files
 
 
 def _check(arguments: argparse.Namespace) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +23,7 @@ from lalaloc_core.importers import export_plan
 from tests.importers.conftest import FLAT, dxf_file
 from tests.importers.test_pictures import hall_beside_a_photograph, open_hall
 
+FAULTS = Path(__file__).parent / "faults"
 ROOM = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]]}}
 
 
@@ -29,6 +32,11 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "flat.json"
     path.write_text(json.dumps(FLAT), encoding="utf-8")
     return path
+
+
+def _two_levels() -> str:
+    rooms = [ROOM | {"properties": {"indoor": "room", "level": level}} for level in ("Attic", "2")]
+    return json.dumps({"type": "FeatureCollection", "units": "m", "features": rooms})
 
 
 def _run(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[bytes]:
@@ -102,14 +110,41 @@ def test_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_every_level_is_written_to_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file, folder = tmp_path / "Duplex.geojson", tmp_path / "plans" / "duplex"
-    rooms = [ROOM | {"properties": {"indoor": "room", "level": level}} for level in ("Attic", "2")]
-    file.write_text(json.dumps({"type": "FeatureCollection", "units": "m", "features": rooms}), encoding="utf-8")
+    file.write_text(_two_levels(), encoding="utf-8")
     assert main(["plan", "import", str(file), "--all-levels"]) == 2
     assert "add --out FOLDER" in capsys.readouterr().err
     assert main(["plan", "import", str(file), "--all-levels", "-o", str(folder)]) == 0
     written = sorted(folder.iterdir())
     assert capsys.readouterr().out.split() == [str(folder / "attic.json"), str(folder / "level-2.json")]
     assert [FloorPlan.from_json(path.read_bytes()).name for path in written] == ["Duplex – Attic", "Duplex – Level 2"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("plan import attic.json --all-levels --replace --out .", "'attic.json' is read and never changed"),
+        ("plan import home-1.json --out home.json", "'home-1.json' is read"),
+        ("plan import home-1.json --all-levels --out .", "'attic.json' exists; choose another name, or add --replace"),
+        ("plan import home-1.json --debug keep.svg", "'keep.svg' exists"),
+        ("plan draw ros_glass.yaml --out ros_glass.png", "'ros_glass.png' is read"),
+        ("localise attic.json keep-0.svg keep-1.svg --out keep.svg", "'keep-0.svg' is read"),
+        ("encode kitchen.features", "'kitchen.features' is read"),
+    ],
+)
+def test_no_file_is_overwritten_unasked(
+    arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("attic.json", "home-1.json"):
+        (tmp_path / name).write_text(_two_levels(), encoding="utf-8")
+    for name in ("keep.svg", "keep-0.svg", "kitchen.features"):
+        (tmp_path / name).write_text(name)
+    for name in ("ros_glass.yaml", "ros_glass.png"):
+        shutil.copy(FAULTS / name, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with contextlib.chdir(tmp_path):
+        assert main(arguments.split()) == 2
+    assert message in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_plan_without_levels_is_written_to_a_folder(file: Path, tmp_path: Path):

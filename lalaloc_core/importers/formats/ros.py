@@ -69,12 +69,16 @@ def read_frame(source: Mapping[str, bytes]) -> MapFrame:
     return _open(source, Budget(DEFAULT_IMPORT_LIMITS)).frame
 
 
+def map_picture(yaml_file: Path) -> Path:
+    """Return the path of the picture that the YAML file of a map names."""
+    return yaml_file.parent / _text(_settings(yaml_file.read_bytes()), "image")
+
+
 def map_files(yaml_file: Path) -> dict[str, bytes]:
     """Return the files of a map by name: a YAML file, and the picture that it names."""
     try:
-        content = yaml_file.read_bytes()
-        picture = yaml_file.parent / _text(_settings(content), "image")
-        return {yaml_file.name: content, picture.name: picture.read_bytes()}
+        picture = map_picture(yaml_file)
+        return {file.name: file.read_bytes() for file in (yaml_file, picture)}
     except OSError as error:
         raise InvalidFloorPlanError(f"'{error.filename}' cannot be read: {error.strerror}") from error
 
