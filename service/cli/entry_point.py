@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import select
+import signal
 import socket
 import sys
+import threading
 import uuid
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -61,6 +65,7 @@ def serve(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigError: an invalid setting, or a public address without keys.
     """
+    _end_with_terminal()
     settings = Settings.load()
     if arguments.lan:
         settings = settings.with_values(api_keys=True)
@@ -86,6 +91,30 @@ def serve(arguments: argparse.Namespace) -> int:
         app = create_app(settings)
         Server(server_config(app, settings, certificate), app, settings).run(sockets=[listener])
     return 0
+
+
+def _end_with_terminal() -> None:
+    """Stop in order when the terminal closes, so that links for phones end too; not if that is ignored, as by nohup."""
+
+    def stop(*_: object) -> None:
+        # The end of the shell can send it again, and a second signal ends the process at once.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        signal.raise_signal(signal.SIGTERM)
+
+    def watch() -> None:
+        closed = select.poll()
+        closed.register(0, 0)
+        closed.poll()
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_DFL:
+        return
+    signal.signal(signal.SIGHUP, stop)
+    # The system tells only the first process of a terminal: with `ssh -t` this is make, which waits for this one.
+    with suppress(OSError):
+        # Fails without a terminal, and for that of another session.
+        os.tcgetpgrp(0)
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _check_parts(settings: Settings, *, example: bool) -> None:

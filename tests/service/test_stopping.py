@@ -89,6 +89,37 @@ def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_make_serve_ends_with_its_terminal(tiny_bundle: Path, tmp_path: Path, *, is_closed: bool) -> None:
+    terminal, own_end = os.openpty()
+    given = [f"BIN={Path(sys.executable).parent}", "PORT=0", "--old-file=.venv/.serving"]
+    command = ["setsid", "--ctty", "make", "--silent", "serve", *given]
+    environment = environment_of(tiny_bundle, tmp_path / "data")
+    process = subprocess.Popen(command, env=environment, cwd=ROOT, stdin=own_end, stdout=own_end, stderr=own_end)
+    os.close(own_end)
+
+    def running() -> list[str]:
+        command = ["ps", "-o", "pid=,stat=", "-s", str(process.pid)]
+        listed = subprocess.run(command, capture_output=True, text=True, check=False)
+        return [line for line in listed.stdout.splitlines() if "Z" not in line]
+
+    try:
+        with open(terminal, "r+b", buffering=0) as screen, httpx.Client(timeout=60.0) as client:
+            address = screen.readline().decode().strip()
+            wait_for(lambda: client.get(f"{address}/readyz").status_code == 200)
+            # Make, the service and its workers.
+            assert len(running()) > 2
+            if not is_closed:
+                screen.write(b"\x03")
+                wait_for(lambda: not running())
+        wait_for(lambda: not running())
+    finally:
+        for listed in running():
+            os.kill(int(listed.split()[0]), signal.SIGKILL)
+        process.wait(10.0)
+
+
+@pytest.mark.slow
 def test_stop_ends_running_imports(tiny_bundle: Path, tmp_path: Path) -> None:
     document = new_dxf()
     document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], close=True, dxfattribs={"layer": "ROOM"})
