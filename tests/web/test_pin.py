@@ -97,6 +97,18 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+def test_menu_lists_more_folders_than_a_page_of_the_list_has(desktop: Visit) -> None:
+    plan_id = upload(desktop.client, FLAT | {"name": "Visited often"})
+    documents = [{"floorplan_id": plan_id, "name": f"Visit {number}"} for number in range(105)]
+    first, *_ = [desktop.client.post("/albums", json=document).json()["id"] for document in documents]
+    page = desktop.open("/pin")
+    expect(page.locator("#plan-choice option", has_text="Visit ")).to_have_count(len(documents) + 1)
+    page.locator("#plan-choice").select_option(f"album:{first}")
+    expect(page.locator("#pin-state")).to_contain_text("0 of 0 photographs")
+    desktop.client.delete(f"/floorplans/{plan_id}")
+
+
+@pytest.mark.slow
 def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -> None:
     page = pin_files(desktop, [grey, FILES[1]])
     _assert_accessible(page)

@@ -7,7 +7,7 @@ import { connectKeyDialog } from "./key_dialog";
 import { attempt, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
-import { choicesOf, Floors, folderOption, type Row } from "./pin_floors";
+import { Floors, folderOption, listPlaces, type Row } from "./pin_floors";
 import { fanned, type PinActions, pinOf } from "./pin_map";
 import { added, photographsOf, saveCopies, type Thumbnail, thumbnailOf, wantedOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
@@ -83,13 +83,10 @@ class PinPage {
 
   /** List plans and venues; show the album that the address names, or the newest plan. */
   private async begin(): Promise<void> {
-    const [{ floorplans }, { venues }, { albums }] = await Promise.all([api.plans(), api.venues(), api.albums()]);
-    show(this.choice, choicesOf("Plans", "plan", floorplans), choicesOf("Venues", "venue", venues));
-    show(this.saved, ...albums.map(folderOption));
-    if (albums.length > 0) this.choice.append(this.saved);
+    for (const listRest of await listPlaces(this.choice, this.saved)) void this.guarded(listRest);
     const id = named("album");
     if (id !== null) await this.open(id);
-    else if (floorplans.length > 0) await this.choose(`plan:${floorplans[0]!.id}`);
+    else if (this.choice.value.startsWith("plan:")) await this.choose(this.choice.value);
   }
 
   private readonly guarded = (work: () => Promise<void>): Promise<void> => attempt(this.error, work);

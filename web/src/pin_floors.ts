@@ -1,7 +1,7 @@
 /** Plans that pins lie in: that of the album, or those of its venue, which are loaded when they are needed. */
 
 import { api } from "./api";
-import { h, s } from "./dom";
+import { h, s, show } from "./dom";
 import { nameIn } from "./plan_caption";
 import { boxOf, path } from "./plan_drawing";
 import type { Layout, Plan, PlanSummary, RoomLayout, Venue } from "./types";
@@ -16,10 +16,35 @@ export interface Floor {
   layout: Layout;
 }
 
-/** Return a group of a list of plans and venues; false if it is empty. */
-export function choicesOf(label: string, kind: string, places: (PlanSummary | Venue)[]): HTMLElement | false {
-  const options = places.map((place) => h("option", { value: `${kind}:${place.id}` }, nameIn(place, places)));
-  return options.length > 0 && h("optgroup", { label }, ...options);
+const choicesOf = (kind: string, places: (PlanSummary | Venue)[]): HTMLOptionElement[] =>
+  places.map((place) => h("option", { value: `${kind}:${place.id}` }, nameIn(place, places)));
+
+/** List the first page of something in a group of choices; return a function that lists the others. */
+async function listPages<P extends { next_cursor: string | null }>(
+  group: HTMLOptGroupElement,
+  read: (name: string, cursor: string | null) => Promise<P>,
+  optionsOf: (page: P) => HTMLOptionElement[],
+): Promise<() => Promise<void>> {
+  let page = await read("", null);
+  group.append(...optionsOf(page));
+  return async () => {
+    while (page.next_cursor !== null) group.append(...optionsOf((page = await read("", page.next_cursor))));
+  };
+}
+
+/** List plans, venues and saved folders as groups of choices, the first page of each; return functions for the others. */
+export async function listPlaces(
+  choice: HTMLSelectElement,
+  saved: HTMLOptGroupElement,
+): Promise<(() => Promise<void>)[]> {
+  const [plans, venues] = [h("optgroup", { label: "Plans" }), h("optgroup", { label: "Venues" })];
+  const rests = await Promise.all([
+    listPages(plans, api.plans, (page) => choicesOf("plan", page.floorplans)),
+    listPages(venues, api.venues, (page) => choicesOf("venue", page.venues)),
+    listPages(saved, api.albums, (page) => page.albums.map(folderOption)),
+  ]);
+  show(choice, ...[plans, venues, saved].filter((group) => group.childElementCount > 0));
+  return rests;
 }
 
 /** Return a saved folder as a choice, by its date, which a long name would cut off, and its name. */
