@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, TURN, add_options, check_sources
-from lalaloc_core.cli.plan_files import check_overwritten, check_picture_name, write_file, write_picture
+from lalaloc_core.cli.plan_files import check_free, check_picture_name, write_file, write_picture
 from lalaloc_core.cli.printing import print_json, print_warnings
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.shown_text import printable
@@ -56,7 +56,7 @@ def _encode(arguments: argparse.Namespace) -> None:
     check_sources(arguments)
     if arguments.out is not None and len(arguments.photographs) > 1:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
-    check_overwritten((path.with_suffix(".features") for path in arguments.photographs), arguments.photographs)
+    check_free((path.with_suffix(".features") for path in arguments.photographs), arguments.photographs)
     stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
     manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
     if arguments.turn is not None:

@@ -12,13 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lalaloc_core.cli.answer_files import FILES, check_file_options, write_files
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, PLAN, TURN, add_options, check_sources, heading, tolerance
-from lalaloc_core.cli.plan_files import (
-    add_plan_options,
-    check_overwritten,
-    check_picture_name,
-    read_plan,
-    write_picture,
-)
+from lalaloc_core.cli.plan_files import add_plan_options, check_free, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.shown_text import probability_text
@@ -75,18 +69,13 @@ def _localise(arguments: argparse.Namespace) -> None:
     check_sources(arguments)
     if arguments.turn is not None and arguments.heading is not None:
         raise InvalidInputError("--heading does not go with --turn, whose headings are searched; leave it out")
-    several, out = len(arguments.photographs) > 1, arguments.out
-    pictures = [out] if out is not None else []
-    if out is not None:
-        check_picture_name(out)
-        if several:
-            pictures = [out.with_stem(f"{out.stem}-{number}") for number in range(len(arguments.photographs))]
-            check_overwritten(pictures, arguments.photographs)
+    if arguments.out is not None:
+        check_picture_name(arguments.out)
     plan = read_plan(arguments.plan, arguments).plan()
     if arguments.camera_height is not None:
         check_height_m(plan, arguments.camera_height)
     check_file_options(arguments, plan)
-    stated = stated_camera(arguments)
+    stated, several = stated_camera(arguments), len(arguments.photographs) > 1
     documents, rows, places, warnings = [], [], [], []
     model = LaLaLoc(arguments.bundle)
     find = _answers if arguments.turn is None else _turn_answers
@@ -99,8 +88,10 @@ def _localise(arguments: argparse.Namespace) -> None:
         drawn = drawn_answer(answer)
         rows.append(_row(document, drawn))
         places.append((path.stem, drawn.camera))
-        if pictures:
-            _draw(drawn, path, pictures[number], arguments, stated, path.name if several else None)
+        if arguments.out is not None:
+            out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
+            check_free([out], arguments.photographs)
+            _draw(drawn, path, out, arguments, stated, path.name if several else None)
     print_warnings(warnings)
     write_files(arguments, plan, documents, places)
     if arguments.json:

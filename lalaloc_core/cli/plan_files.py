@@ -97,7 +97,7 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise InvalidInputError(f"'{path}' cannot be written: {error.strerror}") from error
 
 
-def check_overwritten(files: Iterable[Path], read: Iterable[Path], *, replace: bool = True) -> None:
+def check_free(files: Iterable[Path], read: Iterable[Path], *, replace: bool = True) -> None:
     """Refuse to write over files that are read, and over others that exist unless they may be replaced."""
     sources = [path for path in read if path.exists()]
     for file in filter(Path.exists, files):

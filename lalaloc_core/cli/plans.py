@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lalaloc_core.cli.options import BUNDLE, add_options
 from lalaloc_core.cli.plan_files import (
     add_plan_options,
-    check_overwritten,
+    check_free,
     check_picture_name,
     read_plan,
     read_plans,
@@ -75,7 +75,7 @@ def _import(arguments: argparse.Namespace) -> None:
 
     if arguments.debug is not None:
         check_picture_name(arguments.debug, "--debug")
-        check_overwritten([arguments.debug], [], replace=arguments.replace)
+        check_free([arguments.debug], [], replace=arguments.replace)
     plans: Sequence[ImportedPlan] = (
         _read_traced(arguments) if arguments.debug else read_plans(arguments.file, arguments)
     )
@@ -83,7 +83,7 @@ def _import(arguments: argparse.Namespace) -> None:
     # Write before printing: a reader such as `head` may close the pipe.
     written = [] if arguments.out is None else _files(plans, arguments)
     # A single file has the name that was asked for.
-    check_overwritten(written, [arguments.file], replace=arguments.replace or written == [arguments.out])
+    check_free(written, [arguments.file], replace=arguments.replace or written == [arguments.out])
     _write_plans(plans, written)
     for plan in plans:
         heading = "" if plan.level is None else f"level '{plan.level.name}': "
