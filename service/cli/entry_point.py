@@ -15,7 +15,7 @@ import sys
 import threading
 import uuid
 from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -96,24 +96,15 @@ def serve(arguments: argparse.Namespace) -> int:
 def _end_with_terminal() -> None:
     """Stop in order when the terminal closes, so that links for phones end too; not if that is ignored, as by nohup."""
 
-    def stop(*_: object) -> None:
-        # The end of the shell can send it again, and a second signal ends the process at once.
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        signal.raise_signal(signal.SIGTERM)
-
     def watch() -> None:
         closed = select.poll()
         closed.register(0, 0)
         closed.poll()
-        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), signal.SIGTERM)
 
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_DFL:
-        return
-    signal.signal(signal.SIGHUP, stop)
-    # The system tells only the first process of a terminal: with `ssh -t` this is make, which waits for this one.
-    with suppress(OSError):
-        # Fails without a terminal, and for that of another session.
-        os.tcgetpgrp(0)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL and os.isatty(0):
+        # Its signal does not reach all processes: with `ssh -t` only make, which waits for this one.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         threading.Thread(target=watch, daemon=True).start()
 
 

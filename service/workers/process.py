@@ -62,8 +62,8 @@ def serve_jobs(
             what a job was given as results, and a worker whose function raised one continues with the next job.
         is_fit: called after each job; the worker ends, and is replaced, when it returns False.
     """
-    # Ctrl-C, a closed terminal or a service manager reach the whole group; the parent decides when its workers end.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    # Ctrl-C and a service manager's signal reach the whole process group, but the parent decides when its workers end.
+    for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     _die_with_parent()
     try:

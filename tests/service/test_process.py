@@ -206,9 +206,7 @@ def test_link_for_phones_has_a_key_that_ends_with_the_run(tiny_bundle: Path, tmp
             client.headers["Authorization"] = f"Bearer {key}"
             assert client.get("/floorplans").json()["floorplans"][0]["name"] == "Example flat"
     finally:
-        # As when the terminal closes and its shell ends.
-        for _ in range(2):
-            process.send_signal(signal.SIGHUP)
+        process.terminate()
         process.wait(30.0)
     with closing(open_store(Settings(data_dir=tmp_path))) as store:
         assert [run.revoked_at is None for run in store.keys.list_keys()] == [False]

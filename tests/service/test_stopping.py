@@ -9,9 +9,9 @@ import socket
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
@@ -89,34 +89,26 @@ def test_stop_finishes_requests_in_work(tiny_bundle: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_closed", [True, False])
-def test_make_serve_ends_with_its_terminal(tiny_bundle: Path, tmp_path: Path, *, is_closed: bool) -> None:
+@pytest.mark.parametrize("end", [os.close, lambda terminal: os.write(terminal, b"\x03")], ids=["closed", "Ctrl-C"])
+def test_make_serve_ends_with_its_terminal(tiny_bundle: Path, tmp_path: Path, end: Callable[[int], object]) -> None:
     terminal, own_end = os.openpty()
     given = [f"BIN={Path(sys.executable).parent}", "PORT=0", "--old-file=.venv/.serving"]
-    command = ["setsid", "--ctty", "make", "--silent", "serve", *given]
     environment = environment_of(tiny_bundle, tmp_path / "data")
+    command = ["setsid", "--ctty", "make", "serve", *given]
     process = subprocess.Popen(command, env=environment, cwd=ROOT, stdin=own_end, stdout=own_end, stderr=own_end)
     os.close(own_end)
-
-    def running() -> list[str]:
-        command = ["ps", "-o", "pid=,stat=", "-s", str(process.pid)]
-        listed = subprocess.run(command, capture_output=True, text=True, check=False)
-        return [line for line in listed.stdout.splitlines() if "Z" not in line]
-
     try:
-        with open(terminal, "r+b", buffering=0) as screen, httpx.Client(timeout=60.0) as client:
-            address = screen.readline().decode().strip()
-            wait_for(lambda: client.get(f"{address}/readyz").status_code == 200)
-            # Make, the service and its workers.
-            assert len(running()) > 2
-            if not is_closed:
-                screen.write(b"\x03")
-                wait_for(lambda: not running())
-        wait_for(lambda: not running())
+        address = os.read(terminal, 100).decode().strip()
+        wait_for(lambda: httpx.get(f"{address}/readyz", timeout=60.0).status_code == 200)
+        session = subprocess.run(["ps", "-o", "pid=", "-s", str(process.pid)], stdout=subprocess.PIPE, check=True)
+        pids = [int(pid) for pid in session.stdout.split()]
+        # Make, the service and its workers.
+        assert len(pids) > 2
+        end(terminal)
+        wait_for(lambda: process.poll() is not None and not any(map(alive, pids)))
     finally:
-        for listed in running():
-            os.kill(int(listed.split()[0]), signal.SIGKILL)
-        process.wait(10.0)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.slow
