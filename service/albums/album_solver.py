@@ -28,6 +28,8 @@ _MAX_ATTEMPTS = 5
 # Pause (s) after an attempt that can succeed later, and limit of the pause after a solve, which is as long as the
 # solve, so that an album that grows does not keep a core busy; a correction, which somebody looks at, waits less.
 _RETRY_S, _MAX_REST_S, _MAX_REST_BEFORE_CORRECTION_S = 2.0, 3.0, 0.2
+# Turn (s) of an album while others wait for their tenants' first.
+_TURN_S = 5.0
 # Solutions of albums that cannot succeed until something changes.
 _FINAL = (errors.PlanFailedError, errors.VenueUnsearchableError, InvalidInputError)
 # Errors that pass.
@@ -46,7 +48,7 @@ _SERVICE = ""
 
 
 class AlbumSolver:
-    """Solver of the albums of all tenants; for one event loop.
+    """Solver of the albums of all tenants, which take turns if they are more than are solved at a time.
 
     `reads` are threads for the database, whose calls can read and write the features of an album.
     """
@@ -67,6 +69,9 @@ class AlbumSolver:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._running: dict[str, asyncio.Task[None]] = {}
         self._corrected: dict[str, asyncio.Event] = {}
+        # Begin and progress of each tenant's turn that is not over, and tenants that had one in this round.
+        self._turns: dict[str, tuple[float, AlbumProgress]] = {}
+        self._served: set[str] = set()
 
     def wake(self, corrected: str | None = None) -> None:
         """Look for albums to solve now, from any thread; those that other replicas changed are found at intervals.
@@ -100,17 +105,33 @@ class AlbumSolver:
             await asyncio.gather(*self._running.values(), return_exceptions=True)
 
     async def _begin_due(self) -> None:
-        """Start a task for each album that is due, of tenants without one."""
-        if (room := AT_A_TIME - len(self._running)) <= 0:
-            return
-        find, sha256 = self._store.album_jobs.due, self._localiser.model.sha256
-        for tenant, album_id in await self._reads.run(_SERVICE, find, sha256, list(self._running), room):
+        """Start a task for each album that is due, of tenants without one; if there is no room, end a turn for them."""
+        room, find = AT_A_TIME - len(self._running), self._store.album_jobs.due
+        sha256, begun = self._localiser.model.sha256, list(self._running)
+        due = await self._reads.run(_SERVICE, find, sha256, begun, max(room, 1), list(self._served))
+        if due and room <= 0:
+            self._end_turn()
+        for tenant, album_id in due[:room]:
+            if tenant in self._served:
+                # All that wait had a turn.
+                self._served.clear()
+            self._served.add(tenant)
             task = self._running[tenant] = asyncio.create_task(self._solve(tenant, album_id))
             task.add_done_callback(lambda _, tenant=tenant: self._end(tenant))
 
+    def _end_turn(self) -> None:
+        """Stop the solve whose turn is over for longest, if any; it goes on with what it found at its next turn.
+
+        Each turn compares a photograph at least, and the assignment of all to rooms is not interrupted.
+        """
+        latest = monotonic() - _TURN_S
+        over = ((begin, tenant) for tenant, (begin, solve) in self._turns.items() if 0.0 < solve.share < 1.0)
+        if (first := min(over, default=None)) is not None and first[0] <= latest:
+            self._turns.pop(first[1])[1].stopped = True
+
     def _end(self, tenant: str) -> None:
-        self._running.pop(tenant, None)
-        self._corrected.pop(tenant, None)
+        for known in (self._running, self._corrected, self._turns):
+            known.pop(tenant, None)
         self._changed.set()
 
     async def _solve(self, tenant: str, album_id: str) -> None:
@@ -122,6 +143,9 @@ class AlbumSolver:
             job = await self._reads.run(tenant, claim, album_id, self._owner, lease_s)
             if job is not None:
                 await self._attempt(job)
+                if tenant not in self._turns:
+                    # Others wait.
+                    return
         except errors.StoreUnavailableError:
             await asyncio.sleep(_RETRY_S)
         except Exception:
@@ -136,6 +160,7 @@ class AlbumSolver:
     async def _attempt(self, job: AlbumJob) -> None:
         """Solve a claimed album; its lease ends in any case, at the latest by itself."""
         progress = AlbumProgress()
+        self._turns[job.album.tenant] = monotonic(), progress
         heartbeat = asyncio.create_task(self._renew(job, progress))
         finished = failed = False
         try:

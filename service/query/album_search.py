@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from time import thread_time
 
-from lalaloc_core.errors import InvalidPhotographError
+from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.album.entry import AlbumPhotograph, photograph_entry, read_correction, read_entry
 from lalaloc_core.localise.album.evidence import AlbumMemory
@@ -35,6 +36,8 @@ from service.storage.records import PlanRecord, VenueRecord
 AT_A_TIME = 4
 # Memory of what solves found about single photographs, all albums together.
 _MEMORY_BYTES = 256 * 2**20
+# CPU time (s) of an album until it is solved, in all its turns; the largest ones need some minutes.
+_MAX_CPU_S = 3600.0
 # Photographs that the plans of a large venue are chosen by.
 _CHOOSING = 8
 
@@ -114,6 +117,7 @@ class AlbumSearch:
                 stated.append(replace(entry, correction=correction))
         stored = {part.id: part.evidence for part in query.photographs if part.evidence is not None}
         memory = self._memories.pop(query.album_id) or AlbumMemory(stored=stored)
+        begin_s, memory.spent_s = thread_time() - memory.spent_s, 0.0
 
         def hold() -> None:
             for semaphore in self._cores:
@@ -129,8 +133,12 @@ class AlbumSearch:
             held.close()
             hold()
             # Looked at last: of several solves that stop and wait for each other, none computes any more.
+            spent_s = thread_time() - begin_s
             if query.progress.stopped:
+                memory.spent_s = spent_s
                 raise _Stopped
+            if spent_s > _MAX_CPU_S:
+                raise InvalidInputError(f"it took {_MAX_CPU_S:g} s of CPU time, which is the limit: divide the album")
 
         try:
             with ExitStack() as held:

@@ -55,8 +55,10 @@ class AlbumJobs:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def due(self, model_sha256: str, tenants: Collection[str], limit: int) -> list[tuple[str, str]]:
-        """Return tenant and id of albums that no replica solves, at most one per tenant."""
+    def due(
+        self, model_sha256: str, tenants: Collection[str], limit: int, later: Collection[str] = ()
+    ) -> list[tuple[str, str]]:
+        """Return tenant and id of albums that no replica solves, one per tenant but `tenants`, those `later` last."""
         columns = ALBUMS.c
         live = self._database.is_live(columns.lease_until_s, columns.lease_s)
         first = func.row_number().over(partition_by=columns.tenant, order_by=(columns.updated_at, columns.id))
@@ -66,7 +68,8 @@ class AlbumJobs:
             .where(columns.tenant.not_in(list(tenants)))
             .subquery()
         )
-        query = select(waiting.c.tenant, waiting.c.id).where(waiting.c.place == 1).order_by(waiting.c.updated_at)
+        query = select(waiting.c.tenant, waiting.c.id).where(waiting.c.place == 1)
+        query = query.order_by(waiting.c.tenant.in_(list(later)), waiting.c.updated_at)
         return [(row.tenant, row.id) for row in self._database.rows(query.limit(limit))]
 
     def claim(self, album_id: str, owner: str, lease_s: float) -> AlbumJob | None:

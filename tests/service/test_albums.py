@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 import zipfile
+from collections import Counter
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -30,10 +31,12 @@ from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, Sug
 from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
+from service.albums import album_solver
 from service.albums.album_solver import AlbumSolver
 from service.errors import UnanchoredPlanError
 from service.query import AlbumOutcome, AlbumProgress, album_search
 from service.query.album_answers import compose_outcome
+from service.query.album_search import AT_A_TIME
 from service.routes import album_photographs
 from service.schemas.albums import PinAnswer
 from service.storage.album_rows import NewPhotograph
@@ -644,6 +647,10 @@ def test_album_that_cannot_be_solved_states_why(
             add(client, album_id, pictures[:1])
             wait_for(lambda: client.get(f"/albums/{album_id}").json()["state"] == "failed")
             assert client.get(f"/albums/{album_id}").json()["reason"] == "the album is impossible"
+            patch.undo()
+            patch.setattr(album_search, "_MAX_CPU_S", 0.0)
+            add(client, album_id, pictures[2:3])
+            wait_for(lambda: "divide the album" in client.get(f"/albums/{album_id}").text)
         add(client, album_id, pictures[1:2])
         wait_until_solved(client, album_id)
         assert client.get(f"/albums/{album_id}").json()["reason"] is None
@@ -674,32 +681,53 @@ def solver_of(**jobs: Any) -> AlbumSolver:
     return AlbumSolver(rest, rest, rest, rest, rest, rest)
 
 
-def test_solve_of_a_deleted_album_does_not_fail(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def stopped(_: Any, _job: Any, progress: Any) -> None:
+def job_of(tenant: str, *_: object) -> Any:
+    return SimpleNamespace(album=SimpleNamespace(id=tenant, tenant=tenant))
+
+
+def test_albums_take_turns_and_a_deleted_one_does_not_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared, tenants = Counter[str](), [str(number) for number in range(AT_A_TIME + 3)]
+
+    async def until_stopped(_: Any, job: Any, progress: Any) -> None:
         while not progress.stopped:
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.001)
+            compared[job.album.tenant] += 1
+            progress.share = 0.5
         raise ValueError("stopped")
 
-    monkeypatch.setattr(AlbumSolver, "_pin", stopped)
-    job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
-    solver = solver_of(renew=lambda *_: False, release=lambda *_, **__: None)
-    asyncio.run(solver._attempt(job))
+    async def until_all_advanced() -> None:
+        solving = asyncio.create_task(solver_of(due=due, claim=job_of, renew=lambda *_: True, release=release).run())
+        while min(compared[tenant] for tenant in tenants) < 100:
+            await asyncio.sleep(0.01)
+        solving.cancel()
+
+    def due(_: str, begun: list[str], limit: int, later: list[str]) -> list[tuple[str, str]]:
+        return [(one, one) for one in sorted(tenants, key=later.__contains__) if one not in begun][:limit]
+
+    release = Mock()
+    monkeypatch.setattr(AlbumSolver, "_pin", until_stopped)
+    monkeypatch.setattr(album_solver, "_TURN_S", 0.02)
+    asyncio.run(asyncio.wait_for(until_all_advanced(), 60.0))
+    # The lease of a deleted album is lost.
+    asyncio.run(solver_of(renew=lambda *_: False, release=release)._attempt(job_of("deleted")))
+    assert not any(call.kwargs["failed"] for call in release.call_args_list)
 
 
 def test_heartbeat_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
     renew = Mock(side_effect=[ValueError("damaged"), False])
-    job: Any = SimpleNamespace(album=SimpleNamespace(id="a", tenant="t"))
     progress = AlbumProgress()
-    asyncio.run(asyncio.wait_for(solver_of(renew=renew)._renew(job, progress), 10.0))
+    asyncio.run(asyncio.wait_for(solver_of(renew=renew)._renew(job_of("a"), progress), 10.0))
     assert progress.stopped
     assert "renewing a lease failed" in caplog.text
 
 
-def test_solver_goes_on_after_an_error() -> None:
+def test_solver_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
     due = Mock(side_effect=[ValueError("damaged"), asyncio.CancelledError()])
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(solver_of(due=due).run())
+    assert "looking for albums to solve failed" in caplog.text
 
 
 def test_pin_with_all_suggestions_takes_no_more_than_counts_as_stored() -> None:

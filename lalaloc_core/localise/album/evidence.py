@@ -64,12 +64,14 @@ class AlbumMemory:
         evidence: arrays of each photograph, by id.
         stored: evidence as `to_bytes` wrote it, by id, which the next solve uses.
         links: matches and turn by pair of ids; None for pairs that do not overlap.
+        spent_s: CPU time of solves that were stopped since the last one that ended, which callers measure.
     """
 
     key: str = ""
     evidence: dict[str, Arrays] = field(default_factory=dict)
     stored: Mapping[str, bytes] = field(default_factory=dict)
     links: dict[tuple[str, str], tuple[int, float] | None] = field(default_factory=dict)
+    spent_s: float = 0.0
 
     def use(self, ground: AlbumGround, manifest: Manifest) -> None:
         """Drop everything that is of another ground or model."""
