@@ -49,7 +49,7 @@ class Stored:
     def of(cls, caller: Caller, plan_id: str, venue_id: str, venue_etag: str, member_ids: Sequence[str]) -> Stored:
         """Return a plan and a venue that are ready, and store an album of the plan."""
         plan_etag = caller.send("GET", f"/floorplans/{plan_id}").etag
-        return cls(plan_id, plan_etag, _store_album(caller, plan_id), venue_id, venue_etag, member_ids)
+        return cls(plan_id, plan_etag, store_album(caller, plan_id), venue_id, venue_etag, member_ids)
 
 
 Work = Callable[[Caller, Stored, int], None]
@@ -59,7 +59,8 @@ Work = Callable[[Caller, Stored, int], None]
 class Load:
     """Work of one tenant: the requests of one round, proportional to a size, by default that of the largest input.
 
-    `routes` are as in `openapi.yaml`; `refusals` refuse the input itself, besides too many requests.
+    `routes` are as in `openapi.yaml`; `refusals` refuse the input itself, besides too many requests. The other tenant
+    pins small albums, if `beside_albums`, instead of queries.
     """
 
     routes: tuple[str, ...]
@@ -69,6 +70,7 @@ class Load:
     plan: str = VERTICES_PLAN
     connections: int = 8
     refusals: frozenset[int] = frozenset()
+    beside_albums: bool = False
 
 
 def missing_routes() -> list[str]:
@@ -122,7 +124,7 @@ def store_venue(caller: Caller, homes: int) -> tuple[str, str, list[str]]:
     return created_id(answer), answer.etag, ids
 
 
-def _store_album(caller: Caller, plan_id: str, photographs: int = _PHOTOGRAPHS) -> str:
+def store_album(caller: Caller, plan_id: str, photographs: int = _PHOTOGRAPHS) -> str:
     """Store an album of spheres, wait until it is solved, and return its path; empty if it is refused."""
     if album := _create(caller, "/albums", _body({"floorplan_id": plan_id})):
         for first in range(0, photographs, _PHOTOGRAPHS):
@@ -295,11 +297,11 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **field
     return work
 
 
-def _sequence(*, padded: bool, venue: bool = False) -> Work:
+def _sequence(*, padded: bool, venue: bool = False, photographs: int = _PHOTOGRAPHS) -> Work:
     """Return the work of a sequence, `padded` to `size` tenths of a megabyte in total."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
-        files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS if padded else 0)),)
+        files = photographs * (("photo", _padded_picture(size * 10**5 // photographs if padded else 0)),)
         place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
         caller.send("POST", "/localise/sequence", *form((place, ("motion", "turn")), files))
 
@@ -384,7 +386,7 @@ def _follow_session(caller: Caller, stored: Stored, _size: int, *, venue: bool =
 
 
 def _pin_album(caller: Caller, stored: Stored, size: int) -> None:
-    if not (album := _store_album(caller, stored.plan_id, size)):
+    if not (album := store_album(caller, stored.plan_id, size)):
         return
     caller.send("GET", album)
     page = caller.send("GET", f"{album}/photographs")
@@ -514,6 +516,7 @@ LOADS = (
     ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
     Load(("POST /localise/sequence",), f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
+    Load(("POST /localise/sequence",), "18 photographs of a turn", _sequence(padded=False, photographs=18)),
     Load(("POST /localise/sequence",), "10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
     Load(
         ("POST /localise/sequence",), "10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44
@@ -532,6 +535,7 @@ LOADS = (
         _pin_album,
         500,
     ),
+    Load(("POST /albums",), "album of 500 spheres; beside it albums of 10", _pin_album, 500, beside_albums=True),
     Load((f"POST {_ALBUM}/copies",), f"10 spheres, {VERTICES_PLAN}", _copy_album),
     Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
     Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
