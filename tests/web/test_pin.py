@@ -99,10 +99,10 @@ def test_folder_is_pinned_corrected_and_undone(phone: Visit, tmp_path: Path) -> 
 @pytest.mark.slow
 def test_menu_lists_more_folders_than_a_page_of_the_list_has(desktop: Visit) -> None:
     plan_id = upload(desktop.client, FLAT | {"name": "Visited often"})
-    documents = [{"floorplan_id": plan_id, "name": f"Visit {number}"} for number in range(105)]
-    first, *_ = [desktop.client.post("/albums", json=document).json()["id"] for document in documents]
+    document = {"floorplan_id": plan_id, "name": "One of many"}
+    first, *_ = [desktop.client.post("/albums", json=document).json()["id"] for _ in range(105)]
     page = desktop.open("/pin")
-    expect(page.locator("#plan-choice option", has_text="Visit ")).to_have_count(len(documents) + 1)
+    expect(page.locator("#plan-choice option", has_text="One of many")).to_have_count(105)
     page.locator("#plan-choice").select_option(f"album:{first}")
     expect(page.locator("#pin-state")).to_contain_text("0 of 0 photographs")
     desktop.client.delete(f"/floorplans/{plan_id}")
