@@ -99,7 +99,7 @@ def test_make_serve_ends_with_its_terminal(tiny_bundle: Path, tmp_path: Path, en
     os.close(own_end)
     try:
         address = os.read(terminal, 100).decode().strip()
-        wait_for(lambda: httpx.get(f"{address}/readyz", timeout=60.0).status_code == 200)
+        wait_for(lambda: httpx.get(f"{address}/readyz", timeout=60.0).status_code == 200, 120.0)
         session = subprocess.run(["ps", "-o", "pid=", "-s", str(process.pid)], stdout=subprocess.PIPE, check=True)
         pids = [int(pid) for pid in session.stdout.split()]
         # Make, the service and its workers.
