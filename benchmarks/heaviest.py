@@ -516,7 +516,9 @@ LOADS = (
     ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
     Load(("POST /localise/sequence",), f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
-    Load(("POST /localise/sequence",), "18 photographs of a turn", _sequence(padded=False, photographs=18)),
+    Load(
+        ("POST /localise/sequence",), "18 photographs of a turn", _sequence(padded=False, photographs=18), connections=4
+    ),
     Load(("POST /localise/sequence",), "10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
     Load(
         ("POST /localise/sequence",), "10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44

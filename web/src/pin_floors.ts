@@ -21,7 +21,7 @@ const choicesOf = (kind: string, places: (PlanSummary | Venue)[]): HTMLOptionEle
 
 /** List the first page of something in a group of choices; return a function that lists the others. */
 async function listPages<P extends { next_cursor: string | null }>(
-  group: HTMLOptGroupElement,
+  group: HTMLElement,
   read: (name: string, cursor: string | null) => Promise<P>,
   optionsOf: (page: P) => HTMLOptionElement[],
 ): Promise<() => Promise<void>> {
@@ -33,10 +33,7 @@ async function listPages<P extends { next_cursor: string | null }>(
 }
 
 /** List plans, venues and saved folders as groups of choices, the first page of each; return functions for the others. */
-export async function listPlaces(
-  choice: HTMLSelectElement,
-  saved: HTMLOptGroupElement,
-): Promise<(() => Promise<void>)[]> {
+export async function listPlaces(choice: HTMLElement, saved: HTMLElement): Promise<(() => Promise<void>)[]> {
   const [plans, venues] = [h("optgroup", { label: "Plans" }), h("optgroup", { label: "Venues" })];
   const rests = await Promise.all([
     listPages(plans, api.plans, (page) => choicesOf("plan", page.floorplans)),
