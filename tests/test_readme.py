@@ -62,23 +62,33 @@ def test_targets_and_modules_in_commands_exist() -> None:
     assert [name for name in sorted(modules) if importlib.util.find_spec(name) is None] == []
 
 
-@pytest.mark.parametrize(
-    "command", [command for command in COMMANDS if command[0].endswith("lalaloc")], ids=lambda words: " ".join(words)
-)
-def test_options_in_commands_exist(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def _options() -> dict[tuple[str, ...], set[str]]:
+    """Return the options in all commands by program; `plan` and `lab` have subcommands."""
+    options: dict[tuple[str, ...], set[str]] = {}
+    for command in (command for command in COMMANDS if command[0].endswith("lalaloc")):
+        program = tuple(command[1 : 3 if command[1] in ("plan", "lab") else 2])
+        options.setdefault(program, set()).update(word for word in command[2:] if word.startswith("--"))
+    return options
+
+
+@pytest.mark.parametrize(("program", "options"), _options().items(), ids=str)
+def test_options_in_commands_exist(
+    program: tuple[str, ...], options: set[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as exit_info:
-        # `plan` and `lab` have subcommands.
-        main([*command[1 : 3 if command[1] in ("plan", "lab") else 2], "--help"])
+        main([*program, "--help"])
     assert exit_info.value.code == 0
     output = capsys.readouterr().out
-    assert [word for word in command[2:] if word.startswith("--") and word not in output] == []
+    assert [option for option in options if option not in output] == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_local_links_resolve(page: Path) -> None:
-    targets = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
-    local = [target.partition("#")[0] for target in targets if "://" not in target]
-    assert [target for target in local if target and not (page.parent / target).exists()] == []
+def test_local_links_resolve() -> None:
+    broken = []
+    for page in PAGES:
+        targets = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+        local = [target.partition("#")[0] for target in targets if "://" not in target]
+        broken += [(page.name, target) for target in local if target and not (page.parent / target).exists()]
+    assert broken == []
 
 
 def test_generated_parts_are_up_to_date() -> None:

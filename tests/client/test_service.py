@@ -6,7 +6,6 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,11 @@ import pytest
 from PIL import Image
 
 from lalaloc_client import ConflictError, ImportStep, InvalidError, Localisation, NotFoundError
-from lalaloc_core.bundle import default_bundle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from tests.client.conftest import MakeClient
-from tests.core.fault_photographs import FAULTS, FOLDER, Fault, fault_id
-from tests.service.conftest import FLAT, HOME, StartApp, upload
+from tests.core.fault_photographs import FOLDER
+from tests.service.conftest import FLAT
 
 APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 
@@ -243,31 +241,12 @@ def test_batch_yields_an_answer_per_photograph(service: Any, plan_id: str, spher
         list(service.localise_batch("f" * 32, [sphere]))
 
 
-@pytest.fixture(scope="module")
-def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    with start_app(tmp_path_factory.mktemp("shipped"), bundle=default_bundle(), request_deadline_s=90.0) as started:
-        yield started
-
-
-@pytest.fixture(scope="module")
-def home(shipped: httpx.Client) -> str:
-    return upload(shipped, HOME)
-
-
-@pytest.mark.parametrize("fault", [fault for fault in FAULTS if not fault.fields], ids=fault_id)
-def test_faulty_photograph_gives_its_warning_or_a_named_error(
-    shipped: httpx.Client, home: str, make_client: MakeClient, fault: Fault
-) -> None:
-    with make_client(str(shipped.base_url), timeout_s=100.0) as client:
-        if fault.is_usable:
-            answer = client.localise(home, FOLDER / fault.name)
-            fault.check(dataclasses.asdict(answer))
-            assert fault.said is None or any(fault.said in text for text in answer.warnings)
-            return
-        with pytest.raises(InvalidError) as caught:
-            client.localise(home, FOLDER / fault.name)
-        assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
-        fault.check_refusal(str(caught.value))
+def test_damaged_photograph_gives_its_warning_and_another_picture_a_named_error(service: Any, plan_id: str) -> None:
+    answer = service.localise(plan_id, FOLDER / "jpeg_no_eoi.jpg", refine="none")
+    assert any("the file ends before its picture does" in text for text in answer.warnings)
+    with pytest.raises(InvalidError, match="dual fisheye picture of a 360° camera") as caught:
+        service.localise(plan_id, FOLDER / "dual_fisheye.jpg")
+    assert caught.value.type == "urn:lalaloc:problem:invalid-photograph"
 
 
 def test_earlier_names_of_arguments_are_accepted(service: Any, plan_id: str, sphere: bytes) -> None:

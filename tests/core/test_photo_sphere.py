@@ -121,8 +121,7 @@ def level_world(left: int, width: int) -> np.ndarray:
 
 
 class TestParts:
-    @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
-    @pytest.mark.parametrize("write", [xmp, xmp_of_elements])
+    @pytest.mark.parametrize(("kind", "write"), [("JPEG", xmp), ("PNG", xmp_of_elements), ("WEBP", xmp)])
     @pytest.mark.parametrize(
         ("left", "top", "width", "height"),
         [(0, 128, 1024, 256), (256, 0, 512, 512), (128, 64, 640, 320), (131, 67, 637, 315)],

@@ -355,7 +355,7 @@ def test_fisheye_picture_that_is_read_in_perspective_has_bent_lines(field: float
 
 
 @pytest.mark.parametrize("name", ["kitchen", "living_room", "bedroom", "study"])
-@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0])
+@pytest.mark.parametrize("heading_deg", [0.0, 200.0])
 def test_lines_of_a_picture_in_perspective_are_straight(name: str, heading_deg: float) -> None:
     camera = Perspective.of_hfov(1280, 960, math.radians(80.0))
     photograph = opened(jpeg(take(sphere(name), camera, heading_deg=heading_deg)), hfov_deg=80.0)

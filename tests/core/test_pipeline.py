@@ -59,30 +59,25 @@ def random_pose(plan: FloorPlan, seed: int) -> PoseSet:
 
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
-    def test_each_stage_is_more_accurate(
+    def test_each_stage_is_more_accurate_and_costs_less(
         self, flat: FloorPlan, encoders: PhotographEncoder, search: Search, by_profile: bool
     ) -> None:
         errors: dict[Refine, list[float]] = {"none": [], "vdr": [], "lpo": []}
-        for seed in range(20):
+        for seed in range(10):
             pose = random_pose(flat, seed)
             query = layout_query(encoders, flat, pose, by_profile=by_profile)
-            for refine, distances in errors.items():
-                found = search(query, refine=refine)
-                distances.append(float(np.linalg.norm(found.candidates[0].position_m - pose.position_m[0])))
+            best = {refine: search(query, refine=refine).candidates[0] for refine in errors}
+            for refine, candidate in best.items():
+                errors[refine].append(float(np.linalg.norm(candidate.position_m - pose.position_m[0])))
+            costs = [candidate.cost for candidate in best.values()]
+            # By walls, VDR lowers another cost than LPO.
+            assert by_profile or costs == sorted(costs, reverse=True)
+            # Batches of other sizes round differently.
+            latent_distances = [candidate.latent_distance for candidate in best.values()]
+            assert by_profile or costs == pytest.approx(latent_distances, abs=2e-3)
         median = {refine: float(np.median(distances)) for refine, distances in errors.items()}
         assert median["lpo"] < 0.005 < median["vdr"] < median["none"] < 0.5
         assert np.mean(np.array(errors["lpo"]) < 0.01) >= 0.8
-
-    def test_each_stage_lowers_the_latent_distance(
-        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search
-    ) -> None:
-        for seed in range(10):
-            query = layout_query(encoders, flat, random_pose(flat, seed))
-            best = [search(query, refine=stage).candidates[0] for stage in ("lpo", "vdr", "none")]
-            costs = [candidate.cost for candidate in best]
-            assert costs == sorted(costs)
-            # Batches of other sizes round differently.
-            assert costs == pytest.approx([candidate.latent_distance for candidate in best], abs=2e-3)
 
 
 class TestCandidates:
@@ -296,7 +291,7 @@ def refinement_result(job: RefinementJob, *, position_m: np.ndarray, cost: np.nd
 LOG_SCALE = -3.5
 # Not a multiple of the grid's step, so that the lattice lies differently in every copy.
 APART_M = 0.17
-COPIES = [2, 4, 8]
+COPIES = [2, 8]
 
 
 def copied(polygons: list[Any], count: int) -> FloorPlan:

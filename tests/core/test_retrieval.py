@@ -444,7 +444,7 @@ def test_likeliest_pairs_equal_a_complete_coarse_pass(
     # Plans of at most so many poses are compared without bounds.
     monkeypatch.setattr("lalaloc_core.localise.match.coarse_pass._LAST_CHUNK", chunk)
     compared, rng, poses = 0, np.random.default_rng(2), len(grid.poses)
-    for query in queries[:8]:
+    for query in queries[:2]:
         # Half of the poses are excluded, or have a cost for each heading.
         hint = np.where(rng.random(poses) < 0.5, np.inf, 0.1) if told == "hints" else np.zeros(poses)
         fixtures = rng.random((8 if told == "fixtures" else 1, HYPOTHESES)).astype(np.float32) * 0.2
@@ -465,7 +465,7 @@ def test_likeliest_pairs_equal_a_complete_coarse_pass(
         np.testing.assert_allclose(every.ravel()[pair], found, atol=1e-6)
         assert len(np.unique(pair)) == len(pair) <= limits["at_most"]
         compared += len(np.unique(pair // HYPOTHESES))
-    assert compared < 8 * len(grid.poses)
+    assert compared < 2 * len(grid.poses)
 
 
 # Spheres, and views, of which a known heading with a tolerance has an odd number of hypotheses.

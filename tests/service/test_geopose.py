@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from types import SimpleNamespace
@@ -310,10 +311,10 @@ def test_venue_anchor_places_plans_anywhere(place: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("heading_deg", [0.0, 123.0, 179.99999, 180.0, 180.00001, 359.99999])
-def test_geopose_is_valid_anywhere(place: tuple[float, float], heading_deg: float) -> None:
+def test_geopose_is_valid_anywhere(place: tuple[float, float]) -> None:
     anchor = Anchor(latitude=place[1], longitude=place[0])
-    for position_m in ((0.0, 0.0), (40.0, -30.0), (-40.0, 30.0)):
+    headings_deg = (0.0, 123.0, 179.99999, 180.0, 180.00001, 359.99999)
+    for position_m, heading_deg in itertools.product(((0.0, 0.0), (40.0, -30.0), (-40.0, 30.0)), headings_deg):
         pose = present(geopose_at(anchor, position_m, heading_deg, 1.5))
         distance_m = pyproj.Geod(ellps="WGS84").inv(*place, pose.position.lon, pose.position.lat)[2]
         assert distance_m == pytest.approx(np.hypot(*position_m), abs=1e-3)

@@ -36,8 +36,13 @@ _ROOM = {"name": "hall", "polygon": [[0, 0], [98, 0], [98, 98], [0, 98]]}
 HALL: dict[str, Any] = {"name": "hall", "ceiling_height_m": 6.0, "rooms": [_ROOM]}
 
 
-@pytest.mark.parametrize("heading", [None, 0.0, 90.0, -360.0, 360.0, 123.456])
-@pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "vdr")])
+@pytest.mark.parametrize(
+    ("heading", "refine", "stage"),
+    [
+        *((heading, "none", "retrieval") for heading in (None, 0.0, 90.0, -360.0, 360.0)),
+        *((heading, refine, "vdr") for heading in (None, 123.456) for refine in ("vdr", "lpo")),
+    ],
+)
 def test_answer_lies_in_the_plan_and_names_its_stage(
     client: httpx.Client, flat: str, sphere: bytes, heading: float | None, refine: str, stage: str
 ) -> None:
