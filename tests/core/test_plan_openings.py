@@ -112,7 +112,6 @@ def test_opening_on_no_wall_warns_or_fails() -> None:
     [
         ("door", "opening 0 must be an object, not a string"),
         ({"kind": "gate", "line": DOOR["line"]}, "opening 0: the kind is 'gate'; it must be one of door, window"),
-        ({"kind": "wall", "line": DOOR["line"]}, "the kind is 'wall'"),
         ({"line": DOOR["line"]}, "the kind is null"),
         ({"kind": "door"}, "opening 0: the line must be two points"),
         ({"kind": "door", "line": [[0, 0], [0, 0]]}, "shorter than 0.01 m"),

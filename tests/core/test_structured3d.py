@@ -291,7 +291,6 @@ class TestBadAnnotation:
             (short_line_matrix, FIRST, ["'lineJunctionMatrix' has no entry"]),
             (bad_coordinate([0.0, 1.0]), FIRST, ["[0.0, 1.0]", "three numbers"]),
             (bad_coordinate([0.0, 1.0, float("nan")]), FIRST, ["nan", "three numbers"]),
-            (bad_coordinate([0.0, 1.0, float("inf")]), FIRST, ["inf", "three numbers"]),
             (bad_coordinate("origin"), FIRST, ["origin", "three numbers"]),
             (bow_tie, FIRST, ["crosses itself", "50%", "90%"]),
             (scaled(0.001), "bedroom 1033", ["every room is smaller than 0.2 m²", "read as millimetres"]),
@@ -389,15 +388,12 @@ class TestCameras:
             (b"1 2 3 4", ["holds '1 2 3 4'"]),
             (b"1 2 high", ["high"]),
             (b"1 2 nan", ["nan"]),
-            (b"1 2 inf", ["inf"]),
             (b"\xff\xfe", ["not a text file"]),
             (b"-9000 900 1400", ["(-9.000, 0.900) m is outside its room 'living room 1007', 9 m away"]),
             (b"1000 5000 1400", ["outside its room 'living room 1007'", "in 'bedroom 1033'"]),
             (b"1.1 0.9 1.4", ["0.0014 m above the floor", "read as millimetres"]),
             (b"1100 900 0", ["is 0 m above the floor; the minimum is 0.1 m"]),
-            (b"1100 900 -200", ["is -0.2 m above the floor"]),
             (b"1100 900 2500", ["must be below the ceiling (2.5 m)"]),
-            (b"1100 900 9000", ["is 9 m above the floor", "must be below the ceiling (2.5 m)"]),
         ],
     )
     def test_bad_camera_position_is_refused_or_left_out(self, root: Path, content: bytes, reasons: list[str]) -> None:
@@ -472,7 +468,6 @@ class TestPhotographs:
         ("content", "reason"),
         [
             (None, "cannot be read: No such file"),
-            (b"", "not a readable picture"),
             (b"\x89PNG\r\n\x1a\n", "not a readable picture"),
             (slice(0, -900), "damaged"),
         ],

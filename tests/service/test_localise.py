@@ -103,7 +103,6 @@ def test_answer_has_timings_and_model(client: httpx.Client, flat: str, sphere: b
 
 BAD_FIELDS = {
     "heading not a number": ({"heading_deg": "nan"}, "heading_deg", "finite"),
-    "heading infinite": ({"heading_deg": "-inf"}, "heading_deg", "finite"),
     "heading too large": ({"heading_deg": "360.1"}, "heading_deg", "360"),
     "heading a word": ({"heading_deg": "north"}, "heading_deg", "is 'north': not a number"),
     "heading with underscore": ({"heading_deg": "1_0"}, "heading_deg", "1_0"),
@@ -115,13 +114,11 @@ BAD_FIELDS = {
     "tolerance without heading": ({"heading_tolerance_deg": "5"}, "heading_tolerance_deg", "heading_deg"),
     "tolerance negative": ({"heading_deg": "1", "heading_tolerance_deg": "-1"}, "heading_tolerance_deg", "0"),
     "tolerance too large": ({"heading_deg": "1", "heading_tolerance_deg": "46"}, "heading_tolerance_deg", "45"),
-    "tolerance not a number": ({"heading_deg": "1", "heading_tolerance_deg": "nan"}, "heading_tolerance_deg", "finite"),
     "camera in the floor": ({"camera_height_m": "0"}, "camera_height_m", "must be at least 0.1"),
     "camera height in another unit": ({"camera_height_m": "1e-9"}, "camera_height_m", "is '1e-9': must be at least"),
     "camera height not a number": ({"camera_height_m": "nan"}, "camera_height_m", "finite"),
     "height deviation negative": ({"camera_height_std_m": "-0.1"}, "camera_height_std_m", "0"),
     "height deviation too large": ({"camera_height_std_m": "2.1"}, "camera_height_std_m", "2"),
-    "height deviation not a number": ({"camera_height_std_m": "nan"}, "camera_height_std_m", "finite"),
     "unknown field": ({"headng_deg": "90"}, "headng_deg", "heading_deg"),
     "empty plan id": ({"floorplan_id": ""}, "floorplan_id", "missing"),
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import re
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +23,6 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.conftest import ZIP_BOMB, dxf_file, large_picture
-from tests.importers.test_fault_files import EXPECTED, REFUSED, content_of
 from tests.importers.test_ifc import ifc_flat
 from tests.importers.test_pictures import hall_beside_a_photograph, open_hall, vector_pdf
 from tests.painted import picture_file
@@ -189,18 +187,6 @@ def test_several_levels_require_the_level_option(client: httpx.Client) -> None:
     assert store_plan(client, content, level="1")["import_report"]["level"]["name"] == "1"
     nowhere = assert_problem(send_plan(client, content, level="7"), 422, "invalid-floorplan")
     assert "has no level '7'; set level to one of '0', '1'" in nowhere["detail"]
-
-
-@pytest.mark.slow
-def test_files_with_faults_are_read_or_refused_as_on_the_command_line(client: httpx.Client) -> None:
-    for name, expected in EXPECTED.items():
-        stored = store_plan(client, content_of(name), name=name)
-        report = stored["import_report"]
-        assert len(stored["plan"]["rooms"]) == len(expected.areas_m2), name
-        lines = [*report["notes"], *report["warnings"], *report["unsure"], report["scale_source"], ""]
-        assert any(expected.said in line for line in lines), name
-    for name, remedy in REFUSED.items():
-        assert re.search(remedy, send_plan(client, content_of(name)).json()["detail"]), name
 
 
 @pytest.mark.parametrize(
