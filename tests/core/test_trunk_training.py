@@ -205,33 +205,6 @@ class TestLosses:
             build_optimiser(stage.modules, OptimiserConfig(only=("to_profile",)))
 
 
-class TestHiddenParts:
-    def test_labels_of_hidden_azimuths_do_not_count(self, batch: dict[str, torch.Tensor]) -> None:
-        hiding = {"image.hidden_share": 1.0, "image.optics": 0.0, "image.photometric": 0.0}
-        stage = stage_of(TINY.with_settings(hiding))
-        shown: list[Tensor] = []
-        stage.encoder.register_forward_pre_hook(lambda _, inputs: shown.append(inputs[0]))
-        before = stage.losses(batch)
-        hidden = (shown[0] == 127).all(dim=3).all(dim=1)
-        share = hidden.float().mean(dim=1)
-        assert 0.3 < float(share.min()) < 0.65 < float(share.max()) < 0.9
-        columns = hidden.unflatten(1, (TINY.profile_columns, -1)).all(dim=2)
-        changed = dict(batch)
-        changed["opening_kind"] = torch.where(columns, (batch["opening_kind"] + 1) % 4, batch["opening_kind"])
-        changed["profile_m"] = torch.where(columns, 2.0 * batch["profile_m"], batch["profile_m"])
-        terms = stage_of(TINY.with_settings(hiding)).losses(changed)
-        for name in ("profile", "opening"):
-            torch.testing.assert_close(terms[name], before[name])
-        seen = stage_of(TINY.with_settings(hiding)).losses(dict(batch, profile_m=2.0 * batch["profile_m"]))
-        assert abs(seen["profile"].item() - before["profile"].item()) > 0.01
-
-    def test_share_must_be_a_share_of_a_ring(self) -> None:
-        with pytest.raises(ConfigError, match=r"hidden_share is 1\.5; it must lie between 0 and 1"):
-            TINY.with_settings({"image.hidden_share": 1.5})
-        with pytest.raises(ConfigError, match=r"hidden_share is 0\.5; architecture 'paper' supports 0 only"):
-            PRESETS["paper"].with_settings({"image.hidden_share": 0.5})
-
-
 @pytest.fixture(scope="module")
 def folder(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train against the layout encoder of a ring, resume once, and export a bundle."""

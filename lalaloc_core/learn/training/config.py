@@ -139,8 +139,6 @@ class ImageStageConfig:
         photograph_shares: share of them from each folder; empty draws all photographs alike.
         style_mixing: share of a batch whose early features take on another picture's style, every other time that of a
             photograph; needs photographs.
-        hidden_share: share of the pictures that show only a part of the horizon, 0.15 to 0.6 of the circle, so that
-            walls are read where they are seen (architectures `ring` and `trunk`).
         ema_decay: decay per step of the averaged weights, which are validated and shipped; 0 turns averaging off.
     """
 
@@ -172,7 +170,6 @@ class ImageStageConfig:
     photographs_per_batch: int = 4
     photograph_shares: tuple[float, ...] = ()
     style_mixing: float = 0.0
-    hidden_share: float = 0.0
     ema_decay: float = 0.0
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
 
@@ -222,9 +219,7 @@ class TrainConfig:
         )
         for name in ("uses_per_sphere", "replay_spheres", "photographs_per_batch"):
             _check(f"image.{name}", getattr(image, name), getattr(image, name) >= 1, "the minimum is 1")
-        is_possible = self.has_ring or not image.hidden_share
-        _check("image.hidden_share", image.hidden_share, is_possible, "architecture 'paper' supports 0 only")
-        for name in ("photometric", "optics", "opening_balance", "hidden_share"):
+        for name in ("photometric", "optics", "opening_balance"):
             share = getattr(image, name)
             _check(f"image.{name}", share, 0.0 <= share <= 1.0, "it must lie between 0 and 1")
         for name in _TRUNK_ONLY:
@@ -248,7 +243,8 @@ class TrainConfig:
     def from_dict(cls, raw: dict[str, Any]) -> TrainConfig:
         """Build a configuration from plain data, refusing unknown keys."""
         if isinstance(image := raw.get("image"), dict):
-            raw = raw | {"image": {_EARLIER_NAMES.get(name, name): value for name, value in image.items()}}
+            known = (item for item in image.items() if item[0] not in _EARLIER_SETTINGS)
+            raw = raw | {"image": {_EARLIER_NAMES.get(name, name): value for name, value in known}}
         return build_config(cls, raw, path="config")
 
     def with_settings(self, settings: dict[str, Any]) -> TrainConfig:
@@ -295,6 +291,7 @@ class TrainConfig:
 
 
 _EARLIER_NAMES = {"uses_per_panorama": "uses_per_sphere", "replay_panoramas": "replay_spheres"}
+_EARLIER_SETTINGS = {"hidden_share"}
 
 
 def _check(name: str, value: Any, is_valid: bool, limit: str) -> None:

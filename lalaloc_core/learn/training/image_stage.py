@@ -6,12 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 from torch import Tensor, nn
 
 from lalaloc_core.learn.synth.augmentation import jittered, optics
 from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.batch_streams import UNKNOWN
 from lalaloc_core.learn.training.batches import Batch, Photographs
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
@@ -28,11 +26,6 @@ from lalaloc_core.learn.training.stages import (
 )
 from lalaloc_core.nets import LayoutNetwork, RingLayoutEncoder, TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, first_rows
-
-# Part of the horizon, in turns, that is seen in pictures with hidden sectors.
-_SEEN_TURNS = (0.15, 0.6)
-# Value of hidden pixels, zero after normalisation.
-_HIDDEN_GREY = 127
 
 
 class ImageStage(TrainingStage[ImageStageConfig]):
@@ -68,21 +61,17 @@ class ImageStage(TrainingStage[ImageStageConfig]):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
                 target = self.teacher.head(ring)
-            seen = self._draw_seen(len(ring), ring.device)
-            features, photograph_terms = self._encode(batch, seen)
-            # The latent needs all sectors: the teacher's stand in for hidden ones.
-            seen_ring = torch.where(seen[:, None], features.ring, ring)
-            latent = self.teacher.head(seen_ring)
-            known = seen.repeat_interleave(self.config.profile_columns // seen.shape[1], dim=1)
+            features, photograph_terms = self._encode(batch)
+            latent = self.teacher.head(features.ring)
+            known = torch.ones_like(batch["profile_m"], dtype=torch.bool)
             if features.structure is not None:
                 assert isinstance(self.encoder, TrunkImageEncoder)
-                kind = torch.where(known, batch["opening_kind"], UNKNOWN)
-                terms |= structure_losses(settings, self.encoder, features.structure, kind, batch)
+                terms |= structure_losses(settings, self.encoder, features.structure, batch["opening_kind"], batch)
                 if settings.edges_weight:
                     terms["edges"] = edges_loss(settings, features.structure, batch["edges"], walls, known)
             terms |= photograph_terms
             if settings.ring_weight:
-                terms["ring"] = settings.ring_weight * losses.ring_distillation(seen_ring, ring)
+                terms["ring"] = settings.ring_weight * losses.ring_distillation(features.ring, ring)
             if settings.profile_weight:
                 likelihood = losses.laplace_mixture(features.walls, batch["profile_m"].log(), known)
                 terms["profile"] = settings.profile_weight * likelihood
@@ -96,16 +85,14 @@ class ImageStage(TrainingStage[ImageStageConfig]):
             terms |= self._distance_losses(latent.float(), target.float(), batch)
         return terms
 
-    def _encode(self, batch: Batch, seen: Bool[Tensor, "b s"]) -> tuple[ImageFeatures, dict[str, Tensor]]:
+    def _encode(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
         """Return the features of a batch's spheres, and the loss of the photographs encoded with them."""
         settings, image, height = self.settings, batch["image"], batch["camera_height_m"]
         if self.photographs is None or not (settings.photograph_weight or settings.photograph_profile_weight):
-            return self.encoder(self._hide(self._augment(image), seen), height), {}
+            return self.encoder(self._augment(image), height), {}
         count, columns = settings.photographs_per_batch, self.config.profile_columns
         photographs = self.photographs.draw(count, columns, self._generator(torch.device("cpu")))
-        photograph_seen = self._draw_seen(count, image.device)
         images = self._augment(torch.cat([image, photographs.images.to(image.device)]))
-        images = self._hide(images, torch.cat([seen, photograph_seen]))
         # The camera height of photographs is unknown, so their unit of length is the camera height.
         heights = torch.cat([height, height.new_ones(count)])
         styles = sample_styles(
@@ -116,7 +103,7 @@ class ImageStage(TrainingStage[ImageStageConfig]):
         assert isinstance(self.encoder, TrunkImageEncoder)
         rows = slice(len(image), None)
         logits = features.structure.opening_logits[rows]
-        known = photograph_seen.repeat_interleave(columns // seen.shape[1], dim=1)
+        known = torch.ones(logits.shape[:2], dtype=torch.bool, device=logits.device)
         weight = opening_weight(settings, self.encoder, self.photographs)
         loss = photograph_loss(settings, features.walls.rows(rows), logits, known, photographs, weight)
         return first_rows(features, len(image)), {"photographs": loss}
@@ -130,22 +117,6 @@ class ImageStage(TrainingStage[ImageStageConfig]):
             if self.settings.optics:
                 image = optics(image.float(), self.settings.optics, self._generator(image.device))
         return image
-
-    def _draw_seen(self, count: int, device: torch.device) -> Bool[Tensor, "b s"]:
-        sectors = self.config.ring.sectors
-        if not self.settings.hidden_share:
-            return torch.ones(count, sectors, dtype=torch.bool, device=device)
-        generator = self._generator(torch.device("cpu"))
-        first, width, hidden = torch.rand(3, count, 1, generator=generator)
-        width = _SEEN_TURNS[0] + (_SEEN_TURNS[1] - _SEEN_TURNS[0]) * width
-        offset = (torch.arange(sectors) / sectors - first) % 1.0
-        return ((hidden >= self.settings.hidden_share) | (offset < width)).to(device)
-
-    def _hide(self, image: Tensor, seen: Bool[Tensor, "b s"]) -> Tensor:
-        if not self.settings.hidden_share:
-            return image
-        columns = seen.repeat_interleave(image.shape[2] // seen.shape[1], dim=1)
-        return torch.where(columns[:, None, :, None], image, torch.full_like(image, _HIDDEN_GREY))
 
     def _generator(self, device: torch.device) -> torch.Generator:
         if device not in self._generators:
