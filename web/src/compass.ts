@@ -1,53 +1,25 @@
 /** Dial over the photograph that shows and sets the azimuth of its centre in the plan. */
 
-import { h, s } from "./dom";
+import { byId } from "./dom";
 import { degrees } from "./layout";
 
 export class Compass {
-  readonly element: HTMLElement;
-  private readonly needle = s("path", { class: "needle", d: "M0 -34L7 6L0 2L-7 6Z" });
-  private readonly north = s(
-    "g",
-    { class: "to-north" },
-    s("path", { d: "M0 -50L4 -43L-4 -43Z" }),
-    s("text", { y: -24, "font-size": 11 }, "N"),
-  );
-  private readonly dial: SVGSVGElement;
-  private readonly text = h("span", { class: "dial-text" });
+  private readonly element = byId("compass-place");
+  private readonly dial = byId<SVGSVGElement>("compass");
+  private readonly needle = this.dial.querySelector(".needle")!;
+  private readonly north = this.dial.querySelector(".to-north")!;
+  private readonly text = this.element.querySelector(".dial-text")!;
   /** Heading in the form; null if unknown. */
   private heading: number | null = null;
   /** Heading of the answer, which is shown while none is given. */
   private found: number | null = null;
 
   constructor(private readonly turned: (headingDeg: number | null) => void) {
-    const marks = ["+y", "+x", "−y", "−x"].map((name, quarter) => {
-      const angle = (quarter * Math.PI) / 2;
-      return s("text", { x: 39 * Math.sin(angle), y: 4 - 39 * Math.cos(angle), "font-size": 11 }, name);
-    });
-    this.dial = s(
-      "svg",
-      {
-        viewBox: "-52 -52 104 104",
-        class: "dial",
-        tabindex: 0,
-        role: "slider",
-        id: "compass",
-        "aria-valuemin": 0,
-        "aria-valuemax": 359,
-        "aria-label": "Heading of the photograph: direction of its centre on the plan, degrees",
-      },
-      s("circle", { class: "rim", r: 50 }),
-      ...marks,
-      this.north,
-      this.needle,
-      s("circle", { class: "hub", r: 3 }),
-    );
     this.dial.addEventListener("pointerdown", (event) => this.onPointer(event));
     this.dial.addEventListener("pointermove", (event) => {
       if (event.buttons > 0) this.onPointer(event);
     });
     this.dial.addEventListener("keydown", (event) => this.onKey(event));
-    this.element = h("div", { class: "compass" }, this.dial, this.text);
     this.set(null);
     this.setNorth(null);
   }

@@ -55,7 +55,6 @@ export class Photos {
       this.inputs.heading_deg.value = degrees === null ? "" : String(degrees);
       this.read();
     });
-    byId("compass-place").append(this.compass.element);
     for (const field of Object.values(this.inputs)) field.addEventListener("input", () => this.read());
     this.choice.addEventListener("change", () => this.onMotion());
     acceptChoice(byId("photo-file"), async (files) => this.add(await inOrder(files)));

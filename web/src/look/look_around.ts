@@ -1,6 +1,6 @@
 /** “Look around”: the rear camera takes the photographs of a turn by itself, and shows the plan's lines afterwards. */
 
-import { button, h } from "../dom";
+import { button, byId } from "../dom";
 import { acceptChoice } from "../drops";
 import { clearError, showError } from "../notices";
 import { FrameJudge, takeFrame } from "./frames";
@@ -29,41 +29,19 @@ export interface FoundPlace {
 
 /** Dialog with the camera's picture. */
 export class LookAround {
-  private readonly video = h("video", { playsinline: true, muted: true, "aria-label": "Picture of the camera" });
-  private readonly lines = h("canvas", { class: "lines", "aria-hidden": "true" });
+  private readonly dialog = byId<HTMLDialogElement>("look-dialog");
+  private readonly stage = byId("look-stage");
+  private readonly video = byId<HTMLVideoElement>("look-video");
+  private readonly lines = byId<HTMLCanvasElement>("look-lines");
   private readonly ring = new Ring();
-  private readonly hint = h("p", { id: "look-hint", role: "status" });
-  private readonly error = h("div", { class: "error", id: "look-error", role: "alert", hidden: true });
-  private readonly film = h("input", {
-    id: "look-film",
-    type: "file",
-    accept: "video/mp4,video/quicktime,video/webm,.mkv",
-  });
-  private readonly instead = h(
-    "div",
-    { id: "look-instead", hidden: true },
-    h(
-      "p",
-      { class: "hint" },
-      "Film one slow turn on the spot with the phone's camera app, held upright, and choose it here.",
-    ),
-    h("label", { class: "file" }, this.film, h("span", {}, "Choose a film")),
-  );
+  private readonly hint = byId("look-hint");
+  private readonly error = byId("look-error");
+  private readonly film = byId<HTMLInputElement>("look-film");
+  private readonly instead = byId("look-instead");
   private readonly find = button("Find the place", () => void this.localise(), { class: "primary", disabled: true });
   private readonly take = button("Take a photograph", () => void this.takeNow());
   private readonly sensors = button("Allow motion sensors", () => void this.askAgain(), { hidden: true });
   private readonly close = button("Cancel", () => this.dialog.close());
-  private readonly stage = h("div", { class: "look-stage" }, this.video, this.lines, this.ring.element);
-  private readonly dialog = h(
-    "dialog",
-    { id: "look-dialog", "aria-labelledby": "look-title" },
-    h("h2", { id: "look-title" }, "Look around"),
-    this.stage,
-    this.hint,
-    this.error,
-    this.instead,
-    h("div", { class: "ask" }, this.find, this.take, this.sensors, this.close),
-  );
   private readonly orientation = new Orientation();
   private stream: MediaStream | null = null;
   private judge = new FrameJudge();
@@ -79,7 +57,8 @@ export class LookAround {
   private isTaking = false;
 
   constructor(private readonly finder: Finder) {
-    document.body.append(this.dialog);
+    this.stage.append(this.ring.element);
+    byId("look-ask").append(this.find, this.take, this.sensors, this.close);
     this.dialog.addEventListener("close", () => this.stop());
     acceptChoice(this.film, ([film]) => void this.localiseFilm(film!));
     // The camera's light goes out when the page is left, too.
