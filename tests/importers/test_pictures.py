@@ -251,6 +251,17 @@ def test_symbols_across_walls_of_two_lines_cut_no_wall():
     assert len(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document["rooms"]) == 2
 
 
+@pytest.mark.parametrize("name", ["OPENPORCH", "Roof"])
+def test_area_that_thin_lines_bound_is_a_room_where_a_terrace_is_written(name: str):
+    page = np.full((500, 1000), 255, np.uint8)
+    page[90:410, 90:610] = 0
+    page[110:390, 110:590] = 255
+    page[150:350, 898:900] = page[150:152, 600:900] = page[348:350, 600:900] = 0
+    letterings = [Lettering(name, (7.5, 2.5), is_ocr=True)]
+    sketch = sketch_picture(page, 0.01, ReportBuilder(), Budget(ImportLimits()), letterings=letterings)
+    assert len(sketch.rooms) == (2 if name == "OPENPORCH" else 1)
+
+
 def test_openings_that_look_like_doors_inside_are_doors_outside():
     page = Image.new("L", (1500, 500), 255)
     pen = ImageDraw.Draw(page)

@@ -43,12 +43,13 @@ def role_from_name(text: str) -> Role | None:
 
 @lru_cache(maxsize=1024)
 def room_types_from_reading(text: str | None) -> tuple[str, ...]:
-    """Return the room types of a text in a picture, of whose letters one or two may be misread ("lving", "corrid")."""
+    """Return the room types of a text in a picture, misread or without its spaces ("lving", "openporch")."""
     found = room_types_from_name(text)
     if found or not text:
         return found
     words = [word for word in split_words(text) if len(word) >= _SHORTEST_READING]
-    likely = (get_close_matches(word, ROOM_WORDS, n=1, cutoff=_MIN_ALIKE) for word in words)
+    long = [known for known in ROOM_WORDS if len(known) >= _SHORTEST_READING]
+    likely = ([*filter(word.endswith, long)] or get_close_matches(word, ROOM_WORDS, 1, _MIN_ALIKE) for word in words)
     return next((room_types_from_name(word) for found_words in likely for word in found_words), ())
 
 

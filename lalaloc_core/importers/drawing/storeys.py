@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 import shapely
@@ -30,8 +31,8 @@ Box = tuple[float, float, float, float]
 _APART_M, _JOINED_M = 1.0, 0.2
 # Least share of the largest storey, and least area (m²); smaller parts are outbuildings of the nearest storey.
 _SHARE, _MIN_M2 = 0.3, 12.0
-# Margin (m) around the rooms of a storey, for its walls; most storeys that a warning names.
-_MARGIN_M, _MAX_NAMED = 0.5, 6
+# Margin (m) around the rooms of a storey, for its walls and leaves outside; most storeys that a warning names.
+_MARGIN_M, _MAX_NAMED = (0.5, 1.4), 6
 _STOREYS = keys_by_word("storeys")
 _NUMBERS = _STOREYS | keys_by_word("storeys_in_titles")
 _BESIDE, _COUNTED, _JOINED = (frozenset(PLAN_WORDS["levels"][key].split()) for key in ("beside", "counted", "joined"))
@@ -184,9 +185,11 @@ def _reading_order(storeys: Sequence[BaseGeometry]) -> list[int]:
 def _in_words(storeys: Sequence[BaseGeometry], in_file: Callable[[Box], Box], levels: Sequence[Level] = ()) -> str:
     """Return the number of storeys, and the area and `crop` of each."""
     names: Mapping[int, str] = {index: f"'{level.name}' of " for index, level in enumerate(levels)}
+    apart_m = min(first.distance(second) for first, second in combinations(storeys, 2))
+    margin_m = float(np.clip(0.5 * apart_m, *_MARGIN_M))
     listed = "; ".join(
         f"{names.get(index, '')}{storey.area:.0f} m² at "
-        f"crop={','.join(f'{number:.0f}' for number in in_file(storey.buffer(_MARGIN_M).bounds))}"
+        f"crop={','.join(f'{number:.0f}' for number in in_file(storey.buffer(margin_m).bounds))}"
         for index, storey in enumerate(storeys[:_MAX_NAMED])
     )
     return f"{len(storeys)} storeys seem to be drawn side by side, {listed}"

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import shapely
 from jaxtyping import UInt8
@@ -35,6 +36,8 @@ _LIKE_WALL = (0.4, 1.8)
 _AS_WALL, _WEAK = 0.6, 0.8
 _MIN_ROOM_M2 = 0.8
 _MAX_ISLAND_M2 = 2.0
+# Smallest area (m²) and largest length (m) of a terrace, and its distance (m) from the rooms and from its name.
+_TERRACE, _AT_TERRACE_M = (1.5, 20.0), 1.0
 # Dark walls are more reliable: outlined walls are preferred only if they enclose this much more area, or all rooms of
 # the dark walls and more.
 _OUTLINE_ADVANTAGE = 1.6
@@ -150,6 +153,7 @@ def sketch_picture(
         budget.trace.add("no room", builder.no_room)
     budget.begin("finding doors and windows")
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
+    rooms += [SketchedRoom(align_edges(area)) for area in _terraces(best, ink, letterings)]
     openings = _openings(best, ink, builder, budget)
     outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
     swings = [best.contents[id(gap)] for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
@@ -194,6 +198,25 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     enclosed = enclose(wall_polygons(walls, ink, budget.check_time), [], (), _CONFIG, budget.check_time, rank)
     rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
     return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), contents, is_dark)
+
+
+def _terraces(reading: _Reading, ink: Ink, letterings: Sequence[Lettering]) -> list[shapely.Polygon]:
+    """Return the areas beside the rooms that thin lines enclose and the name of a balcony or terrace is written at."""
+    rooms = shapely.union_all(reading.enclosed.rooms)
+    places = [shapely.Point(text.position) for text in letterings if "balcony" in text.room_types]
+    names = [place for place in places if not rooms.covers(place)]
+    if not names or rooms.is_empty:
+        return []
+    blocked = ink.mask.astype(np.uint8)
+    rings = [ink.to_pixels(np.asarray(gap.shape.exterior.coords)) - 0.5 for gap in reading.enclosed.gaps]
+    cv2.fillPoly(blocked, [np.round(ring).astype(np.int32) for ring in rings], 1)
+    outlines = np.array([shape.outline for shape in closed_shapes(replace(ink, mask=blocked > 0), _TERRACE)])
+    is_beside = shapely.dwithin(outlines, rooms, _AT_TERRACE_M) & ~shapely.intersects(
+        outlines, rooms.buffer(-_BESIDE_M)
+    )
+    tree = shapely.STRtree(outlines[is_beside])
+    _, nearest = tree.query_nearest(names, max_distance=_AT_TERRACE_M, all_matches=False)
+    return [tree.geometries[index] for index in np.unique(nearest)]
 
 
 def _without_islands(room: shapely.Polygon, builder: ReportBuilder) -> shapely.Polygon:

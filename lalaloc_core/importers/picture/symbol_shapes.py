@@ -14,7 +14,7 @@ from jaxtyping import Float
 from lalaloc_core.importers.picture.ink import Ink
 
 # Size of parts of symbols (m², m), and most parts of a picture.
-_SMALLEST_M2, _LONGEST_M, _MOST = 0.004, 4.0, 3000
+_PART, _MOST = (0.004, 4.0), 3000
 # Share of the box that a rectangle fills, and range of that of an ellipse with its deviation.
 _FILLED, _ELLIPSE, _OFF_ELLIPSE = 0.9, (0.7, 0.86), 0.06
 _CIRCLE = 1.2
@@ -109,10 +109,10 @@ class Shape:
         return other.area < 0.95 * self.area and self.outline.covers(shapely.Point(other.centre))
 
 
-def closed_shapes(ink: Ink, *, is_faint: bool = False) -> list[Shape]:
-    """Return the areas that lines enclose, with their holes filled, as large as parts of symbols; none if too many.
+def closed_shapes(ink: Ink, sizes: tuple[float, float] = _PART, *, is_faint: bool = False) -> list[Shape]:
+    """Return the areas that lines enclose, with their holes filled, from an area (m²) up to a length (m).
 
-    With `is_faint`, faint lines count, and small gaps in lines are closed.
+    There are none if too many. With `is_faint`, faint lines count, and small gaps in lines are closed.
     """
     lines = ink.mask.astype(np.uint8)
     if is_faint:
@@ -121,7 +121,7 @@ def closed_shapes(ink: Ink, *, is_faint: bool = False) -> list[Shape]:
     labels, pixel_m = np.asarray(found, dtype=np.int32), ink.metres_per_pixel
     area_m2 = stats[:, cv2.CC_STAT_AREA] * pixel_m**2
     long_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * pixel_m
-    is_part = (area_m2 >= _SMALLEST_M2) & (long_m <= _LONGEST_M)
+    is_part = (area_m2 >= sizes[0]) & (long_m <= sizes[1])
     is_part[0] = False
     numbers = np.flatnonzero(is_part)
     if len(numbers) > _MOST:

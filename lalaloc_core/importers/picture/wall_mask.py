@@ -16,14 +16,14 @@ from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
 from lalaloc_core.importers.picture.ink import Ink
 
 _MIN_THICKNESS_M = 0.055
-# Broadest strokes relative to walls, and thinnest inner wall (m).
-_STROKE, _THINNEST_INNER_M = 0.4, 0.075
+# Broadest strokes and leaves between two lines relative to walls, with the thinnest inner wall (m) beside them.
+_STROKE, _LEAF = (0.4, 0.075), (0.55, 0.1)
 # Largest white gap between the two lines of a wall; the sector of a door swing is wider.
 _MAX_CAVITY_M = 0.42
 _SMALL_M = 1.2
 _STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
-# Thickness range of walls, relative to the usual wall; filled walls can have pillars.
-_OUTLINED_RANGE, _FILLED_RANGE = (0.6, 2.5), (0.6, 3.0)
+# Thickness range of walls and diameter of discs, relative to the usual wall; share of its box that a disc fills.
+_OUTLINED_RANGE, _FILLED_RANGE, _DISC_OF_WALL, _DISC = (0.6, 2.5), (0.6, 3.0), 1.25, 0.95
 # Largest share of a cavity that can be wider than a wall, at the junctions of walls.
 _WIDE_PART = 0.15
 # White areas in walls: least length of sure ones (m), share of the walls that sets the thickest, tolerance of widths,
@@ -174,10 +174,13 @@ def _reaches(labels: Int[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], cou
 def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
     size = _min_thickness_px(ink)
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
-    # Strokes of furniture can be broad in scans, but not as broad as walls.
-    widest = min(_STROKE * _usual_thickness(thick), _THINNEST_INNER_M / ink.metres_per_pixel)
-    if cavities is None and round(widest) > size:
-        thick = cv2.morphologyEx(thick, cv2.MORPH_OPEN, np.ones((round(widest),) * 2, np.uint8))
+    # Strokes of furniture can be broad in scans, and leaves between two lines, but not as broad as walls.
+    share, thinnest_m = _STROKE if cavities is None else _LEAF
+    widest = round(min(share * _usual_thickness(thick), thinnest_m / ink.metres_per_pixel))
+    if widest > size:
+        # The middles of even sizes would move walls off the panes between their lines.
+        kernel, middle = np.ones((widest, widest), np.uint8), (widest - 1) // 2
+        thick = cv2.dilate(cv2.erode(thick, kernel), kernel, anchor=(middle, middle))
     thickness = _usual_thickness(thick) * ink.metres_per_pixel
     if thickness < _MIN_THICKNESS_M:
         return None  # Merged strokes of a hatch are not walls.
@@ -212,16 +215,20 @@ def _usual_thickness(mask: np.ndarray, share: float = 0.5) -> float:
 def _without_furniture(
     mask: np.ndarray, thickness: float, metres_per_pixel: float, thickness_range: tuple[float, float]
 ) -> Bool[np.ndarray, "h w"]:
-    """Drop small pieces that are not as thick as a wall. Corners between two windows are kept.
+    """Drop small pieces that are not as thick as a wall, and discs. Corners between two windows are kept.
 
     `thickness` is the usual thickness of a wall (pixels); `thickness_range` is that of a kept piece, relative to it.
     """
     count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     labels = np.asarray(found, dtype=np.int32)
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-    is_large = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * metres_per_pixel >= _SMALL_M
+    sides = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    is_large = sides.max(axis=1) * metres_per_pixel >= _SMALL_M
     thinnest, thickest = (0.5 * (share * thickness + 1.0) for share in thickness_range)
     keep = is_large | (_reaches(labels, depth >= thinnest, count) & ~_reaches(labels, depth > thickest, count))
+    # Circles are filled between two lines: outlets and lamps, drawn over openings.
+    is_wide = (thickness_range == _FILLED_RANGE) | (sides.max(axis=1) > _DISC_OF_WALL * thickness)
+    keep &= is_wide | (stats[:, cv2.CC_STAT_AREA] > _DISC * sides.prod(axis=1))
     keep[0] = False
     return keep[labels]
 

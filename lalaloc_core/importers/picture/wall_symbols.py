@@ -21,12 +21,12 @@ from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.picture.ink import COLOURLESS, Ink, faint_lines
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
-# Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (pixels).
+# Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (m), at least a pixel.
 _ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
-_NEAR_PX = 2
+_NEAR_M, _COARSE_M = 0.017, 0.02
 _DOOR_M = (0.5, 2.4)
 # Leaves that are no full arc's: smallest share of one without an arc, and largest inked share beside a symbol.
-_LEAF_ALONE, _BESIDE = 0.95, 0.4
+_LEAF_ALONE, _BESIDE = 0.95, 0.45
 # Lines of panes that a scan broke: smallest inked shares, of the whole line and of each quarter.
 _BROKEN, _BROKEN_QUARTER = 0.35, 0.15
 # Widths of bow windows (m), and their smallest and largest depths relative to them.
@@ -63,10 +63,16 @@ class GapReader:
 
     def __init__(self, ink: Ink, walls: WallMask) -> None:
         self._ink = ink
-        reach = np.ones((2 * _NEAR_PX - 1,) * 2, np.uint8)
+        # Arcs of few pixels are compared on a finer picture: their lines would cover what is drawn beside them.
+        self._finer = max(1, round(ink.metres_per_pixel / _COARSE_M))
+        gray, inked, wall = (
+            cv2.resize(part.astype(np.uint8), None, fx=self._finer, fy=self._finer, interpolation=cv2.INTER_CUBIC)
+            for part in (ink.gray, ink.lines, walls.mask)
+        )
+        hairlines = faint_lines(gray, ink.metres_per_pixel / self._finer, _HAIRLINE)
+        reach = np.ones((2 * max(1, round(_NEAR_M / ink.metres_per_pixel)) + 1,) * 2, np.uint8)
         # Exclude walls, because a hatch would match any arc.
-        hairlines = ink.lines | faint_lines(ink.gray, ink.metres_per_pixel, _HAIRLINE)
-        drawn = [(lines & ~walls.mask).astype(np.uint8) for lines in (ink.lines, hairlines)]
+        drawn = [np.where(wall, 0, lines) for lines in (inked, inked | hairlines)]
         # There is no ink outside the picture.
         self._near, self._near_hairlines = (np.pad(cv2.dilate(lines, reach) > 0, 1) for lines in drawn)
 
@@ -80,13 +86,15 @@ class GapReader:
         found = GapContent("swing", swing, leaf_m=gap.width / leaves)
         if swing > _ARC and leaves == 1:
             return found
-        lines, share, warmth = self._lines(gap)
+        lines, share, warmth, halves = self._lines(gap)
         if lines < 2 and gap.is_sure and gap.is_between_ends and _BOW_M[0] <= gap.width <= _BOW_M[1]:
             depths = np.arange(*_BOW, 2.0 * self._ink.metres_per_pixel / gap.width)
             bows = [self._lines(gap, side * float(depth)) for depth in depths for side in (1.0, -1.0)]
             bow = max(bows, key=lambda found: found[:2])
             if bow[0] >= 2 and bow[1] >= _ARC:
                 return GapContent("pane", bow[1], bow[2], bow[0])
+        if lines < 2 and halves >= 2:
+            return GapContent("swing", _ARC)
         if swing > _ARC or (swing >= _ARC and (lines < 2 or share < _LINE)):
             return found
         if lines >= 2:
@@ -101,10 +109,10 @@ class GapReader:
         It is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open, or such a
         leaf alone. A pale arc must stand out from what is drawn beside it.
         """
-        start, end = self._ink.to_pixels(np.array([gap.start, gap.end]))
+        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
         width = math.dist(start, end)
         along = (end - start) / width
-        half = 0.5 * gap.shape.area / gap.width / self._ink.metres_per_pixel
+        half = 0.5 * self._finer * gap.shape.area / gap.width / self._ink.metres_per_pixel
         angles, reach = np.radians(np.arange(12.0, 91.0, 2.0)), np.arange(0.16, 1.25, 0.04)
         # Number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
         count, side, hinge, offset, angle, distance = np.meshgrid(
@@ -136,11 +144,11 @@ class GapReader:
         one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
         return (two, 2) if two > one else (one, 1)
 
-    def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float]:
+    def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float, int]:
         """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
 
-        The mean of the pixels along a line reveals even thin and faint lines. `bow` is the depth of a curve that they
-        follow, relative to the gap's width.
+        The last is the number of lines at one of the jambs alone, as of sliding leaves. The mean of pixels along a line
+        reveals even faint ones. `bow` is the depth of a curve that they follow, relative to the gap's width.
         """
         start, end = np.array(gap.start), np.array(gap.end)
         along = (end - start) / gap.width
@@ -155,11 +163,12 @@ class GapReader:
         columns, rows = (self._ink.to_pixels(points.reshape(-1, 2)) - 0.5).astype(np.float32).T
         maps = columns.reshape(len(offsets), len(reach)), rows.reshape(len(offsets), len(reach))
         values = cv2.remap(self._ink.gray, *maps, cv2.INTER_LINEAR, borderValue=255)
-        found: dict[int, float] = {}
+        found, halves = dict[int, float](), 0
         for index, level in _dips(values.mean(axis=1)):
             depth = level - float(values[index].mean())
             inked = values[index] < level - min(_FAINT, _OF_DEPTH * depth)
             quarters = [part.mean() for part in np.array_split(inked, 4)]
+            halves += max(quarters[0], quarters[3]) >= _LEAF and min(quarters[0], quarters[3]) <= 1.0 - _LEAF
             is_broken = bow == 0.0 and inked.mean() >= _BROKEN and min(quarters) >= _BROKEN_QUARTER
             if is_broken or inked.mean() >= _LINE:
                 found[index] = float(inked.mean())
@@ -168,7 +177,7 @@ class GapReader:
         if found and self._ink.warmth is not None:
             colours = cv2.remap(self._ink.warmth, *maps, cv2.INTER_LINEAR, borderValue=COLOURLESS)
             warmth = float(colours[list(found)].mean()) - COLOURLESS
-        return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth
+        return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth, halves
 
 
 def _dips(profile: Float[np.ndarray, "n"]) -> list[tuple[int, float]]:
