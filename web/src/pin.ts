@@ -279,7 +279,8 @@ class PinPage {
   private state(row: Row, correction: Correction | null, isKey: boolean): void {
     void this.guarded(async () => {
       await this.correct(row, correction);
-      if (isKey) (document.querySelector<HTMLElement>("#photographs .uncertain .card") ?? byId<HTMLElement>("undo")).focus();
+      if (isKey)
+        (document.querySelector<HTMLElement>("#photographs .uncertain .card") ?? byId<HTMLElement>("undo")).focus();
     });
   }
 
