@@ -71,7 +71,7 @@ def _options() -> dict[tuple[str, ...], set[str]]:
     return options
 
 
-@pytest.mark.parametrize(("program", "options"), _options().items(), ids=str)
+@pytest.mark.parametrize(("program", "options"), _options().items(), ids=map(" ".join, _options()))
 def test_options_in_commands_exist(
     program: tuple[str, ...], options: set[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
