@@ -128,17 +128,14 @@ def main() -> int:
             checkouts.append(Checkout(folder.name, folder, service))
         figures = _print_figures(checkouts, options.rounds, options.only or list(FIGURES))
     if options.json:
-        before, after = (_version(checkout.folder) for checkout in checkouts)
+        texts = [(checkout.folder / "lalaloc_core/__init__.py").read_text() for checkout in checkouts]
+        before, after = (re.findall(r'^__version__ = "(.+)"', text, re.MULTILINE)[0] for text in texts)
         releases = json.loads(options.json.read_text()) if options.json.exists() else {}
         releases[after] = {"before": before, "figures": figures, "stages": stage_ratios(checkouts[1].folder)}
         options.json.write_text(json.dumps(releases, indent=2) + "\n")
     differences = _differences(*checkouts)
     print("\nLargest differences: " + ", ".join(f"{name} {value:.1e}" for name, value in differences.items()))
     return int(max(differences.values()) > _TOLERANCE)
-
-
-def _version(checkout: Path) -> str:
-    return re.findall(r'^__version__ = "(.+)"', (checkout / "lalaloc_core/__init__.py").read_text(), re.MULTILINE)[0]
 
 
 def stage_ratios(checkout: Path, rounds: int = _STAGE_ROUNDS) -> dict[str, float]:

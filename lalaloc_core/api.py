@@ -125,7 +125,7 @@ class LaLaLoc:
         """
         self.bundle = model if isinstance(model, Bundle) else Bundle.open(Path(model or default_bundle()))
         self._model = LocalModel(self.bundle)
-        self._ground = lru_cache(_GRIDS)(self._new_ground)
+        self._ground = lru_cache(_GRIDS)(lambda plan, height_m: Ground(plan, self._model.grid(plan, height_m)))
 
     def localise(
         self,
@@ -291,9 +291,6 @@ class LaLaLoc:
         # As the service answers it: the time at the place, without its zone.
         taken = "" if at is None else at.replace(tzinfo=None).isoformat(sep=" ", timespec="seconds")
         return PinnedPhotograph(number, name, id, taken=taken)
-
-    def _new_ground(self, plan: FloorPlan, camera_height_m: float) -> Ground:
-        return Ground(plan, self._model.grid(plan, camera_height_m))
 
     def _grid_height_m(self, plan: FloorPlan, height: CameraHeight) -> float:
         """Return the camera height of the pose grid; only models that compare latents alone need one per height."""

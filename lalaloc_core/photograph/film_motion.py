@@ -71,7 +71,8 @@ class FlowTracker:
 
     def _turn(self, before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
         """Return the turn (radians) between samples with its error as a share; not a number if nothing tells it."""
-        gradients = [_gradient(picture) for picture in (before, after)]
+        blurred = (cv2.GaussianBlur(picture, (0, 0), _BLUR) for picture in (before, after))
+        gradients = [cv2.Sobel(picture, cv2.CV_32F, 1, 0) for picture in blurred]
         if min(float(np.percentile(np.abs(gradient), 99)) for gradient in gradients) < _BLANK:
             return math.nan, _GUESSED_SHARE
         moved, focal = _moved(before, after), self._focal(after.shape[1], after.shape[0])
@@ -151,11 +152,6 @@ class FlowTracker:
 
 def _focal_of(hfov: float, width: int) -> float:
     return 0.5 * width / math.tan(0.5 * min(hfov, 0.9 * math.pi))
-
-
-def _gradient(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Return how much a picture, blurred, changes from column to column."""
-    return cv2.Sobel(cv2.GaussianBlur(grey, (0, 0), _BLUR), cv2.CV_32F, 1, 0)
 
 
 def _edges_shift(before: Float[np.ndarray, "h w"], after: Float[np.ndarray, "h w"]) -> float | None:

@@ -131,12 +131,6 @@ def best_matches(
     return kept, best[kept]
 
 
-def _rooted(descriptor: UInt8[np.ndarray, "n 128"]) -> Float[np.ndarray, "n 128"]:
-    """Return RootSIFT: square roots of the shares (Arandjelović and Zisserman, CVPR 2012)."""
-    values = descriptor.astype(np.float32)
-    return np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1.0))
-
-
 def find_links(
     features: Sequence[Features], cameras: Sequence[Camera], attitudes: Sequence[Attitude], rng: np.random.Generator
 ) -> list[Link]:
@@ -156,7 +150,9 @@ def find_links(
         camera.rays(found.place * (camera.width, camera.height))
         for found, camera in zip(features, cameras, strict=True)
     ]
-    rooted = [_rooted(found.descriptor) for found in features]
+    # RootSIFT: square roots of the shares (Arandjelović and Zisserman, CVPR 2012).
+    values = (found.descriptor.astype(np.float32) for found in features)
+    rooted = [np.sqrt(value / np.maximum(value.sum(axis=1, keepdims=True), 1.0)) for value in values]
     axes = [camera_axes(pitch=attitude.pitch, roll=attitude.roll) for attitude in attitudes]
 
     def link(pair: tuple[int, int], min_matches: int, min_share: float) -> Link | None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
-from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
@@ -54,23 +53,17 @@ def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = l
         floor = room.free_floor(WALL_MARGIN_M)
         shapely.prepare(floor)
         columns = max(1, _LATTICE_POINTS // max(1, len(ys)))
-        chosen = np.concatenate(
-            [np.empty((0, 2))]
-            + [_lattice_inside(floor, xs[first : first + columns], ys) for first in range(0, len(xs), columns)]
-        )
+        parts = [np.empty((0, 2))]
+        for first in range(0, len(xs), columns):
+            lattice = np.stack(np.meshgrid(xs[first : first + columns], ys, indexing="ij"), axis=-1).reshape(-1, 2)
+            parts.append(lattice[shapely.contains_xy(floor, lattice[:, 0], lattice[:, 1])])
+        chosen = np.concatenate(parts)
         if len(chosen) == 0:
             chosen = room.interior_point()[None]
         positions.append(chosen)
         rooms.append(np.full(len(chosen), index))
         after_room()
     return PoseSet(np.concatenate(positions), np.concatenate(rooms))
-
-
-def _lattice_inside(
-    floor: BaseGeometry, xs: Float[np.ndarray, "c"], ys: Float[np.ndarray, "r"]
-) -> Float[np.ndarray, "n 2"]:
-    lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
-    return lattice[shapely.contains_xy(floor, lattice[:, 0], lattice[:, 1])]
 
 
 def random_poses(plan: FloorPlan, count: int, rng: np.random.Generator, margin_m: float = WALL_MARGIN_M) -> PoseSet:

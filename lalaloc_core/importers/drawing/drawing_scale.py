@@ -139,7 +139,9 @@ def drawing_scale(
         written = _written_scale(texts, paper_m or math.inf)
         if written is not None and paper_m_per_unit is not None:
             return checked(written[0] * paper_m_per_unit, written[1])
-        found = next(filter(None, (_drawn_scale(drawing, check_time) for drawing in drawings)), None) or guess()
+        drawn = (drawing for drawing in drawings if drawing.shapes)
+        by_dimensions = (scale_by_dimensions(written_dimensions(part, check_time), part.extent) for part in drawn)
+        found = next(filter(None, by_dimensions), None) or guess()
         if found:
             return checked(*found)
         hint = f" (1:{written[0]:g} is written in it, but it has no size on paper)" if written is not None else ""
@@ -205,11 +207,6 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
     if count < max(_MIN_AGREEING, _MARGIN * len({index for _, index, _ in others})) or len(lengths) < _MIN_LENGTHS:
         return None
     return math.exp(middle), f"{count} dimensions written in the drawing"
-
-
-def _drawn_scale(drawing: Drawing, check_time: Callable[[], None]) -> tuple[float, str] | None:
-    """Return metres per unit of a drawing by the dimensions written in it, None if too few agree."""
-    return scale_by_dimensions(written_dimensions(drawing, check_time), drawing.extent) if drawing.shapes else None
 
 
 def check_scale(

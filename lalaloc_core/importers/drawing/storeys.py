@@ -239,17 +239,14 @@ def storeys_of(drawing: Drawing) -> dict[str, tuple[Level, Drawing]]:
     # Numbers count walls as well as storeys, unless other layers have the same ones.
     named = {number for number in walls if not names[number].isdecimal() or number in others}
     boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in named}
-    if len(boxes) < 2 or not all(_is_over(first, second) for first in boxes.values() for second in boxes.values()):
+    pairs = combinations(boxes.values(), 2)
+    if len(boxes) < 2 or not all(a.intersection(b).area >= _OVER * min(a.area, b.area) for a, b in pairs):
         return {}
 
     def part(number: float) -> Drawing:
         return drawing.on_layers(lambda layer: (storey := _storey(layer)) is None or storey[1] == number)
 
     return {names[number]: (Level(names[number], number), part(number)) for number in boxes}
-
-
-def _is_over(first: shapely.Polygon, second: shapely.Polygon) -> bool:
-    return first.intersection(second).area >= _OVER * min(first.area, second.area)
 
 
 @lru_cache(maxsize=1024)

@@ -99,7 +99,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
     pictures = sum(local_name(element) == "image" for element in root.iter())
-    texts = sum(local_name(element) == "foreignObject" and _has_text(element) for element in root.iter())
+    hypertexts = (element for element in root.iter() if local_name(element) == "foreignObject")
+    texts = sum(any(text.strip() for text in element.itertext()) for element in hypertexts)
     for parent in root.iter():
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
     check_work(root, budget)
@@ -127,10 +128,6 @@ def _naming_pictures(pictures: int) -> Iterator[None]:
 def _picture_text(pictures: int) -> str:
     subject = "an embedded picture" if pictures == 1 else f"{pictures} embedded pictures"
     return f"the SVG has {subject}, not read: if the plan is a picture, send that PNG or JPEG itself"
-
-
-def _has_text(element: Element) -> bool:
-    return any(text.strip() for text in element.itertext())
 
 
 def _html_text(texts: int) -> str:

@@ -121,7 +121,8 @@ class Structured3D:
             raise DatasetError("unknown scene; names have the form 'scene_03250'", scene=name, path=self.root)
         annotation = read_annotation(self.root / name / ANNOTATION_FILE, name)
         cameras = []
-        for folder in sorted(_folders(self.root / name / RENDERING_FOLDER), key=_by_number):
+        folders = _folders(self.root / name / RENDERING_FOLDER)
+        for folder in sorted(folders, key=lambda path: (int(path.name) if path.name.isdecimal() else -1, path.name)):
             # Some rooms have perspective pictures only.
             if not (folder / "panorama").is_dir():
                 continue
@@ -187,7 +188,3 @@ def _folders(folder: Path) -> list[Path]:
     """Return the folders in one; none if it does not exist."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return [path for path in paths if not path.name.startswith(".") and path.is_dir()]
-
-
-def _by_number(folder: Path) -> tuple[int, str]:
-    return (int(folder.name) if folder.name.isdecimal() else -1, folder.name)

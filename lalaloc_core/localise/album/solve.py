@@ -91,7 +91,9 @@ def solve_album(
     states, bias = _states(ground, encoder, ordered, memory, links)
     walk = walk_order(ordered, links) if by_time else None
     weights = encoder.manifest.album
-    outside = [_outside(encoder, each) for each in ordered]
+    seen = (encoder.seen_objects([(each.photograph, 0.0)]) for each in ordered)
+    # Log likelihood ratios of a photograph taken outside to one of a room; 0 if no objects are known.
+    outside = [0.0 if objects is None else objects.outside for objects in seen]
     # What a person stated, and what is taken outside, does not tell how well the plan is read.
     telling = [
         state.rooms / state.photographs
@@ -239,12 +241,6 @@ def _room_shares(
     share = np.empty(alone.shape)
     share[order] = assign_rooms(evidence, pause=pause)
     return share
-
-
-def _outside(encoder: PhotographEncoder, photograph: AlbumPhotograph) -> float:
-    """Return the log likelihood ratio of a photograph taken outside to one of a room; 0 if no objects are known."""
-    seen = encoder.seen_objects([(photograph.photograph, 0.0)])
-    return 0.0 if seen is None else seen.outside
 
 
 def _pin(

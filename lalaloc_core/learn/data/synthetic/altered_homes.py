@@ -307,10 +307,6 @@ def _room(
     return {"id": name, "name": name, "type": kind, "ceiling_height_m": ceiling_m, "polygon": polygon}
 
 
-def _leave_out_openings(own: Scene, _homes: GeneratedScenes) -> Scene:
-    return dataclasses.replace(own, plan=without_openings(own.plan))
-
-
 def _replace_plan(own: Scene, homes: GeneratedScenes) -> Scene:
     """Show the photographs in the plan of another building; poses are those of other cameras."""
     number, other = _next_home(own, homes)
@@ -335,7 +331,7 @@ CHANGES: dict[str, tuple[str, Callable[[Scene, GeneratedScenes], Scene]]] = {
     "disturbed": ("disturbed", _disturb),
     "foreign": ("asked in plans of other buildings", _replace_plan),
     "mismatched": ("asked with photographs of others", _mismatch),
-    "unopened": ("plans without openings", _leave_out_openings),
+    "unopened": ("plans without openings", lambda own, _: dataclasses.replace(own, plan=without_openings(own.plan))),
 }
 
 
