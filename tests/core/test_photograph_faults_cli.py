@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lalaloc_core.cli import main
-from tests.core.fault_photographs import CONTRADICTED, FAULTS, FOLDER, LIBRARY_WORDS, Fault, fault_id
+from tests.core.fault_photographs import FAULTS, FOLDER, LIBRARY_WORDS, Fault, fault_id
 from tests.core.taken import EXAMPLES
 
 PLAN = str(EXAMPLES / "flat.json")
@@ -39,11 +39,6 @@ def test_files_are_localised_right_or_refused_by_name(capsys: pytest.CaptureFixt
 def test_statements_that_do_not_fit_are_corrected(fault: Fault, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["localise", PLAN, str(FOLDER / fault.name), *options_of(fault), "--json"]) == 0
     fault.check(json.loads(capsys.readouterr().out)[0])
-
-
-def test_contradicted_statement_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["localise", PLAN, str(FOLDER / CONTRADICTED.name), *options_of(CONTRADICTED), "--json"])
-    CONTRADICTED.check_warnings(json.loads(capsys.readouterr().out)[0])
 
 
 @pytest.mark.slow
