@@ -211,11 +211,6 @@ def test_errors_are_one_line(
         ("lab reproduce --table roof", 2, "unknown table 'roof'; --table is one of localisation"),
         ("lab reproduce", 2, "no table is chosen"),
         ("lab reproduce --table similarity", 2, "--data is missing"),
-        (
-            "lab synth --out {out} --scenes 250 --split test",
-            2,
-            "scenes is 250; the limits of split 'test' are 1 to 249",
-        ),
         ("lab synth --out {out} --scenes 1 --height 33", 2, "height is 33; it must be an even number"),
         ("lab synth --out {out} --scenes 1 --height 8", 2, "height is 8"),
         ("lab synth --out {out} --scenes 1 --seed -1", 2, "seed is -1"),

@@ -211,15 +211,6 @@ def test_pins_are_read_and_written_beside_the_event_loop(
     assert threads == {"lalaloc-reads"}
 
 
-@pytest.mark.slow
-def test_pins_of_a_plan_without_an_anchor_have_no_geojson(client: httpx.Client, pictures: list[bytes]) -> None:
-    album_id = create(client, upload(client, HOME))
-    add(client, album_id, pictures[:1])
-    wait_until_solved(client, album_id)
-    response = client.get(f"/albums/{album_id}/photographs", headers={"Accept": "application/geo+json"})
-    assert_problem(response, 409, "floorplan-unanchored")
-
-
 def copies(client: httpx.Client, album_id: str, files: list[tuple[str, bytes]]) -> zipfile.ZipFile:
     answer = client.post(f"/albums/{album_id}/copies", files=[("photo", file) for file in files])
     assert (answer.status_code, answer.headers["content-type"]) == (200, "application/zip"), answer.text
@@ -713,17 +704,15 @@ def test_albums_take_turns_and_a_deleted_one_does_not_fail(monkeypatch: pytest.M
     assert not any(call.kwargs["failed"] for call in release.call_args_list)
 
 
-def test_heartbeat_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_solver_and_its_heartbeat_log_an_error_and_go_on(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
     renew = Mock(side_effect=[ValueError("damaged"), False])
     progress = AlbumProgress()
     asyncio.run(asyncio.wait_for(solver_of(renew=renew)._renew(job_of("a"), progress), 10.0))
     assert progress.stopped
     assert "renewing a lease failed" in caplog.text
-
-
-def test_solver_logs_an_error_and_goes_on(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
     due = Mock(side_effect=[ValueError("damaged"), asyncio.CancelledError()])
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(solver_of(due=due).run())
@@ -743,9 +732,9 @@ def test_pin_with_all_suggestions_takes_no_more_than_counts_as_stored() -> None:
 
 def test_plan_without_an_anchor_is_named_beside_a_pin_set_aside(monkeypatch: pytest.MonkeyPatch) -> None:
     places = None, SimpleNamespace(floorplan_id="f")
-    rows = [SimpleNamespace(pin=SimpleNamespace(place=place, geopose=None)) for place in places]
+    pins = [SimpleNamespace(place=place, geopose=None) for place in places]
+    rows = [SimpleNamespace(id="photograph", pin=pin, model_dump=dict) for pin in pins]
     monkeypatch.setattr(album_photographs, "_answers", lambda *_: rows)
-    monkeypatch.setattr(album_photographs, "pins_geojson", lambda _: None)
     album: Any = SimpleNamespace(venue_id=None)
     with pytest.raises(UnanchoredPlanError, match="'f'"):
         album_photographs._content("application/geo+json", album, [], None, None)

@@ -447,17 +447,6 @@ def test_remote_job_of_replaced_revision_ends(open_store: OpenStore, make_grids:
 # A large grid in the background
 
 
-def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
-    grids = make_grids(store, grid_step_m=0.4)
-    large, small = _add(store, HALL, "large"), _add(store, PLAN, "small")
-    slow = _begun(encoders, grids, large)
-    quick = grids.compute(small, 1.5)
-    encoders.go_on.set()
-    quick.result(30.0)
-    assert not slow.done()
-    assert slow.result(60.0) is not None
-
-
 @pytest.mark.slow
 def test_overtaken_grid_keeps_its_lease(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     grids = make_grids(store, grid_lease_s=2.0)
