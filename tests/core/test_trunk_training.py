@@ -242,10 +242,6 @@ class TestRuns:
             if "_bn" in name:
                 assert torch.equal(trained[name], value), name
 
-    def test_starting_from_a_ring_image_encoder_is_refused(self, tiny_bundle: Path, tmp_path: Path) -> None:
-        with pytest.raises(CheckpointError, match="was trained with architecture ring"):
-            run.train_stage("image", SHORT, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
-
     def test_run_starts_from_a_trunk_bundle(self, folder: Path) -> None:
         start = load_warm_start(folder / "bundle", "image", TINY)
         start.load_into({"image_encoder": build_image_encoder(TINY)})

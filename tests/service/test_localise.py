@@ -6,7 +6,6 @@ import dataclasses
 import re
 import shutil
 import threading
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import monotonic
@@ -27,7 +26,6 @@ from lalaloc_core.photograph.spheres import read_sphere
 from service.grids import builder
 from service.schemas import TimingsAnswer
 from service.settings import Settings
-from tests.painted import png_file
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
@@ -170,20 +168,6 @@ def test_every_part_and_a_known_plan_are_required(client: httpx.Client, flat: st
     assert_problem(client.post("/localise", json={"floorplan_id": flat}), 415, "unsupported-media")
     assert_problem(client.post("/localise"), 415, "unsupported-media")
     assert "'nowhere'" in assert_problem(localise(client, "nowhere", sphere), 404, "unknown-floorplan")["detail"]
-
-
-BAD_PICTURES = {
-    "empty": (b"", "empty"),
-    "truncated": (encode_picture(512, 256, "JPEG")[:3000], "rows are missing, because the file ends too early"),
-    "bomb": (png_file(20_000, 10_000, zlib.compress(b"\0")), "pixels"),
-}
-
-
-@pytest.mark.parametrize(("picture", "message"), BAD_PICTURES.values(), ids=BAD_PICTURES.keys())
-def test_invalid_sphere_is_rejected_with_its_fault(
-    client: httpx.Client, flat: str, picture: bytes, message: str
-) -> None:
-    assert message in assert_problem(localise(client, flat, picture), 422, "invalid-photograph")["detail"]
 
 
 def test_camera_height_is_solved_unless_exact(client: httpx.Client, flat: str, sphere: bytes) -> None:
