@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from tests.client.conftest import MakeClient
 from tests.core.fault_photographs import FOLDER
-from tests.service.conftest import FLAT
+from tests.service.conftest import FLAT, StartApp
 
 APP_SETTINGS = {"bundle": "tiny_view_bundle"}
 

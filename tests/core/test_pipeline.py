@@ -66,14 +66,14 @@ class TestAccuracy:
         for seed in range(10):
             pose = random_pose(flat, seed)
             query = layout_query(encoders, flat, pose, by_profile=by_profile)
-            best = {refine: search(query, refine=refine).candidates[0] for refine in errors}
-            for refine, candidate in best.items():
-                errors[refine].append(float(np.linalg.norm(candidate.position_m - pose.position_m[0])))
-            costs = [candidate.cost for candidate in best.values()]
+            best = [search(query, refine=refine).candidates[0] for refine in errors]
+            for distances, candidate in zip(errors.values(), best, strict=True):
+                distances.append(float(np.linalg.norm(candidate.position_m - pose.position_m[0])))
+            costs = [candidate.cost for candidate in best]
             # By walls, VDR lowers another cost than LPO.
             assert by_profile or costs == sorted(costs, reverse=True)
             # Batches of other sizes round differently.
-            latent_distances = [candidate.latent_distance for candidate in best.values()]
+            latent_distances = [candidate.latent_distance for candidate in best]
             assert by_profile or costs == pytest.approx(latent_distances, abs=2e-3)
         median = {refine: float(np.median(distances)) for refine, distances in errors.items()}
         assert median["lpo"] < 0.005 < median["vdr"] < median["none"] < 0.5
