@@ -205,7 +205,7 @@ def test_photograph_of_an_album_that_fits_badly_is_uncertain_and_not_set_aside(
     states = States.of(memory.evidence[kitchen.id], encoder().manifest.ring_sectors)
     rooms = len(ground.plan.rooms)
     share = np.append(np.full(rooms, 0.3 / rooms), 0.7)
-    pins = [_pin_of(ground, kitchen, states, share, None, fits=fits) for fits in (True, False)]
+    pins = [_pin_of(ground, kitchen, states, share, None, fits=fits, is_outside=False) for fits in (True, False)]
     assert [pin.state for pin in pins] == ["set_aside", "uncertain"]
     assert pins[1].confidence == pytest.approx(0.3 / rooms)
 
