@@ -82,6 +82,11 @@ def test_stairs_are_parallel_lines_at_equal_distances():
     assert tread_spacings(uneven) == []
 
 
+def test_several_stairs_of_a_home_tell_what_one_does():
+    one, three = (present(combine(Measures(leaves=[84.0] * 6, treads=[24.5] * count), 0.01)) for count in (1, 3))
+    assert three.metres_per_unit == pytest.approx(one.metres_per_unit, rel=1e-6)
+
+
 def test_written_areas_of_a_picture_give_its_scale():
     page = PrintedPlan(dimensions=False)
     report = import_plan(page.file(), limits=LIMITS).report

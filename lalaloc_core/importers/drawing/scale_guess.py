@@ -219,10 +219,12 @@ def _likelihoods(measures: Measures, grid: Likelihood) -> dict[str, tuple[int, L
         return len(terms), sum(terms, start=none)
 
     dimensions = [_dimension(grid, dimension) for dimension in measures.dimensions]
+    # Stairs of one home are alike, so all of them tell what one does.
+    tread = [(float(np.median(measures.treads)), _TREAD)] if measures.treads else []
     return {
         "leaf": (len(measures.leaves), _leaves(grid, measures.leaves)),
         "wall": usual("wall", [(measures.wall, _WALL)]),
-        "tread": usual("tread", [(spacing, _TREAD) for spacing in measures.treads]),
+        "tread": (len(measures.treads), usual("tread", tread)[1]),
         "fixture": usual("fixture", [(size, _FIXTURE[kind]) for kind, size in measures.fixtures]),
         "area": usual("area", [(math.sqrt(units2), (math.sqrt(m2), _AREA_STD)) for m2, units2 in measures.areas]),
         "dimension": (len(dimensions), sum(dimensions, start=none)),
