@@ -286,7 +286,7 @@ def _plain_rows(pictures: UInt8[np.ndarray, "f n m 3"], spread: float) -> tuple[
 def _blurred_rows(greys: UInt8[np.ndarray, "f n m"]) -> int:
     """Return the number of rows of each of two equal bars, which are smooth and end at straight edges; 0 without."""
     # Few edges are not to outweigh many small steps.
-    changes = [cv2.min(cv2.absdiff(grey[1:], grey[:-1]), _MAX_STEP) for grey in greys]
+    changes = [np.minimum(cv2.absdiff(grey[1:], grey[:-1]), np.uint8(_MAX_STEP)) for grey in greys]
     steps = np.mean([cv2.reduce(change, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] for change in changes], axis=0)
     wide = np.max([steps[:-2], steps[1:-1], steps[2:]], axis=0)
     edges = np.minimum(wide, wide[::-1])[: len(wide) // 2]

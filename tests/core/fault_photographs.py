@@ -74,7 +74,7 @@ class Fault:
 
 
 _LIVING = {"room": "living room", "x_m": 2.15, "y_m": 2.3, "heading_deg": 30.0}
-_TURNED = _LIVING | {"heading_deg": 335.0}
+_TURNED = {"room": "living room", "x_m": 2.15, "y_m": 2.3, "heading_deg": 335.0}
 _CORNER = {"room": "living room", "x_m": 3.0, "y_m": 1.54, "heading_deg": 335.0}
 _SMALL = '{"fx":232.4,"fy":232.4,"cx":319.5,"cy":239.5}'
 _SIDEWAYS = '{"fx":581,"fy":581,"cx":799.5,"cy":599.5}'

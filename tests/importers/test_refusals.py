@@ -118,7 +118,8 @@ def test_page_that_is_painted_over_and_over_is_refused_before_it_is_rendered(mon
 def test_changed_picture_of_a_plan_is_read_or_refused(seed: int):
     chance = random.Random(seed)
     page = Image.open(io.BytesIO(draw_plan(STYLES[seed % len(STYLES)], seed).png())).convert("RGB")
-    page.thumbnail((chance.choice([300, 500, 700]),) * 2)
+    side = chance.choice([300, 500, 700])
+    page.thumbnail((side, side))
     page = page.rotate(chance.choice([0.0, 90.0, chance.uniform(-180.0, 180.0)]), expand=True, fillcolor="white")
     page = page.crop((chance.randint(0, page.width // 3), 0, page.width, chance.randint(page.height // 2, page.height)))
     page = ImageOps.invert(page) if seed % 2 else Image.open(io.BytesIO(picture_file(page, "JPEG", quality=8)))

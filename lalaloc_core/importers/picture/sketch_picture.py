@@ -210,13 +210,11 @@ def _terraces(reading: _Reading, ink: Ink, letterings: Sequence[Lettering]) -> l
     blocked = ink.mask.astype(np.uint8)
     rings = [ink.to_pixels(np.asarray(gap.shape.exterior.coords)) - 0.5 for gap in reading.enclosed.gaps]
     cv2.fillPoly(blocked, [np.round(ring).astype(np.int32) for ring in rings], 1)
-    outlines = np.array([shape.outline for shape in closed_shapes(replace(ink, mask=blocked > 0), _TERRACE)])
-    is_beside = shapely.dwithin(outlines, rooms, _AT_TERRACE_M) & ~shapely.intersects(
-        outlines, rooms.buffer(-_BESIDE_M)
-    )
-    tree = shapely.STRtree(outlines[is_beside])
-    _, nearest = tree.query_nearest(names, max_distance=_AT_TERRACE_M, all_matches=False)
-    return [tree.geometries[index] for index in np.unique(nearest)]
+    inside = rooms.buffer(-_BESIDE_M)
+    outlines = [shape.outline for shape in closed_shapes(replace(ink, mask=blocked > 0), _TERRACE)]
+    beside = [each for each in outlines if each.dwithin(rooms, _AT_TERRACE_M) and not each.intersects(inside)]
+    _, nearest = shapely.STRtree(beside).query_nearest(names, max_distance=_AT_TERRACE_M, all_matches=False)
+    return [beside[index] for index in np.unique(nearest)]
 
 
 def _without_islands(room: shapely.Polygon, builder: ReportBuilder) -> shapely.Polygon:
