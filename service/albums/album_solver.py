@@ -109,7 +109,10 @@ class AlbumSolver:
         room, find = AT_A_TIME - len(self._running), self._store.album_jobs.due
         sha256, begun = self._localiser.model.sha256, list(self._running)
         due = await self._reads.run(_SERVICE, find, sha256, begun, max(room, 1), list(self._served))
-        if due and room <= 0:
+        if not due:
+            # Nobody waits, so the round is over.
+            self._served.clear()
+        elif room <= 0:
             self._end_turn()
         for tenant, album_id in due[:room]:
             if tenant in self._served:

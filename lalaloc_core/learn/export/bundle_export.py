@@ -156,11 +156,12 @@ def add_objects(folder: Path, detector: Path | None = None) -> Bundle:
     networks: list[tuple[str, nn.Module, list[str]]] = [(OBJECTS_ONNX, ObjectNetwork(), ["probability", "by_column"])]
     if detector is not None:
         networks.append((DETECTOR_ONNX, DetectorNetwork(detector), ["by_column"]))
-    (bundle.folder / DETECTOR_ONNX).unlink(missing_ok=True)
     with _new_files(bundle.folder) as work:
         for name, network, outputs in networks:
             _freeze(network)
             _export(work / name, network, {"image": image}, outputs, sides)
+    if detector is None:
+        (bundle.folder / DETECTOR_ONNX).unlink(missing_ok=True)
     listed = OBJECTS if detector is None else (*OBJECTS, *DETECTED)
     objects = dataclasses.replace(
         bundle.manifest.objects or ObjectsManifest(names=[], shares=[]),
