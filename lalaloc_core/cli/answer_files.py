@@ -49,7 +49,8 @@ def write_files(
     from lalaloc_core.draw.plan_overlays import draw_places
 
     if arguments.csv is not None:
-        write_file(arguments.csv, csv_text(_COLUMNS, map(_row, answers)))
+        rows = ([no_formula(a["photograph"]), *_cells(a), no_formula(a.get("error", ""))] for a in answers)
+        write_file(arguments.csv, csv_text(_COLUMNS, rows))
     if arguments.geojson is not None:
         write_file(arguments.geojson, json.dumps(_collection(plan, answers)) + "\n")
     if arguments.map is not None:
@@ -63,10 +64,6 @@ def csv_text(columns: Iterable[str], rows: Iterable[Sequence[object]]) -> str:
     writer.writerow(columns)
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _row(answer: dict[str, Any]) -> list[str]:
-    return [no_formula(answer["photograph"]), *_cells(answer), no_formula(answer.get("error", ""))]
 
 
 def _cells(answer: dict[str, Any]) -> list[str]:

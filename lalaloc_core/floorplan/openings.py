@@ -266,14 +266,11 @@ def _nearest(contacts: Sequence[_Contact], length_m: float) -> list[_Contact]:
     """Keep only the nearest wall of a room at each point of an opening."""
     kept: list[_Contact] = []
     for contact in sorted(contacts, key=lambda contact: contact.away_m):
-        shared_m = [_shared(contact, other) * length_m for other in kept if other.room == contact.room]
-        if max(shared_m, default=0.0) <= TOUCHING_M:
+        own = (other for other in kept if other.room == contact.room)
+        shared = [min(contact.high, other.high) - max(contact.low, other.low) for other in own]
+        if length_m * max(shared, default=0.0) <= TOUCHING_M:
             kept.append(contact)
     return sorted(kept, key=lambda contact: (contact.room, contact.wall))
-
-
-def _shared(first: _Contact, second: _Contact) -> float:
-    return min(first.high, second.high) - max(first.low, second.low)
 
 
 def _faces(

@@ -61,10 +61,6 @@ _FOCAL_FLOOR = 0.03
 _Mode = tuple[np.ndarray, float, np.ndarray]
 # Largest gap between two pieces of a line and offset across it (shares of the longer side), and their largest turn.
 _GAP, _OFFSET, _TURN = 0.03, 0.006, np.radians(9.0)
-# A picture that needs a steeper pitch than this as it is, and less than that turned by a quarter, can lie on its side
-# if its lines fit that better by these log odds. Of 510 views of real and rendered rooms, tilted by up to 15°, none
-# does; of 919 such views on their side 18 %, and of 165 that look down by 20° to 30° 6 %: it is said, and not believed.
-_STEEP, _LEVEL, _ON_SIDE = math.radians(20.0), math.radians(15.0), 3.0
 # Shortest chain, and its least distance from the centre (shares of half of the diagonal).
 _SHORTEST, _OFF_CENTRE = 0.3, 0.25
 # Fewest chains, and the share of their weight that must bend more than half as much. They lie on several sides of the
@@ -145,35 +141,6 @@ def lines_of(segments: Float[np.ndarray, "n 4"], camera: Camera) -> Lines:
 def estimate_attitude(lines: Lines) -> Attitude:
     """Return the most probable tilt of a camera that sees `lines`; with few lines, the prior of handheld cameras."""
     return _attitude(_modes(lines, _REFINED))
-
-
-def side_warnings(lines: Lines, upright: Attitude) -> tuple[str, ...]:
-    """Return a warning if a picture seems to lie on its side, by its tilt as it is.
-
-    The same directions explain the lines either way, as the vertical one and a horizontal one change places: towards a
-    wall they tell nothing. Towards a corner, walls would need a steep pitch, which is rare.
-    """
-    if abs(upright.pitch) < _STEEP:
-        return ()
-    normal, middle = (rays[:, ::-1] * (1.0, 1.0, -1.0) for rays in (lines.normal, lines.middle))
-    turned = replace(lines, normal=normal, middle=middle)
-    side = estimate_attitude(turned)
-    if abs(side.pitch) > _LEVEL or _fit(turned, side) - _fit(lines, upright) < _ON_SIDE:
-        return ()
-    as_it_is, on_side, limit = (math.degrees(abs(pitch)) for pitch in (upright.pitch, side.pitch, _STEEP))
-    return (
-        f"the photograph may lie on its side: as it is, its lines need a tilt of {as_it_is:.0f}°, more than "
-        f"{limit:.0f}°, and turned by 90° one of {on_side:.0f}°; turn it upright and send it again, or state "
-        "pitch_deg if the camera looked up or down",
-    )
-
-
-def _fit(lines: Lines, attitude: Attitude) -> float:
-    """Return the log probability of an attitude, whose three directions count alike."""
-    directions = _directions(np.array([attitude.pitch, attitude.roll, attitude.yaw]))
-    density = _densities(_errors(lines, directions), _sigmas(lines, _SIGMA)[:, None]).mean(axis=1)
-    prior = 0.5 * float(np.square(np.array([attitude.pitch, attitude.roll]) / _PRIOR).sum())
-    return float(_weights(lines) @ np.log(_SHARES.sum() * density + _OUTLIERS)) - prior
 
 
 def estimate_calibration(

@@ -16,7 +16,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from PIL import ExifTags, Image
 
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.file_kinds import is_drawing
@@ -29,7 +29,6 @@ from lalaloc_core.photograph.levelling import (
     estimate_calibration,
     find_segments,
     lines_of,
-    side_warnings,
 )
 from lalaloc_core.photograph.overlap import find_features
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
@@ -95,6 +94,7 @@ class Photograph:
         axes: rotation from level rays (right, forward, up) to the camera's frame; None for a full sphere.
         compass_heading: azimuth of the centre, radians clockwise from true north; None if not in the metadata.
         overview: parts that tell its angles to photographs that overlap it, in albums and turns.
+        is_upright: its metadata or a stated tilt tell which side is up; if not, it can lie on the side or upside down.
     """
 
     projection: Projection
@@ -113,6 +113,7 @@ class Photograph:
     compass_heading: float | None = None
     taken: Taken | None = None
     overview: Overview | None = None
+    is_upright: bool = False
     warnings: tuple[str, ...] = ()
 
     @property
@@ -214,7 +215,9 @@ def open_photograph(
         photograph = _photograph_of_sphere(pixels, lens, stated, opened.metadata)
     else:
         photograph = photograph_of_picture(pixels, (opened.width, opened.height), lens, stated, size, purpose)
-    return replace(photograph, taken=taken)
+    # Software without a sensor states an orientation, too, but no camera.
+    is_upright = photograph.is_upright or (bool(taken.make) and ExifTags.Base.Orientation in file.exif)
+    return replace(photograph, taken=taken, is_upright=is_upright)
 
 
 @dataclass(eq=False)
@@ -369,10 +372,6 @@ def photograph_of_picture(
     lines = lines_of(segments, small)
     attitude = attitude or estimate_attitude(lines)
     warnings = (*warnings, *bend_warnings(segments, small))
-    is_tilt_known = stated.pitch_deg is not None or stated.roll_deg is not None or isinstance(camera, Around)
-    # All frames of a film lie as it does, which its motion tells better.
-    if not is_tilt_known and purpose != "film":
-        warnings = (*warnings, *side_warnings(lines, attitude))
     estimated = (
         Assumed(value=angle, sd=sd, source="estimated" if sd < MAX_ESTIMATED_SD else "assumed")
         for angle, sd in ((attitude.pitch, attitude.pitch_sd), (attitude.roll, attitude.roll_sd))
@@ -408,6 +407,7 @@ def photograph_of_picture(
         camera=camera,
         axes=camera_axes(pitch=tilt, roll=roll.value),
         overview=overlapping,
+        is_upright=stated.pitch_deg is not None or stated.roll_deg is not None or isinstance(camera, Around),
         warnings=warnings,
     )
 

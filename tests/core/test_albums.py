@@ -6,7 +6,6 @@ from datetime import datetime
 
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw, ImageFilter
 
 from lalaloc_core.bundle import AlbumWeights
 from lalaloc_core.errors import InvalidCorrectionError, InvalidEntryError, InvalidFeaturesError, InvalidInputError
@@ -34,7 +33,6 @@ from lalaloc_core.photograph import Assumed, open_photograph
 from lalaloc_core.photograph.exif import Taken
 from tests.core.shipped import bundle, encoder
 from tests.core.taken import EXAMPLES
-from tests.painted import picture_file
 from tests.strategies import present
 
 NAMES = ("kitchen.jpg", "study.jpg", "bedroom.jpg", "living_room.jpg", "phone.jpg")
@@ -149,37 +147,20 @@ def test_memory_of_another_plan_is_not_used(ground: AlbumGround, photographs: li
     assert seen == [1]
 
 
-def _facade(seed: int) -> bytes:
-    """Return a picture of a brick house behind a lawn, as JPEG."""
-    width, height = 640, 480
-    pixels = np.linspace([110, 160, 220], [210, 230, 250], height)[:, None, :].repeat(width, axis=1)
-    pixels[370:] = np.array([70, 110, 40]) + np.random.default_rng(seed).normal(0.0, 25.0, (height - 370, width, 1))
-    picture = Image.fromarray(pixels.clip(0, 255).astype(np.uint8))
-    draw = ImageDraw.Draw(picture)
-    draw.rectangle((90, 150, 550, 370), fill=(170, 90, 70))
-    for top in range(150, 370, 8):
-        draw.line((90, top, 550, top), fill=(205, 190, 180))
-        for left in range(90 + top % 16, 550, 24):
-            draw.line((left, top, left, top + 8), fill=(205, 190, 180))
-    draw.polygon(((70, 150), (320, 60), (570, 150)), fill=(95, 60, 50))
-    for left in range(120, 520, 85):
-        for top in (180, 270):
-            draw.rectangle((left, top, left + 50, top + 60), fill=(60, 80, 105), outline=(240, 240, 235), width=5)
-    return picture_file(picture.filter(ImageFilter.GaussianBlur(0.7)), "JPEG")
+def _without(photograph: AlbumPhotograph, id: str, *outputs: str) -> AlbumPhotograph:
+    """Return a photograph whose walls or objects are not seen."""
+    features = present(photograph.photograph.features)
+    empty = {name: np.zeros_like(features.outputs[name]) for name in outputs}
+    features = replace(features, outputs={**features.outputs, **empty})
+    return replace(photograph, id=id, photograph=replace(photograph.photograph, features=features))
 
 
-@pytest.mark.slow
-def test_photographs_of_a_facade_are_set_aside(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
-    size = {"sphere_size": sphere_size(encoder().manifest), "patch_size": patch_size(encoder().manifest)}
-    outside = [
-        photograph_entry(
-            f"outside {number}",
-            encoder().with_features(open_photograph(_facade(number), purpose="album", **size)),
-            replace(photographs[-1].taken, at=datetime(2026, 5, 1, 12, 10 + number)),
-        )
-        for number in range(2)
-    ]
-    pins = solve_album(ground, encoder(), [*photographs, *outside]).pins
+def test_photographs_without_walls_and_objects_are_set_aside(
+    ground: AlbumGround, photographs: list[AlbumPhotograph]
+) -> None:
+    blank = [_without(photographs[-1], name, "seen", "object_probability") for name in ("façade", "garden")]
+    outside = [replace(each, colours=np.roll(each.colours, 32)) for each in blank]
+    pins = solve_album(ground, encoder(), [*photographs, *outside], by_time=False).pins
     assert [each.pose.room_id for each in pins[:-2] if each.pose] == list(ROOMS)
     for pin in pins[-2:]:
         assert (pin.state, pin.pose) == ("set_aside", None)
@@ -187,12 +168,7 @@ def test_photographs_of_a_facade_are_set_aside(ground: AlbumGround, photographs:
 
 
 def test_photograph_that_shows_no_wall_is_not_sure(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
-    phone = photographs[-1]
-    assert phone.photograph.features is not None
-    outputs = dict(phone.photograph.features.outputs)
-    outputs["seen"] = np.full_like(outputs["seen"], 0.0)
-    features = replace(phone.photograph.features, outputs=outputs)
-    blind = replace(phone, id="blind", photograph=replace(phone.photograph, features=features))
+    blind = _without(photographs[-1], "blind", "seen")
     pin = solve_album(ground, encoder(), [blind]).pins[0]
     assert pin.state in ("set_aside", "uncertain")
     assert pin.within_1m < 0.2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -53,6 +54,21 @@ def plan(*types: str) -> FloorPlan:
         for k, kind in enumerate(types)
     ]
     return FloorPlan.from_dict({"rooms": rooms})
+
+
+@pytest.mark.parametrize("headings_deg", [(150.0,), (BED_DEG, 150.0, 210.0)])
+@pytest.mark.parametrize(
+    ("turns", "expected"),
+    [(0, []), (1, ["on its side: turned by 90° to the right"]), (2, ["upside down: turned by 180°"])],
+)
+def test_photographs_that_do_not_lie_upright_are_named(
+    headings_deg: tuple[float, ...], turns: int, expected: list[str]
+) -> None:
+    upright = [view(heading_deg) for heading_deg in headings_deg]
+    lying = [replace(each, thumbnail=np.rot90(present(each.thumbnail), turns).copy()) for each in upright]
+    warnings = query(*((replace(each, is_upright=False), 0.0) for each in lying)).warnings
+    assert [re.sub(".* may lie (.*), the objects.*", r"\1", text) for text in warnings] == expected
+    assert query(*((each, 0.0) for each in lying)).warnings == ()
 
 
 def test_bed_is_seen_where_it_stands() -> None:

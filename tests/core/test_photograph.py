@@ -16,14 +16,13 @@ from PIL import ExifTags
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.nets.layout_network import RingConfig
 from lalaloc_core.nets.view_network import ViewEncoderConfig
-from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, StatedCamera, open_photograph
+from lalaloc_core.photograph import Intrinsics, PatchSize, Photograph, open_photograph
 from lalaloc_core.photograph.cameras import Around, Camera, Fisheye, Perspective
 from lalaloc_core.photograph.levelling import measure_bend
 from lalaloc_core.photograph.patches import UNSEEN, Patch, joined_patches, patch_azimuths
 from lalaloc_core.photograph.picture_files import PhotographLimits
 from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
-from lalaloc_core.photograph.turned import open_turn
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, PHONE, jpeg, opened, sphere, take
 from tests.painted import picture_file
@@ -359,21 +358,14 @@ def test_fisheye_picture_that_is_read_in_perspective_has_bent_lines(field: float
 def test_lines_of_a_picture_in_perspective_are_straight(name: str, heading_deg: float) -> None:
     camera = Perspective.of_hfov(1280, 960, math.radians(80.0))
     photograph = opened(jpeg(take(sphere(name), camera, heading_deg=heading_deg)), hfov_deg=80.0)
-    assert not any("bent" in text or "on its side" in text for text in photograph.warnings)
+    assert not any("bent" in text for text in photograph.warnings)
 
 
-@pytest.mark.parametrize("quarter", [1, -1])
-@pytest.mark.parametrize("exif", [PHONE, None])
-def test_photograph_on_its_side_is_said_to_be(quarter: int, exif: dict[Any, Any] | None) -> None:
+def test_camera_with_an_orientation_or_a_stated_tilt_tells_which_side_is_up() -> None:
     upright = view_of(MAIN, heading_deg=120.0)
-    assert not any("on its side" in text for text in opened(jpeg(upright, exif)).warnings)
-    content = jpeg(np.rot90(upright, quarter).copy(), exif)
-    (text,) = (text for text in opened(content).warnings if "on its side" in text)
-    assert "turn it upright and send it again, or state pitch_deg" in text
-    turn, _ = open_turn([jpeg(upright, exif), content], StatedCamera(), sphere_size=(128, 256), patch_size=None)
-    assert [text in view.warnings for view in turn] == [False, True]
-    # A camera that measures its tilt knows it.
-    assert not any("on its side" in text for text in opened(content, pitch_deg=40.0).warnings)
+    by_software, by_camera = jpeg(upright, orientation=1), jpeg(upright, orientation=1, maker="Phone")
+    assert [opened(content).is_upright for content in (by_software, by_camera)] == [False, True]
+    assert opened(by_software, pitch_deg=40.0).is_upright
 
 
 def test_bend_is_measured_in_shares_of_the_longer_side() -> None:

@@ -102,7 +102,7 @@ def test_warnings_about_the_album_are_lines_of_the_report() -> None:
 def test_photographs_on_their_side_are_named_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, camera = tmp_path / "visit", Perspective.of_hfov(640, 480, math.radians(67.3))
     folder.mkdir()
-    for number, heading_deg in enumerate((120.0, 300.0)):
+    for number, heading_deg in enumerate((135.0, 315.0)):
         upright = take(sphere("living_room"), camera, heading_deg=heading_deg)
         (folder / f"{number}.jpg").write_bytes(jpeg(np.rot90(upright).copy(), PHONE))
     command = ["pin", str(EXAMPLES / "flat.json"), str(folder), "--out", str(tmp_path / "out"), "--no-copies"]

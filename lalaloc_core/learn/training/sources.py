@@ -151,12 +151,6 @@ class GeneratedSource:
         return RendererCache(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)
 
 
-def _picture_key(
-    _: SceneSource, scene: Scene, camera: Camera, look: Appearance, height: int, width: int
-) -> tuple[Any, ...]:
-    return scene.name, camera.name, look, height, width
-
-
 @dataclass(eq=False)
 class SceneSource:
     """Source of a data set's training scenes in shuffled epochs; each visit draws some of a scene's cameras.
@@ -243,7 +237,7 @@ class SceneSource:
             return self._read(scene, camera, look, height, width)
         return None
 
-    @cachedmethod(attrgetter("_pictures"), key=_picture_key)
+    @cachedmethod(attrgetter("_pictures"), key=lambda _, scene, camera, *how: (scene.name, camera.name, *how))
     def _read(self, scene: Scene, camera: Camera, look: Appearance, height: int, width: int) -> np.ndarray:
         return camera.photographs[look].image(height, width)
 

@@ -57,7 +57,7 @@ def compose_answer(
     candidates = [_possible(place, found.query, share) for place, share in zip(placed, shares, strict=True)]
     covariance_m2, heading_std_deg = _uncertainty(placed[0], model)
     best, reason = candidates[0], None
-    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
+    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings, *found.query.warnings]
     if confidence is not None:
         reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
     return Answer(
@@ -161,7 +161,7 @@ def compose_tracked(
             for candidate, probability in zip(found.candidates, found.probability, strict=True)
         ],
         motion_contradicted=list(found.contradicted),
-        warnings=[*about_motion, *warnings, *spot.photograph.warnings],
+        warnings=[*about_motion, *warnings, *spot.photograph.warnings, *query.warnings],
         view=spot.view,
         model=ModelAnswer.of(bundle),
     )

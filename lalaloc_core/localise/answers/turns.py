@@ -247,7 +247,9 @@ def compose_turn(
         for index in found.contradicted
     ]
     film = turn.film
-    fields: dict[str, Any] = vars(poses[0]) | {"warnings": [*turn.warnings, *contradicted, *named, *warnings]}
+    fields: dict[str, Any] = vars(poses[0]) | {
+        "warnings": [*turn.warnings, *contradicted, *named, *warnings, *found.pictures[0].query.warnings]
+    }
     return TurnAnswer(
         **fields,
         poses=poses,

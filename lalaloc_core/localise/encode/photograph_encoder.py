@@ -23,6 +23,7 @@ from lalaloc_core.localise.encode.view_encoder import (
     ObjectEncoder,
     ViewEncoder,
     objects_of_views,
+    upright_warnings,
 )
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
@@ -115,7 +116,9 @@ class PhotographEncoder:
         assert self._views is not None
         objects = self._beside(self._object_outputs, photograph)
         outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0) | objects()
-        return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
+        warnings = (*photograph.warnings, *upright_warnings([outputs.pop("upright")] if "upright" in outputs else []))
+        features = PhotographFeatures(outputs, photograph.patch_azimuths)
+        return replace(photograph, features=features, warnings=warnings)
 
     def _beside(
         self, work: Callable[[_ArgumentT], _ResultT], argument: _ArgumentT, *, with_helper: bool = True
@@ -146,14 +149,15 @@ class PhotographEncoder:
         if self._objects is None:
             return None
         assert self.manifest.objects is not None
-        views = []
+        views, upright = [], []
         for view, turn in turned:
             outputs = self._objects.outputs(view) if view.features is None else view.features.outputs
             # Features of earlier versions have no objects.
             if not outputs.keys() >= set(OBJECT_OUTPUTS):
                 return None
             views.append((outputs["object_probability"], outputs["object_azimuth"] + turn))
-        return objects_of_views(self.manifest.objects, views)
+            upright += [outputs["upright"]] if "upright" in outputs else []
+        return replace(objects_of_views(self.manifest.objects, views), warnings=upright_warnings(upright))
 
     def check(self, photograph: Photograph) -> None:
         """Refuse a photograph that the model cannot encode.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -39,6 +41,12 @@ _LEAST, _NEVER, _MOST_SEEN = 0.1, 1e-9, 0.98
 # Probability of all objects together, which are those of households, and the log likelihood ratio of outside to inside:
 # of 32 real photographs outside (12 of streets, façades and woods), and of 122 real and 220 rendered views of rooms.
 _HOUSEHOLD, _OUTSIDE = (0.02, 0.035, 0.05, 0.07, 0.09, 0.12, 0.2), (5.0, 4.2, 3.0, 1.5, 0.5, -1.5, -3.0)
+# Weights of recognised objects in the log odds of a picture that is upright. Probabilities that are added before the
+# log of one object and of all, the weight of each of several photographs, and the probability that is warned about.
+_UPRIGHT = tomllib.loads(Path(__file__).with_name("upright.toml").read_text(encoding="utf-8"))
+_RARE, _ANY, _SEVERAL, _TURNED = 0.003, 0.01, 0.5, 0.95
+# Where a picture lies that one to three quarter turns to the left make upright, and how to turn it.
+_LIES = (("on its side", "90° to the left"), ("upside down", "180°"), ("on its side", "90° to the right"))
 
 
 class ViewEncoder:
@@ -162,10 +170,22 @@ class ObjectEncoder:
         excess = np.maximum(score[0].max(axis=1) - self._manifest.detected_floor, 0.0)
         detected = self._manifest.detected_weight / (1.0 - self._manifest.detected_floor) * excess
         column = np.concatenate([by_column[0].argmax(axis=1), score[0].argmax(axis=1)])
-        return {
+        found = {
             "object_probability": np.concatenate([probability[0], detected]).astype(np.float32),
             "object_azimuth": _column_azimuths(photograph, by_column.shape[2])[column],
         }
+        return found if photograph.is_upright else found | {"upright": self._upright(thumbnail, probability[0])}
+
+    def _upright(
+        self, thumbnail: UInt8[np.ndarray, "h w 3"], probability: Float[np.ndarray, "n"]
+    ) -> Float[np.ndarray, "4"]:
+        """Return the log odds that a picture is upright as it is, and turned to the left by one to three quarters."""
+        turned = (np.ascontiguousarray(np.rot90(thumbnail, turns))[None] for turns in (1, 2, 3))
+        rows = np.stack(
+            [probability, *(as_array(self._session.run(["probability"], {"image": each})[0])[0] for each in turned)]
+        )
+        weights = np.array([_UPRIGHT.get(name, 0.0) for name in self._manifest.names[: rows.shape[1]]])
+        return np.log(rows + _RARE) @ weights + _UPRIGHT["all objects"] * np.log(rows.sum(axis=1) + _ANY)
 
     def warm_up(self) -> None:
         """Run the network once, because the first run allocates memory."""
@@ -204,6 +224,21 @@ def _mixture(present: Float[np.ndarray, "n"], shares: Float[np.ndarray, "n t"]) 
     """Return the likelihood of every type by objects that are each present with a probability."""
     present = present * min(1.0, _MOST_SEEN / max(float(present.sum()), _NEVER))
     return 1.0 - present.sum() + (shares.shape[1] - 1) * present @ shares
+
+
+def upright_warnings(odds: Sequence[Float[np.ndarray, "4"]]) -> tuple[str, ...]:
+    """Return a warning if photographs of one spot do not lie upright, by their log odds for each quarter turn."""
+    if not odds:
+        return ()
+    log = (1.0 if len(odds) == 1 else _SEVERAL) * np.sum(odds, axis=0)
+    share = np.exp(log - np.logaddexp.reduce(log))
+    turns = int(share.argmax())
+    if not turns or share[turns] < _TURNED:
+        return ()
+    (place, turn), named = _LIES[turns - 1], "the photograph" if len(odds) == 1 else "each photograph or frame"
+    return (
+        f"{named} may lie {place}: turned by {turn}, the objects in sight are upright; turn it so, and send it again",
+    )
 
 
 def outside_odds(probability: Float[np.ndarray, "n"]) -> float:

@@ -286,11 +286,13 @@ class SeenObjects:
         room_type: its probabilities presume that all types are equally frequent.
         objects: the most probable first.
         outside: log likelihood ratio of a photograph taken outside to one of a room.
+        warnings: that photographs seem not to lie upright.
     """
 
     room_type: PredictedRoomType
     objects: tuple[SeenObject, ...]
     outside: float = 0.0
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,6 +341,11 @@ class Query:
             profile=None if profile is None else profile.scaled(offset),
             ceiling=None if ceiling is None else replace(ceiling, log_m=ceiling.log_m + offset),
         )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings by what the photograph shows."""
+        return () if self.objects is None else self.objects.warnings
 
     @property
     def sector(self) -> float:

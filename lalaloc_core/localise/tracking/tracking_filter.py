@@ -55,7 +55,7 @@ _NEGLIGIBLE_SHARE = 1e-7
 # one photograph, and thresholds of the modes.
 _LEAVING, _MAX_ODDS = 0.02, 10.0
 # Factor of the odds that a partial photograph is of the plan: real homes are read worse than the generated ones that
-# confidence is fitted on. Chosen on a furnished house by others, whose sessions were lost while their places were right.
+# confidence is fitted on. Chosen on a furnished house by others, whose sessions were lost though places were right.
 _READ_WORSE = 2.0
 _LOST_BELOW, _TRACKING_FROM = 0.2, 0.5
 # Probability of its pose from which a photograph is sure by itself.

@@ -31,11 +31,6 @@ _LENGTH_ERROR = 0.1
 _STRENGTH = 1.0
 
 
-def _disturb(own: Scene, _homes: GeneratedScenes) -> Scene:
-    """Stretch the photographs slightly, and change their exposure, blur and compression."""
-    return dataclasses.replace(own, cameras=tuple(map(_disturbed, own.cameras)))
-
-
 def _disturbed(camera: Camera) -> Camera:
     seed = camera_seed(camera)
     photographs = {look: DisturbedPhotograph(photograph, seed) for look, photograph in camera.photographs.items()}
@@ -328,7 +323,7 @@ def _replace_plan(own: Scene, homes: GeneratedScenes) -> Scene:
 # Changes of a generated scene by the name of the generator, each with its part of the data set's description.
 CHANGES: dict[str, tuple[str, Callable[[Scene, GeneratedScenes], Scene]]] = {
     "copies": (f"{_COPIES} copies that differ in their doors", _copy),
-    "disturbed": ("disturbed", _disturb),
+    "disturbed": ("disturbed", lambda own, _: dataclasses.replace(own, cameras=tuple(map(_disturbed, own.cameras)))),
     "foreign": ("asked in plans of other buildings", _replace_plan),
     "mismatched": ("asked with photographs of others", _mismatch),
     "unopened": ("plans without openings", lambda own, _: dataclasses.replace(own, plan=without_openings(own.plan))),
