@@ -26,7 +26,7 @@ from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, mov
 from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
 from lalaloc_core.localise.album.solve import MAX_ROOMS, calibrated, misread_share, solve_album
 from lalaloc_core.localise.album.solve import _pin as _pin_of
-from lalaloc_core.localise.album.states import States, turned_together
+from lalaloc_core.localise.album.states import States, by_compass, turned_together
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import patch_size, sphere_size
 from lalaloc_core.photograph import Assumed, open_photograph
@@ -184,6 +184,23 @@ def test_photograph_of_an_album_that_fits_badly_is_uncertain_and_not_set_aside(
     pins = [_pin_of(ground, kitchen, states, share, None, fits=fits, is_outside=False) for fits in (True, False)]
     assert [pin.state for pin in pins] == ["set_aside", "uncertain"]
     assert pins[1].confidence == pytest.approx(0.3 / rooms)
+
+
+def test_album_that_fits_badly_says_so_and_has_no_sure_pin(
+    ground: AlbumGround, photographs: list[AlbumPhotograph], solved: tuple[Album, AlbumMemory, list[int]]
+) -> None:
+    misread = {id: {**each, "rooms": np.full_like(each["rooms"], -8.0)} for id, each in solved[1].evidence.items()}
+    album = solve_album(ground, encoder(), photographs, memory=AlbumMemory(key=solved[1].key, evidence=misread))
+    assert "fit this plan badly" in album.warnings[0]
+    assert {pin.state for pin in album.pins} == {"uncertain"}
+
+
+def test_bias_of_a_compass_is_that_of_all_photographs(solved: tuple[Album, AlbumMemory, list[int]]) -> None:
+    states = [States.of(evidence, encoder().manifest.ring_sectors) for evidence in solved[1].evidence.values()]
+    compass = [float(state.heading[state.log.argmax()]) + 1.0 for state in states]
+    for north in (None, -1.1):
+        _, bias = by_compass(states, compass, north)
+        assert bias == pytest.approx(-1.0 % math.tau, abs=0.1)
 
 
 def test_unknown_room_and_repeated_id_are_refused(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:
