@@ -12,10 +12,13 @@ import math
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import process_time
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -77,6 +80,14 @@ class Film:
     warnings: tuple[str, ...] = ()
 
 
+class _Frame(NamedTuple):
+    """Frame to sample: its time, the part of it within bars, and the same small."""
+
+    time_s: float
+    whole: UInt8[np.ndarray, "h w 3"]
+    picture: UInt8[np.ndarray, "k l 3"]
+
+
 @dataclass(eq=False)
 class _Sample:
     """A frame that can be kept: its time, number, angle by optical flow, sharpness and picture."""
@@ -126,8 +137,11 @@ def read_film(
     stated: StatedCamera | None = None,
     patch_size: PatchSize | None = None,
     limits: FilmLimits | None = None,
+    threads: Literal[1, 2] = 2,
 ) -> Film:
     """Read a film of a turn on one spot: MP4, MOV, WebM or Matroska with H.264, HEVC, MPEG-4, VP8 or VP9.
+
+    Of two `threads`, one decodes while the other follows the camera.
 
     Raises:
         InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
@@ -142,17 +156,17 @@ def read_film(
         )
     hfov = None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
     tracker, samples, begin = FlowTracker(hfov), _Samples(), process_time()
-    _sample_film(content, tracker, samples, limits, begin)
+    _sample_film(content, tracker, samples, limits, begin, threads)
     inside = _inside_bars(samples)
     if inside != _WHOLE:
         tracker, samples = FlowTracker(hfov), _Samples(inside=inside)
-        _sample_film(content, tracker, samples, limits, begin)
+        _sample_film(content, tracker, samples, limits, begin, threads)
     kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
     if not kept:
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
     if tracker.nodded > max(_MOST_NOD, _SIDEWAYS * tracker.turned):
         raise InvalidFilmError(_on_side(tracker, "lies on its side"))
-    photographs, angles = _turned(kept, samples.full_size, stated, size, tracker)
+    photographs, angles = _turned(kept, samples.full_size, stated, size, tracker, threads)
     joined = _likely(angles)
     first = angles[joined[0]].heading
     if len(joined) < len(kept):
@@ -164,7 +178,7 @@ def read_film(
             replace(angles[index], heading=float(wrap_angle(angles[index].heading - first))) for index in joined
         ),
         frames=samples.frames,
-        dropped=dict(samples.dropped),
+        dropped=dict(sorted(samples.dropped.items())),
         duration_s=samples.last_s,
         turned=tracker.turned,
         warnings=(*_warnings(samples, tracker), *_assumed([angles[index] for index in joined])),
@@ -172,13 +186,20 @@ def read_film(
 
 
 def _turned(
-    kept: Sequence[_Sample], full_size: tuple[int, int], stated: StatedCamera, size: PatchSize, tracker: FlowTracker
+    kept: Sequence[_Sample],
+    full_size: tuple[int, int],
+    stated: StatedCamera,
+    size: PatchSize,
+    tracker: FlowTracker,
+    threads: int,
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
     if lens.is_sphere:
         raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
-    photographs = [photograph_of_picture(sample.picture, full_size, lens, stated, size, "film") for sample in kept]
+    read = partial(photograph_of_picture, full_size=full_size, lens=lens, stated=stated, size=size, purpose="film")
+    with ThreadPoolExecutor(threads) as pool:
+        photographs = list(pool.map(read, [sample.picture for sample in kept]))
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
     numbers = [sample.number for sample in kept]
@@ -246,8 +267,29 @@ def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
     return warnings
 
 
-def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float) -> None:
+def _sample_film(
+    content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float, threads: int
+) -> None:
     """Decode a film, and add its sharpest frames by angle; its CPU time counts from `begin`."""
+    with closing(_frames(content, samples, limits, begin)) as frames, ThreadPoolExecutor(1) as decoding:
+        for frame in frames if threads == 1 else _ahead(frames, decoding):
+            _sample(frame, samples, tracker)
+            if samples.is_barred:
+                break
+    if not samples.frames:
+        raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
+
+
+def _ahead(frames: Iterator[_Frame], decoding: Executor) -> Iterator[_Frame]:
+    """Yield frames, the next of which is decoded meanwhile."""
+    coming = decoding.submit(next, frames, None)
+    while (frame := coming.result()) is not None:
+        coming = decoding.submit(next, frames, None)
+        yield frame
+
+
+def _frames(content: bytes, samples: _Samples, limits: FilmLimits, begin: float) -> Generator[_Frame]:
+    """Yield the frames to sample."""
     with _opened(content, limits) as (capture, claimed_s):
         interval_s = max(1.0 / _RATE, claimed_s / _SAMPLES)
         next_s = 0.0
@@ -267,41 +309,39 @@ def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits
                 continue
             # Samples stay at their rate on average, whatever that of the frames.
             next_s = max(next_s + interval_s, time_s)
-            seen, frame = capture.retrieve()
-            if not seen or frame is None:
+            seen, pixels = capture.retrieve()
+            if not seen or pixels is None:
                 samples.dropped["damaged"] += 1
                 continue
-            _sample(frame, time_s, samples, tracker)
-            if samples.is_barred:
-                break
-    if not samples.frames:
-        raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
+            height, width = pixels.shape[:2]
+            if samples.stored_size == (0, 0):
+                samples.stored_size = width, height
+            if samples.stored_size != (width, height):
+                samples.dropped["of another size"] += 1
+                continue
+            whole = pixels[samples.inside]
+            yield _Frame(time_s, whole, _within(whole, _LONG_SIDE))
 
 
-def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
-    height, width = frame.shape[:2]
-    if samples.stored_size == (0, 0):
-        samples.stored_size = width, height
-    if samples.stored_size != (width, height):
-        samples.dropped["of another size"] += 1
-        return
-    frame = frame[samples.inside]
-    share = min(_LONG_SIDE / max(frame.shape), 1.0)
-    picture = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else frame
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    if float(grey.mean()) < _DARK:
+def _within(pixels: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarray, "k l 3"]:
+    """Return a picture whose sides are at most so long (pixels)."""
+    share = long_side / max(pixels.shape)
+    return cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else pixels
+
+
+def _sample(frame: _Frame, samples: _Samples, tracker: FlowTracker) -> None:
+    grey = cv2.cvtColor(frame.picture, cv2.COLOR_BGR2GRAY)
+    if cv2.mean(grey)[0] < _DARK:
         samples.dropped["dark"] += 1
         return
     if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
-        share = min(THUMBNAIL_SIDE / max(frame.shape), 1.0)
-        samples.looks.append(cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+        samples.looks.append(_within(frame.whole, THUMBNAIL_SIDE))
         # A film with bars is read once more, within them.
         samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
-    samples.add(
-        _Sample(time_s, tracker.number, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
-    )
+    picture = cv2.cvtColor(frame.picture, cv2.COLOR_BGR2RGB)
+    samples.add(_Sample(frame.time_s, tracker.number, heading, sharpness, picture), tracker.step)
 
 
 def _inside_bars(samples: _Samples) -> tuple[slice, slice]:

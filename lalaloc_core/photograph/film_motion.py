@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,9 +15,9 @@ _LONG_SIDE, _CORNERS, _QUALITY, _APART = 400, 200, 0.01, 6
 _LEAST, _TOGETHER = 8, 3.0
 # Field of view of the shorter side of phones' films, and the step of kept frames as a share of the field.
 _USUAL_FIELD, _STEP_SHARE = math.radians(53.0), 0.25
-# Blank pictures: gradient (grey levels per pixel of a Sobel kernel, blurred by so many pixels) of the strongest
-# hundredth. Codecs copy blank parts from sample to sample, as if the camera stood still.
-_BLANK, _BLUR = 4.0, 2.0
+# Blank pictures: gradient (grey levels per pixel of a Sobel kernel, blurred by so many pixels) that a smaller share of
+# pixels reach. Codecs copy blank parts from sample to sample, as if the camera stood still.
+_BLANK, _BLUR, _MARKED_SHARE = 4.0, 2.0, 0.01
 # Upright edges: largest shift (share of the width), least correlation and gradient of the columns' means.
 _SHIFT, _CORRELATION, _EDGE = 0.2, 0.85, 2.0
 # Corners that contradict upright edges, by so much (radians, share): fewer than so many, or still ones, are wrong.
@@ -43,7 +44,7 @@ class FlowTracker:
         self.heading, self.step = 0.0, _STEP_SHARE * (hfov or _USUAL_FIELD)
         self.scale = 1.0
         self._hfov = hfov
-        self._before: UInt8[np.ndarray, "h w"] | None = None
+        self._before: _Look | None = None
         self._speed = 0.0
         self._turns: list[float] = []
         self._errors: list[float] = []
@@ -56,11 +57,11 @@ class FlowTracker:
     def follow(self, grey: UInt8[np.ndarray, "h w"]) -> float:
         """Return the heading (radians) of the next sample."""
         share = min(_LONG_SIDE / max(grey.shape), 1.0)
-        small = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-        before, self._before = self._before, small
+        look = _Look.of(cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+        before, self._before = self._before, look
         if before is None:
             return self.heading
-        turn, error = self._turn(before, small)
+        turn, error = self._turn(before, look)
         self._turns.append(turn)
         self._errors.append(error)
         if not math.isnan(turn):
@@ -69,14 +70,12 @@ class FlowTracker:
         self._least, self._most = min(self._least, self.heading), max(self._most, self.heading)
         return self.heading
 
-    def _turn(self, before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
+    def _turn(self, before: _Look, after: _Look) -> tuple[float, float]:
         """Return the turn (radians) between samples with its error as a share; not a number if nothing tells it."""
-        blurred = (cv2.GaussianBlur(picture, (0, 0), _BLUR) for picture in (before, after))
-        gradients = [cv2.Sobel(picture, cv2.CV_32F, 1, 0) for picture in blurred]
-        if min(float(np.percentile(np.abs(gradient), 99)) for gradient in gradients) < _BLANK:
+        if before.is_blank or after.is_blank:
             return math.nan, _GUESSED_SHARE
-        moved, focal = _moved(before, after), self._focal(after.shape[1], after.shape[0])
-        shift = _edges_shift(*gradients)
+        moved, focal = _moved(before.grey, after.grey), self._focal(*after.grey.shape[::-1])
+        shift = _edges_shift(before.upright, after.upright)
         swept = None if shift is None else math.atan(-shift / focal)
         if moved is None:
             return (math.nan, _GUESSED_SHARE) if swept is None else (swept, _EDGE_SHARE)
@@ -150,22 +149,39 @@ class FlowTracker:
         return float(np.isnan(self._turns).mean()) if self._turns else 0.0
 
 
+class _Look(NamedTuple):
+    """Small grey picture of a sample, the mean gradient across each column, and whether it is blank."""
+
+    grey: UInt8[np.ndarray, "h w"]
+    upright: Float[np.ndarray, "w"]
+    is_blank: bool
+
+    @classmethod
+    def of(cls, grey: UInt8[np.ndarray, "h w"]) -> _Look:
+        gradient = cv2.Sobel(cv2.GaussianBlur(grey, (0, 0), _BLUR), cv2.CV_32F, 1, 0)
+        marked = np.count_nonzero(np.abs(gradient) >= _BLANK)
+        return cls(grey, gradient.mean(axis=0), bool(marked < _MARKED_SHARE * gradient.size))
+
+
 def _focal_of(hfov: float, width: int) -> float:
     return 0.5 * width / math.tan(0.5 * min(hfov, 0.9 * math.pi))
 
 
-def _edges_shift(before: Float[np.ndarray, "h w"], after: Float[np.ndarray, "h w"]) -> float | None:
-    """Return the shift (pixels to the right) of upright edges by their gradients; None if nothing tells it."""
+def _edges_shift(one: Float[np.ndarray, "w"], other: Float[np.ndarray, "w"]) -> float | None:
+    """Return the shift (pixels to the right) of upright edges by the columns' gradients; None if nothing tells it."""
     # Edges of plain walls have no corners, so the means of columns are compared.
-    one, other = before.mean(axis=0), after.mean(axis=0)
     if np.abs(one).max() < _EDGE:
         return None
-    width, best = len(one), (0.0, 0)
-    for shift in range(-round(_SHIFT * width), round(_SHIFT * width) + 1):
-        kept, met = one[max(-shift, 0) : width - max(shift, 0)], other[max(shift, 0) : width - max(-shift, 0)]
-        alike = float(kept @ met) / max(float(np.linalg.norm(kept) * np.linalg.norm(met)), 1e-9)
-        best = max(best, (alike, shift))
-    return float(best[1]) if best[0] > _CORRELATION else None
+    width, most = len(one), round(_SHIFT * len(one))
+    shift = np.arange(-most, most + 1)
+    # Sums of squares of the columns that both show, from their running totals.
+    ahead, behind = np.maximum(shift, 0), np.maximum(-shift, 0)
+    first, second = (np.concatenate([[0.0], np.cumsum(np.square(values, dtype=float))]) for values in (one, other))
+    square = (first[width - ahead] - first[behind]) * (second[width - behind] - second[ahead])
+    product = np.correlate(other, one, "full")[width - 1 + shift]
+    alike = product / np.maximum(np.sqrt(np.maximum(square, 0.0)), 1e-9)
+    best = int(alike.argmax())
+    return float(shift[best]) if alike[best] > _CORRELATION else None
 
 
 def _moved(

@@ -233,18 +233,19 @@ def _starts(lines: Lines) -> Float[np.ndarray, "s 3"]:
     upright = float(_SHARES[0]) * _densities(_errors(lines, vertical.astype(np.float32)), sigma)
     prior = -0.5 * ((pitch / _PRIOR[0]) ** 2 + (roll / _PRIOR[1]) ** 2)
     score = weight @ np.log(upright + _OUTLIERS + 0.4 / math.pi) + prior
-    found = []
-    for index in np.argsort(-score)[:_STARTS]:
-        angles = np.stack(np.broadcast_arrays(pitch[index], roll[index], _YAWS), axis=-1)
-        directions = _directions(angles).astype(np.float32)
-        first, second = (_densities(_errors(lines, directions[:, row]), sigma) for row in (1, 2))
-        horizontal = float(_SHARES[1]) * first + float(_SHARES[2]) * second
-        full = weight @ np.log(upright[:, index, None] + horizontal + _OUTLIERS)
-        best = int(np.argmax(full))
-        found.append((full[best] + prior[index], np.array([pitch[index], roll[index], _YAWS[best]])))
-    found.sort(key=lambda start: -start[0])
+    chosen = np.argsort(-score)[:_STARTS]
+    angles = np.stack(
+        [*(np.repeat(grid[chosen], len(_YAWS)) for grid in (pitch, roll)), np.tile(_YAWS, _STARTS)], axis=-1
+    )
+    directions = _directions(angles).astype(np.float32)
+    first, second = (_densities(_errors(lines, directions[:, row]), sigma) for row in (1, 2))
+    horizontal = float(_SHARES[1]) * first + float(_SHARES[2]) * second
+    full = weight @ np.log(np.repeat(upright[:, chosen], len(_YAWS), axis=1) + horizontal + _OUTLIERS)
+    full = full.reshape(_STARTS, -1)
+    best = full.argmax(axis=1)
+    order = np.argsort(-(full[np.arange(_STARTS), best] + prior[chosen]), kind="stable")
     starts: list[np.ndarray] = []
-    for _, start in found:
+    for start in angles.reshape(_STARTS, -1, 3)[order, best[order]]:
         # Neighbours on the grid lead to the same attitude.
         if all(np.abs(start[:2] - kept[:2]).max() > _APART for kept in starts):
             starts.append(start)
@@ -331,19 +332,18 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
     group = {index: [index] for index in range(len(pieces))}
     ends = pieces.reshape(-1, 2)
     apart = np.linalg.norm(ends[:, None] - ends[None], axis=2)
-    first, second = np.nonzero(apart < _GAP * side)
-    for a, b in zip(first.tolist(), second.tolist(), strict=True):
-        i, j = a // 2, b // 2
-        if i >= j:
-            continue
-        cosine = abs(float(direction[i] @ direction[j]))
-        # The far ends are on different sides, so that the pieces follow each other.
-        outward = (pieces[i, 1 - a % 2] - ends[a]) @ (pieces[j, 1 - b % 2] - ends[b])
-        gap = ends[b] - ends[a]
-        offset = min(abs(float(direction[k, 0] * gap[1] - direction[k, 1] * gap[0])) for k in (i, j))
-        follows = cosine > np.cos(_TURN) and outward < 0.0 and offset < _OFFSET * side
-        if follows and group[i] is not group[j]:
-            merged = sorted(group[i] + group[j])
+    a, b = np.nonzero(apart < _GAP * side)
+    a, b = a[a // 2 < b // 2], b[a // 2 < b // 2]
+    i, j = a // 2, b // 2
+    cosine = np.abs((direction[i] * direction[j]).sum(axis=1))
+    # The far ends are on different sides, so that the pieces follow each other.
+    outward = ((ends[a ^ 1] - ends[a]) * (ends[b ^ 1] - ends[b])).sum(axis=1)
+    gap = ends[b] - ends[a]
+    offset = np.minimum(*(np.abs(direction[k, 0] * gap[:, 1] - direction[k, 1] * gap[:, 0]) for k in (i, j)))
+    follows = (cosine > np.cos(_TURN)) & (outward < 0.0) & (offset < _OFFSET * side)
+    for one, other in zip(i[follows].tolist(), j[follows].tolist(), strict=True):
+        if group[one] is not group[other]:
+            merged = sorted(group[one] + group[other])
             group |= dict.fromkeys(merged, merged)
     return list({members[0]: members for members in group.values()}.values())
 

@@ -50,9 +50,9 @@ class Decoding:
             content, sphere_size=self.sphere, stated=stated, patch_size=self.patch, limits=self.limits, purpose=purpose
         )
 
-    def film(self, content: bytes, stated: StatedCamera) -> Film:
+    def film(self, content: bytes, stated: StatedCamera, threads: Literal[1, 2]) -> Film:
         """Read a film of a turn."""
-        return read_film(content, stated=stated, patch_size=self.patch, limits=self.film_limits)
+        return read_film(content, stated=stated, patch_size=self.patch, limits=self.film_limits, threads=threads)
 
     def turn(self, photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[TurnAngles]]:
         """Return photographs of one spot with their patches, and their angles to each other."""

@@ -23,6 +23,7 @@ from lalaloc_core.photograph.photograph import Purpose
 from lalaloc_core.photograph.placed_copy import Place, PlacedHead
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from service import errors
+from service.capacity.cores import usable_cores
 from service.capacity.fair_share import FairSemaphore
 from service.decoding.decode_worker import DecodeJob, Decoding, run_decoder
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
@@ -66,7 +67,7 @@ class Decoder:
     """Bounded pool of decoding workers."""
 
     def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry, cores: FairSemaphore) -> None:
-        self._settings = settings
+        self._settings, self._cores = settings, cores
         decoding = Decoding(
             sphere=sphere_size(manifest),
             patch=patch_size(manifest),
@@ -130,8 +131,9 @@ class Decoder:
         return await self._run_job(DecodeJob("photograph", (content, stated, purpose)), context)
 
     async def film(self, content: bytes | UploadedFile, stated: StatedCamera, context: QueryContext) -> Film:
-        """Read a film of a turn."""
-        return await self._run_job(DecodeJob("film", (content, stated)), context)
+        """Read a film of a turn, with a second thread if a core beside its own is idle."""
+        threads = 2 if self._cores.in_use + 1 < usable_cores() else 1
+        return await self._run_job(DecodeJob("film", (content, stated, threads)), context)
 
     async def level_turn(
         self, photographs: Sequence[Photograph], context: QueryContext

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -23,14 +22,10 @@ from lalaloc_core.localise.encode.view_encoder import (
     ObjectEncoder,
     ViewEncoder,
     objects_of_views,
-    upright_warnings,
 )
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
 from lalaloc_core.photograph.patches import joined_patches
-
-_ArgumentT = TypeVar("_ArgumentT")
-_ResultT = TypeVar("_ResultT")
 
 
 class PhotographEncoder:
@@ -79,7 +74,7 @@ class PhotographEncoder:
         self.check(photograph)
         assert self._views is not None
         turned = [(photograph, 0.0), *others]
-        objects = self._beside(self.seen_objects, turned, with_helper=photograph.features is None)
+        objects = self._objects_beside([view for view, _ in turned])
         if photograph.features is None:
             patches = self._patches(turned)
             outputs = self._views.outputs([patch.rgba for patch, _ in patches], height_m)
@@ -96,7 +91,11 @@ class PhotographEncoder:
             for view, turn in turned
             if view.wall_direction is not None
         )
-        several = {"objects": objects(), "wall_directions": directions, "is_turn": bool(others)}
+        several = {
+            "objects": self._seen_objects(turned, objects()),
+            "wall_directions": directions,
+            "is_turn": bool(others),
+        }
         searched = None if query.searched is None else replace(query.searched, **several)
         return replace(query, **several, searched=searched)
 
@@ -114,21 +113,32 @@ class PhotographEncoder:
             outputs["ring"] = np.zeros((len(RING_HEIGHTS_M), *outputs["ring"].shape), np.float32)
             return replace(photograph, features=PhotographFeatures(outputs))
         assert self._views is not None
-        objects = self._beside(self._object_outputs, photograph)
-        outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0) | objects()
-        warnings = (*photograph.warnings, *upright_warnings([outputs.pop("upright")] if "upright" in outputs else []))
-        features = PhotographFeatures(outputs, photograph.patch_azimuths)
-        return replace(photograph, features=features, warnings=warnings)
+        objects = self._objects_beside([photograph], detects=True)
+        outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0) | objects()[0]
+        return replace(photograph, features=PhotographFeatures(outputs, photograph.patch_azimuths))
 
-    def _beside(
-        self, work: Callable[[_ArgumentT], _ResultT], argument: _ArgumentT, *, with_helper: bool = True
-    ) -> Callable[[], _ResultT]:
-        """Return a function with the result of recognising objects, meanwhile on an idle core if there is one."""
-        helper = self.layouts.helper() if with_helper and self._objects is not None else None
-        return partial(work, argument) if helper is None else helper.submit(work, argument).result
+    def _objects_beside(
+        self, photographs: Sequence[Photograph], *, detects: bool = False
+    ) -> Callable[[], list[dict[str, np.ndarray]]]:
+        """Return a function with the outputs of recognising objects, meanwhile on an idle core if there is one."""
+        helper = None if self._objects is None else self.layouts.helper()
+        work = partial(self._object_outputs, detects=detects)
+        begun = [Future() if helper is None else helper.submit(work, photograph) for photograph in photographs]
 
-    def _object_outputs(self, photograph: Photograph) -> dict[str, np.ndarray]:
-        return {} if self._objects is None else self._objects.outputs(photograph, detects=True)
+        def outputs() -> list[dict[str, np.ndarray]]:
+            # The caller recognises what the helper has not begun, from the last photograph on.
+            for number in reversed(range(len(begun))):
+                if begun[number].cancel():
+                    begun[number] = Future()
+                    begun[number].set_result(work(photographs[number]))
+            return [future.result() for future in begun]
+
+        return outputs
+
+    def _object_outputs(self, photograph: Photograph, *, detects: bool = False) -> dict[str, np.ndarray]:
+        if photograph.features is not None:
+            return dict(photograph.features.outputs)
+        return {} if self._objects is None else self._objects.outputs(photograph, detects=detects)
 
     def _patches(self, turned: Sequence[tuple[Photograph, float]]) -> list[tuple[Patch, float]]:
         """Return the patches of photographs of one spot, and the standard deviations (radians) of their tilt.
@@ -146,18 +156,19 @@ class PhotographEncoder:
 
     def seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
         """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
-        if self._objects is None:
+        return self._seen_objects(turned, [self._object_outputs(view) for view, _ in turned])
+
+    def _seen_objects(
+        self, turned: Sequence[tuple[Photograph, float]], outputs: Sequence[Mapping[str, np.ndarray]]
+    ) -> SeenObjects | None:
+        # Features of earlier versions have no objects.
+        if self.manifest.objects is None or not all(each.keys() >= set(OBJECT_OUTPUTS) for each in outputs):
             return None
-        assert self.manifest.objects is not None
-        views, upright = [], []
-        for view, turn in turned:
-            outputs = self._objects.outputs(view) if view.features is None else view.features.outputs
-            # Features of earlier versions have no objects.
-            if not outputs.keys() >= set(OBJECT_OUTPUTS):
-                return None
-            views.append((outputs["object_probability"], outputs["object_azimuth"] + turn))
-            upright += [outputs["upright"]] if "upright" in outputs else []
-        return replace(objects_of_views(self.manifest.objects, views), warnings=upright_warnings(upright))
+        views = [
+            (each["object_probability"], each["object_azimuth"] + turn)
+            for each, (_, turn) in zip(outputs, turned, strict=True)
+        ]
+        return objects_of_views(self.manifest.objects, views)
 
     def check(self, photograph: Photograph) -> None:
         """Refuse a photograph that the model cannot encode.
