@@ -348,8 +348,8 @@ def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
     """Return the rows and columns of frames between bars, by some of all frames; all of them without bars."""
     if not samples.looks:
         return _WHOLE
-    looks, parts = np.stack(samples.looks), []
-    for side, pictures in zip(samples.stored_size[::-1], (looks, looks.transpose(0, 2, 1, 3)), strict=True):
+    looks, parts = (samples.looks, [cv2.transpose(look) for look in samples.looks]), []
+    for side, pictures in zip(samples.stored_size[::-1], map(np.stack, looks), strict=True):
         begin, end = between_bars(pictures)
         rows = pictures.shape[1]
         # A row at each bar can be mixed with it.
