@@ -270,12 +270,11 @@ def camera_axes(*, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
 def level_axes(angles: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Return right, forward and up (rows) of cameras in a level frame, by heading, pitch and roll (radians)."""
     # Entry by entry, because stacking takes longer than all else, and least squares call this hundreds of times.
-    cosine, sine = (function(np.moveaxis(angles, -1, 0)) for function in (np.cos, np.sin))
-    across, level, (upright, lean) = (sine[0], cosine[0]), cosine[1], (cosine[2], sine[2])
-    axes = np.empty((*angles.shape, 3))
-    above = -across[0] * sine[1], -across[1] * sine[1], level
-    for column, (right, up) in enumerate(zip((across[1], -across[0], 0.0), above, strict=True)):
+    cosine, sine, axes = np.cos(angles), np.sin(angles), np.empty((*angles.shape, 3))
+    (turn, level, upright), (swing, rise, lean) = ([each[..., index] for index in range(3)] for each in (cosine, sine))
+    above = -swing * rise, -turn * rise, level
+    for column, (right, up) in enumerate(zip((turn, -swing, 0.0), above, strict=True)):
         axes[..., 0, column] = upright * right - lean * up
         axes[..., 2, column] = lean * right + upright * up
-    axes[..., 1, 0], axes[..., 1, 1], axes[..., 1, 2] = level * across[0], level * across[1], sine[1]
+    axes[..., 1, 0], axes[..., 1, 1], axes[..., 1, 2] = level * swing, level * turn, rise
     return axes

@@ -16,10 +16,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import unit_rays, wrap_angle
 from lalaloc_core.photograph.cameras import Camera, Perspective, level_axes
@@ -321,15 +322,20 @@ class _Fit:
         for column, step in ((-3, (_STEP, 0.0)), (-2, (0.0, _STEP))):
             slope = (self._match_residuals(*pair, log_focal + step[0], nearness + step[1]) - base) / _STEP
             parts.append((slope, rows, np.full(len(base), len(values) + column)))
-        prior = self._prior_residuals(values)
-        for column in range(len(values)):
-            changed = values.copy()
-            changed[column] += _STEP
-            slope = (self._prior_residuals(changed) - prior) / _STEP
-            hit = np.flatnonzero(slope)
-            parts.append((slope[hit], len(base) + hit, np.full(len(hit), column)))
+        slope, row, column = self._prior_slopes
+        parts.append((slope, len(base) + row, column))
         value, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return csr_array((value, (row, column)), shape=(len(base) + len(prior), len(values)))
+        return csr_array((value, (row, column)), shape=(int(row.max()) + 1, len(values)))
+
+    @cached_property
+    def _prior_slopes(self) -> tuple[Float[np.ndarray, "s"], Int[np.ndarray, "s"], Int[np.ndarray, "s"]]:
+        """Derivatives of the priors' residuals, with their rows and columns: they are the same everywhere."""
+        # Where headings by lines do not wrap.
+        values = np.append(np.column_stack([-self._yaw, self._tilt]), np.zeros(3))
+        prior = self._prior_residuals(values)
+        slopes = np.array([self._prior_residuals(changed) - prior for changed in values + _STEP * np.eye(len(values))])
+        column, row = np.nonzero(slopes)
+        return slopes[column, row] / _STEP, row, column
 
 
 def _stretched(rays: Float[np.ndarray, "m 3"], log_focal: float) -> Float[np.ndarray, "m 3"]:
