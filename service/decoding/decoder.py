@@ -92,6 +92,7 @@ class Decoder:
         self._film_stall_s = settings.photographs.max_film_cpu_s + _FILM_MARGIN_S
         self._films = pool("film", self._film_stall_s, settings.decode.film_workers, _FILM_QUEUE)
         self._films_started, self._lock = False, threading.Lock()
+        self._long_jobs = 0
         telemetry.gauge(
             "lalaloc_decode_queue_depth", "Photographs waiting for a decoding worker.", lambda: self._pool.waiting
         )
@@ -166,13 +167,22 @@ class Decoder:
         return await self._run_job(DecodeJob("drawing", (svg,)), context)
 
     async def _run_job(self, job: DecodeJob, context: QueryContext) -> Any:
-        pool = self._started_films() if _is_long(job) else self._pool
+        is_long = _is_long(job) or self._can_be_beside(job)
+        pool = self._started_films() if is_long else self._pool
+        self._long_jobs += is_long
         try:
             return await pool.run_job(job, max(context.left_s, 0.0), context.client)
         except JobLostError as error:
-            raise self._error(error, job, context) from error
+            raise self._error(error, job, is_long, context) from error
         except (InvalidPhotographError, InvalidFilmError) as error:
             raise type(error)(f"{error}; see {_HELP}") from error
+        finally:
+            self._long_jobs -= is_long
+
+    def _can_be_beside(self, job: DecodeJob) -> bool:
+        """Return whether a photograph of a turn can be decoded where films are read, on another core, at once."""
+        is_of_turn = job.task == "photograph" and job.arguments[2] == "turn"
+        return is_of_turn and not self._long_jobs and self._films.state.ready > 0
 
     def _started_films(self) -> WorkerPool[DecodeJob, Any]:
         """Return the pool of films, whose workers the first long job starts."""
@@ -190,9 +200,9 @@ class Decoder:
                 self._films.close()
             self._films_started = True
 
-    def _error(self, lost: JobLostError, job: DecodeJob, context: QueryContext) -> Exception:
+    def _error(self, lost: JobLostError, job: DecodeJob, is_long: bool, context: QueryContext) -> Exception:
         """Return the service's error for a lost job."""
-        stall_s = self._film_stall_s if _is_long(job) else self._settings.decode.stall_s
+        stall_s = self._film_stall_s if is_long else self._settings.decode.stall_s
         match lost.reason:
             case "stalled" if job.task == "drawing":
                 # Drawings have a bounded size, so the machine is slow.
@@ -205,7 +215,7 @@ class Decoder:
                 kind = InvalidFilmError if job.task == "film" else InvalidPhotographError
                 return kind(_FAULTS.get(job.task, _FAULTS["photograph"])[lost.reason].format(stall_s))
             case "queue-full":
-                return errors.OverloadedError(_FILM_QUEUE if _is_long(job) else _QUEUE)
+                return errors.OverloadedError(_FILM_QUEUE if is_long else _QUEUE)
             case "not-ready" | "stopped":
                 return errors.DecoderNotReadyError()
             case "closing":
