@@ -18,7 +18,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import process_time
-from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -45,6 +44,8 @@ _EBML, _DOC_TYPES, _HEAD = b"\x1a\x45\xdf\xa3", (b"webm", b"matroska"), 64
 _CODECS = {b"h264": "H.264", b"avc1": "H.264", b"hevc": "HEVC", b"hvc1": "HEVC", b"hev1": "HEVC", b"VP90": "VP9"}
 _CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8", b"FMP4": "MPEG-4", b"mp4v": "MPEG-4"}
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+# Frame to sample: its time, the part of it within bars, and the same small.
+_Frame = tuple[float, np.ndarray, np.ndarray]
 # All rows and columns.
 _WHOLE = slice(None), slice(None)
 # Samples per second, and of a whole film.
@@ -78,14 +79,6 @@ class Film:
     duration_s: float
     turned: float
     warnings: tuple[str, ...] = ()
-
-
-class _Frame(NamedTuple):
-    """Frame to sample: its time, the part of it within bars, and the same small."""
-
-    time_s: float
-    whole: UInt8[np.ndarray, "h w 3"]
-    picture: UInt8[np.ndarray, "k l 3"]
 
 
 @dataclass(eq=False)
@@ -137,11 +130,8 @@ def read_film(
     stated: StatedCamera | None = None,
     patch_size: PatchSize | None = None,
     limits: FilmLimits | None = None,
-    threads: Literal[1, 2] = 2,
 ) -> Film:
     """Read a film of a turn on one spot: MP4, MOV, WebM or Matroska with H.264, HEVC, MPEG-4, VP8 or VP9.
-
-    Of two `threads`, one decodes while the other follows the camera.
 
     Raises:
         InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
@@ -156,17 +146,17 @@ def read_film(
         )
     hfov = None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
     tracker, samples, begin = FlowTracker(hfov), _Samples(), process_time()
-    _sample_film(content, tracker, samples, limits, begin, threads)
+    _sample_film(content, tracker, samples, limits, begin)
     inside = _inside_bars(samples)
     if inside != _WHOLE:
         tracker, samples = FlowTracker(hfov), _Samples(inside=inside)
-        _sample_film(content, tracker, samples, limits, begin, threads)
+        _sample_film(content, tracker, samples, limits, begin)
     kept = sorted(samples.best.values(), key=lambda sample: sample.time_s)
     if not kept:
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
     if tracker.nodded > max(_MOST_NOD, _SIDEWAYS * tracker.turned):
         raise InvalidFilmError(_on_side(tracker, "lies on its side"))
-    photographs, angles = _turned(kept, samples.full_size, stated, size, tracker, threads)
+    photographs, angles = _turned(kept, samples, stated, size, tracker, limits)
     joined = _likely(angles)
     first = angles[joined[0]].heading
     if len(joined) < len(kept):
@@ -187,18 +177,19 @@ def read_film(
 
 def _turned(
     kept: Sequence[_Sample],
-    full_size: tuple[int, int],
+    samples: _Samples,
     stated: StatedCamera,
     size: PatchSize,
     tracker: FlowTracker,
-    threads: int,
+    limits: FilmLimits,
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
+    full_size = samples.full_size
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
     if lens.is_sphere:
         raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
     read = partial(photograph_of_picture, full_size=full_size, lens=lens, stated=stated, size=size, purpose="film")
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(limits.threads) as pool:
         photographs = list(pool.map(read, [sample.picture for sample in kept]))
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
@@ -267,13 +258,11 @@ def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
     return warnings
 
 
-def _sample_film(
-    content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float, threads: int
-) -> None:
+def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float) -> None:
     """Decode a film, and add its sharpest frames by angle; its CPU time counts from `begin`."""
     with closing(_frames(content, samples, limits, begin)) as frames, ThreadPoolExecutor(1) as decoding:
-        for frame in frames if threads == 1 else _ahead(frames, decoding):
-            _sample(frame, samples, tracker)
+        for frame in frames if limits.threads == 1 else _ahead(frames, decoding):
+            _sample(*frame, samples, tracker)
             if samples.is_barred:
                 break
     if not samples.frames:
@@ -320,7 +309,7 @@ def _frames(content: bytes, samples: _Samples, limits: FilmLimits, begin: float)
                 samples.dropped["of another size"] += 1
                 continue
             whole = pixels[samples.inside]
-            yield _Frame(time_s, whole, _within(whole, _LONG_SIDE))
+            yield time_s, whole, _within(whole, _LONG_SIDE)
 
 
 def _within(pixels: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarray, "k l 3"]:
@@ -329,19 +318,20 @@ def _within(pixels: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndar
     return cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else pixels
 
 
-def _sample(frame: _Frame, samples: _Samples, tracker: FlowTracker) -> None:
-    grey = cv2.cvtColor(frame.picture, cv2.COLOR_BGR2GRAY)
+def _sample(time_s: float, whole: np.ndarray, picture: np.ndarray, samples: _Samples, tracker: FlowTracker) -> None:
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     if cv2.mean(grey)[0] < _DARK:
         samples.dropped["dark"] += 1
         return
     if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
-        samples.looks.append(_within(frame.whole, THUMBNAIL_SIDE))
+        samples.looks.append(_within(whole, THUMBNAIL_SIDE))
         # A film with bars is read once more, within them.
         samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
     sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
-    picture = cv2.cvtColor(frame.picture, cv2.COLOR_BGR2RGB)
-    samples.add(_Sample(frame.time_s, tracker.number, heading, sharpness, picture), tracker.step)
+    samples.add(
+        _Sample(time_s, tracker.number, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
+    )
 
 
 def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
@@ -430,9 +420,10 @@ def _too_long(seconds: float, limits: FilmLimits) -> InvalidFilmError:
 
 @dataclass(frozen=True, kw_only=True)
 class FilmLimits:
-    """Limits of films."""
+    """Limits of films; of two threads, one decodes while the other follows the camera."""
 
     max_bytes: int = 100 * 2**20
     max_s: float = 60.0
     max_pixels: int = 4096 * 2304
     max_cpu_s: float = 20.0
+    threads: int = 2

@@ -6,7 +6,7 @@ It also copies photographs, finds the angles between them, and draws, which keep
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from typing import Any, Literal, NamedTuple
 
@@ -50,9 +50,10 @@ class Decoding:
             content, sphere_size=self.sphere, stated=stated, patch_size=self.patch, limits=self.limits, purpose=purpose
         )
 
-    def film(self, content: bytes, stated: StatedCamera, threads: Literal[1, 2]) -> Film:
+    def film(self, content: bytes, stated: StatedCamera, threads: int) -> Film:
         """Read a film of a turn."""
-        return read_film(content, stated=stated, patch_size=self.patch, limits=self.film_limits, threads=threads)
+        limits = replace(self.film_limits, threads=threads)
+        return read_film(content, stated=stated, patch_size=self.patch, limits=limits)
 
     def turn(self, photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[TurnAngles]]:
         """Return photographs of one spot with their patches, and their angles to each other."""

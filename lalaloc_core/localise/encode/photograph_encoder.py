@@ -92,7 +92,7 @@ class PhotographEncoder:
             if view.wall_direction is not None
         )
         several = {
-            "objects": self._seen_objects(turned, objects()),
+            "objects": self.seen_objects(turned, objects()),
             "wall_directions": directions,
             "is_turn": bool(others),
         }
@@ -154,13 +154,11 @@ class PhotographEncoder:
             (replace(patch, azimuth_rad=azimuth), tilt) for (patch, azimuth), tilt in zip(placed, tilts, strict=True)
         ]
 
-    def seen_objects(self, turned: Sequence[tuple[Photograph, float]]) -> SeenObjects | None:
-        """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
-        return self._seen_objects(turned, [self._object_outputs(view) for view, _ in turned])
-
-    def _seen_objects(
-        self, turned: Sequence[tuple[Photograph, float]], outputs: Sequence[Mapping[str, np.ndarray]]
+    def seen_objects(
+        self, turned: Sequence[tuple[Photograph, float]], outputs: Sequence[Mapping[str, np.ndarray]] = ()
     ) -> SeenObjects | None:
+        """Return the objects in photographs of one spot; None if the model recognises none, or not all have some."""
+        outputs = outputs or [self._object_outputs(view) for view, _ in turned]
         # Features of earlier versions have no objects.
         if self.manifest.objects is None or not all(each.keys() >= set(OBJECT_OUTPUTS) for each in outputs):
             return None
