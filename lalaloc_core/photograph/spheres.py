@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
-from lalaloc_core.conventions import column_azimuths, row_elevations, unit_rays
+from lalaloc_core.conventions import TWO_PI, column_azimuths, row_elevations, unit_rays
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import camera_axes
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
@@ -107,39 +108,14 @@ def level(
     that direction, radians clockwise. The result's centre has the azimuth `turn` in `pixels`, radians clockwise.
     """
     height, width = pixels.shape[:2]
-    axes = camera_axes(pitch=pitch, roll=roll)
+    # A row beyond a pole is the row before it, half a turn away.
+    beyond = [np.roll(pixels[[row]], width // 2, axis=1) for row in (0, -1)]
+    around = np.pad(np.concatenate([beyond[0], pixels, beyond[1]]), ((0, 0), (1, 1), (0, 0)), mode="wrap")
     azimuth, elevation = column_azimuths(width) + turn, row_elevations(height)
-    out = np.empty_like(pixels)
+    axes, parts = camera_axes(pitch=pitch, roll=roll), []
     for top in range(0, height, _ROWS):
-        rays = unit_rays(azimuth, elevation[top : top + _ROWS, None])
-        out[top : top + _ROWS] = _sample(pixels, rays @ axes.T)
-    return out
-
-
-def _sample(pixels: UInt8[np.ndarray, "h w 3"], rays: Float[np.ndarray, "r c 3"]) -> UInt8[np.ndarray, "r c 3"]:
-    """Return the colours along unit rays in the camera's frame (right, forward, up)."""
-    height, width = pixels.shape[:2]
-    column = (np.arctan2(rays[..., 0], rays[..., 1]) / (2.0 * np.pi) + 0.5) * width - 0.5
-    row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / np.pi) * height - 0.5
-    left, above = np.floor(column).astype(int), np.floor(row).astype(int)
-    across, down = (column - left)[..., None], (row - above)[..., None]
-    blended = sum(
-        weight * _pixels_around(pixels, above + i, left + j)
-        for i, j, weight in (
-            (0, 0, (1.0 - down) * (1.0 - across)),
-            (0, 1, (1.0 - down) * across),
-            (1, 0, down * (1.0 - across)),
-            (1, 1, down * across),
-        )
-    )
-    return np.round(blended).astype(np.uint8)
-
-
-def _pixels_around(
-    pixels: UInt8[np.ndarray, "h w 3"], row: np.ndarray, column: np.ndarray
-) -> UInt8[np.ndarray, "r c 3"]:
-    """Return pixels by row and column; a row beyond a pole is the row before it, half a turn away."""
-    height, width = pixels.shape[:2]
-    beyond = (row < 0) | (row >= height)
-    column = np.where(beyond, column + width // 2, column)
-    return pixels[np.clip(row, 0, height - 1), column % width]
+        rays = unit_rays(azimuth, elevation[top : top + _ROWS, None]) @ axes.T
+        column = (np.arctan2(rays[..., 0], rays[..., 1]) / TWO_PI + 0.5) * width + 0.5
+        row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height + 0.5
+        parts.append(cv2.remap(around, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR))
+    return np.concatenate(parts)
