@@ -269,7 +269,6 @@ def camera_axes(*, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
 
 def level_axes(angles: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Return right, forward and up (rows) of cameras in a level frame, by heading, pitch and roll (radians)."""
-    # Entry by entry, because stacking takes longer than all else, and least squares call this hundreds of times.
     cosine, sine, axes = np.cos(angles), np.sin(angles), np.empty((*angles.shape, 3))
     (turn, level, upright), (swing, rise, lean) = ([each[..., index] for index in range(3)] for each in (cosine, sine))
     above = -swing * rise, -turn * rise, level

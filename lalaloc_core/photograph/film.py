@@ -12,9 +12,9 @@ import math
 import os
 import struct
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import process_time
@@ -44,8 +44,6 @@ _EBML, _DOC_TYPES, _HEAD = b"\x1a\x45\xdf\xa3", (b"webm", b"matroska"), 64
 _CODECS = {b"h264": "H.264", b"avc1": "H.264", b"hevc": "HEVC", b"hvc1": "HEVC", b"hev1": "HEVC", b"VP90": "VP9"}
 _CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8", b"FMP4": "MPEG-4", b"mp4v": "MPEG-4"}
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
-# Frame to sample: its time, the part of it within bars, and the same small.
-_Frame = tuple[float, np.ndarray, np.ndarray]
 # All rows and columns.
 _WHOLE = slice(None), slice(None)
 # Samples per second, and of a whole film.
@@ -156,7 +154,7 @@ def read_film(
         raise InvalidFilmError("all frames of the film are dark or blank: film in a lit room")
     if tracker.nodded > max(_MOST_NOD, _SIDEWAYS * tracker.turned):
         raise InvalidFilmError(_on_side(tracker, "lies on its side"))
-    photographs, angles = _turned(kept, samples, stated, size, tracker, limits)
+    photographs, angles = _turned(kept, samples.full_size, stated, size, tracker, limits.threads)
     joined = _likely(angles)
     first = angles[joined[0]].heading
     if len(joined) < len(kept):
@@ -168,7 +166,7 @@ def read_film(
             replace(angles[index], heading=float(wrap_angle(angles[index].heading - first))) for index in joined
         ),
         frames=samples.frames,
-        dropped=dict(sorted(samples.dropped.items())),
+        dropped=dict(samples.dropped),
         duration_s=samples.last_s,
         turned=tracker.turned,
         warnings=(*_warnings(samples, tracker), *_assumed([angles[index] for index in joined])),
@@ -177,24 +175,22 @@ def read_film(
 
 def _turned(
     kept: Sequence[_Sample],
-    samples: _Samples,
+    full_size: tuple[int, int],
     stated: StatedCamera,
     size: PatchSize,
     tracker: FlowTracker,
-    limits: FilmLimits,
+    threads: int,
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
-    full_size = samples.full_size
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
     if lens.is_sphere:
         raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
     read = partial(photograph_of_picture, full_size=full_size, lens=lens, stated=stated, size=size, purpose="film")
-    with ThreadPoolExecutor(limits.threads) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         photographs = list(pool.map(read, [sample.picture for sample in kept]))
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
-    numbers = [sample.number for sample in kept]
-    heading, error = (values[numbers] for values in tracker.reckoned())
+    heading, error = (values[[sample.number for sample in kept]] for values in tracker.reckoned())
     steps = [
         Step(float(turn), math.hypot(_FLOW_SD, float(sd)))
         for turn, sd in zip(np.diff(heading), np.diff(error), strict=True)
@@ -260,25 +256,6 @@ def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
 
 def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float) -> None:
     """Decode a film, and add its sharpest frames by angle; its CPU time counts from `begin`."""
-    with closing(_frames(content, samples, limits, begin)) as frames, ThreadPoolExecutor(1) as decoding:
-        for frame in frames if limits.threads == 1 else _ahead(frames, decoding):
-            _sample(*frame, samples, tracker)
-            if samples.is_barred:
-                break
-    if not samples.frames:
-        raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
-
-
-def _ahead(frames: Iterator[_Frame], decoding: Executor) -> Iterator[_Frame]:
-    """Yield frames, the next of which is decoded meanwhile."""
-    coming = decoding.submit(next, frames, None)
-    while (frame := coming.result()) is not None:
-        coming = decoding.submit(next, frames, None)
-        yield frame
-
-
-def _frames(content: bytes, samples: _Samples, limits: FilmLimits, begin: float) -> Generator[_Frame]:
-    """Yield the frames to sample."""
     with _opened(content, limits) as (capture, claimed_s):
         interval_s = max(1.0 / _RATE, claimed_s / _SAMPLES)
         next_s = 0.0
@@ -298,33 +275,34 @@ def _frames(content: bytes, samples: _Samples, limits: FilmLimits, begin: float)
                 continue
             # Samples stay at their rate on average, whatever that of the frames.
             next_s = max(next_s + interval_s, time_s)
-            seen, pixels = capture.retrieve()
-            if not seen or pixels is None:
+            seen, frame = capture.retrieve()
+            if not seen or frame is None:
                 samples.dropped["damaged"] += 1
                 continue
-            height, width = pixels.shape[:2]
-            if samples.stored_size == (0, 0):
-                samples.stored_size = width, height
-            if samples.stored_size != (width, height):
-                samples.dropped["of another size"] += 1
-                continue
-            whole = pixels[samples.inside]
-            yield time_s, whole, _within(whole, _LONG_SIDE)
+            _sample(frame, time_s, samples, tracker)
+            if samples.is_barred:
+                break
+    if not samples.frames:
+        raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
 
 
-def _within(pixels: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarray, "k l 3"]:
-    """Return a picture whose sides are at most so long (pixels)."""
-    share = long_side / max(pixels.shape)
-    return cv2.resize(pixels, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else pixels
-
-
-def _sample(time_s: float, whole: np.ndarray, picture: np.ndarray, samples: _Samples, tracker: FlowTracker) -> None:
+def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
+    height, width = frame.shape[:2]
+    if samples.stored_size == (0, 0):
+        samples.stored_size = width, height
+    if samples.stored_size != (width, height):
+        samples.dropped["of another size"] += 1
+        return
+    frame = frame[samples.inside]
+    share = min(_LONG_SIDE / max(frame.shape), 1.0)
+    picture = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else frame
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     if cv2.mean(grey)[0] < _DARK:
         samples.dropped["dark"] += 1
         return
     if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
-        samples.looks.append(_within(whole, THUMBNAIL_SIDE))
+        share = min(THUMBNAIL_SIDE / max(frame.shape), 1.0)
+        samples.looks.append(cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
         # A film with bars is read once more, within them.
         samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
@@ -366,7 +344,7 @@ def _opened(content: bytes, limits: FilmLimits) -> Iterator[tuple[cv2.VideoCaptu
     # It outlives the capture, which reads from it until it is released.
     stream = io.BytesIO(content)
     try:
-        capture = cv2.VideoCapture(stream, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])  # pyright: ignore
+        capture = cv2.VideoCapture(stream, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, limits.threads])  # pyright: ignore
     except cv2.error as error:
         raise InvalidFilmError(f"the film is damaged: {error.err}") from error
     finally:
@@ -420,7 +398,7 @@ def _too_long(seconds: float, limits: FilmLimits) -> InvalidFilmError:
 
 @dataclass(frozen=True, kw_only=True)
 class FilmLimits:
-    """Limits of films; of two threads, one decodes while the other follows the camera."""
+    """Limits of films; threads decode while the caller's follows the camera, and read the frames that are kept."""
 
     max_bytes: int = 100 * 2**20
     max_s: float = 60.0

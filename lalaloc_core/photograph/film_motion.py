@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,6 +27,8 @@ _CORNER_SHARE, _EDGE_SHARE, _GUESSED_SHARE = 0.1, 0.3, 0.35
 _GROWN, _APART_SHARE = math.log(1.6), 0.45
 # Shaking: nod (radians) between samples.
 _NOD = math.radians(2.0)
+# Small grey picture of a sample, the mean gradient across each column, and whether it is blank.
+_Look = tuple[np.ndarray, np.ndarray, bool]
 
 
 class FlowTracker:
@@ -57,7 +58,7 @@ class FlowTracker:
     def follow(self, grey: UInt8[np.ndarray, "h w"]) -> float:
         """Return the heading (radians) of the next sample."""
         share = min(_LONG_SIDE / max(grey.shape), 1.0)
-        look = _Look.of(cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+        look = _look(cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
         before, self._before = self._before, look
         if before is None:
             return self.heading
@@ -72,10 +73,11 @@ class FlowTracker:
 
     def _turn(self, before: _Look, after: _Look) -> tuple[float, float]:
         """Return the turn (radians) between samples with its error as a share; not a number if nothing tells it."""
-        if before.is_blank or after.is_blank:
+        (first, first_upright, was_blank), (second, second_upright, is_blank) = before, after
+        if was_blank or is_blank:
             return math.nan, _GUESSED_SHARE
-        moved, focal = _moved(before.grey, after.grey), self._focal(*after.grey.shape[::-1])
-        shift = _edges_shift(before.upright, after.upright)
+        moved, focal = _moved(first, second), self._focal(*second.shape[::-1])
+        shift = _edges_shift(first_upright, second_upright)
         swept = None if shift is None else math.atan(-shift / focal)
         if moved is None:
             return (math.nan, _GUESSED_SHARE) if swept is None else (swept, _EDGE_SHARE)
@@ -149,18 +151,10 @@ class FlowTracker:
         return float(np.isnan(self._turns).mean()) if self._turns else 0.0
 
 
-class _Look(NamedTuple):
-    """Small grey picture of a sample, the mean gradient across each column, and whether it is blank."""
-
-    grey: UInt8[np.ndarray, "h w"]
-    upright: Float[np.ndarray, "w"]
-    is_blank: bool
-
-    @classmethod
-    def of(cls, grey: UInt8[np.ndarray, "h w"]) -> _Look:
-        gradient = cv2.Sobel(cv2.GaussianBlur(grey, (0, 0), _BLUR), cv2.CV_32F, 1, 0)
-        marked = np.count_nonzero(np.abs(gradient) >= _BLANK)
-        return cls(grey, gradient.mean(axis=0), bool(marked < _MARKED_SHARE * gradient.size))
+def _look(grey: UInt8[np.ndarray, "h w"]) -> _Look:
+    gradient = cv2.Sobel(cv2.GaussianBlur(grey, (0, 0), _BLUR), cv2.CV_32F, 1, 0)
+    marked = np.count_nonzero(np.abs(gradient) >= _BLANK)
+    return grey, gradient.mean(axis=0), bool(marked < _MARKED_SHARE * gradient.size)
 
 
 def _focal_of(hfov: float, width: int) -> float:

@@ -234,9 +234,8 @@ def _starts(lines: Lines) -> Float[np.ndarray, "s 3"]:
     prior = -0.5 * ((pitch / _PRIOR[0]) ** 2 + (roll / _PRIOR[1]) ** 2)
     score = weight @ np.log(upright + _OUTLIERS + 0.4 / math.pi) + prior
     chosen = np.argsort(-score)[:_STARTS]
-    angles = np.stack(
-        [*(np.repeat(grid[chosen], len(_YAWS)) for grid in (pitch, roll)), np.tile(_YAWS, _STARTS)], axis=-1
-    )
+    tilt = np.repeat(np.column_stack([pitch, roll])[chosen], len(_YAWS), axis=0)
+    angles = np.column_stack([tilt, np.tile(_YAWS, _STARTS)])
     directions = _directions(angles).astype(np.float32)
     first, second = (_densities(_errors(lines, directions[:, row]), sigma) for row in (1, 2))
     horizontal = float(_SHARES[1]) * first + float(_SHARES[2]) * second
@@ -321,7 +320,7 @@ def _chains(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[tuple[float
     chains = [pieces[chain] for chain in _joined(pieces, side)]
     # Most chains are a piece or two, and too short in any direction.
     long = [chain for chain in chains if np.hypot(*np.ptp(chain.reshape(-1, 2), axis=0)) >= _SHORTEST]
-    found = [_coefficient(_sampled(chain)) for chain in long]
+    found = [_coefficient(chain) for chain in long]
     return [chain for chain in found if chain is not None]
 
 
@@ -348,17 +347,12 @@ def _joined(pieces: Float[np.ndarray, "n 2 2"], side: float) -> list[list[int]]:
     return list({members[0]: members for members in group.values()}.values())
 
 
-def _sampled(pieces: Float[np.ndarray, "k 2 2"]) -> Float[np.ndarray, "m 2"]:
-    """Return points on pieces, as many per length."""
-    found = []
-    for start, end in pieces:
-        count = max(2, int(np.linalg.norm(end - start) / 0.01))
-        found.append(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
-    return np.concatenate(found)
-
-
-def _coefficient(points: Float[np.ndarray, "m 2"]) -> tuple[float, float, float, float] | None:
+def _coefficient(pieces: Float[np.ndarray, "k 2 2"]) -> tuple[float, float, float, float] | None:
     """Return -k of a chain, its weight and its side; None for a short chain, or one through the centre."""
+    counts = np.maximum(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1) / 0.01, 2).astype(int).tolist()
+    points = np.concatenate(
+        [np.linspace(start, end, count) for (start, end), count in zip(pieces, counts, strict=True)]
+    )
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
     along, across = ((points - middle) @ axis for axis in axes)

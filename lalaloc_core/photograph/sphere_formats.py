@@ -83,8 +83,7 @@ class Thumbnail:
 
     @cached_property
     def between_bars(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """`between_bars` of its rows, and of its columns."""
-        # OpenCV reads arrays that numpy transposed ten times as slowly.
+        """`between_bars` of its rows, and of its columns, as OpenCV reads arrays that numpy transposed very slowly."""
         return between_bars(self.pixels[None]), between_bars(cv2.transpose(self.pixels)[None])
 
 

@@ -313,15 +313,12 @@ class _Fit:
         base = self._match_residuals(*pair, log_focal, nearness)
         rows = np.arange(len(base))
         parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        for side, numbers in enumerate((self._first, self._second)):
-            for axis in range(3):
-                one, other = (rays.copy() for rays in pair)
-                (one, other)[side][:, axis] += _STEP
-                slope = (self._match_residuals(one, other, log_focal, nearness) - base) / _STEP
-                parts.append((slope, rows, np.tile(3 * numbers + axis, 2)))
-        for column, step in ((-3, (_STEP, 0.0)), (-2, (0.0, _STEP))):
-            slope = (self._match_residuals(*pair, log_focal + step[0], nearness + step[1]) - base) / _STEP
-            parts.append((slope, rows, np.full(len(base), len(values) + column)))
+        columns = [3 * numbers + axis for numbers in (self._first, self._second) for axis in range(3)]
+        columns += [np.full(len(self._first), len(values) + column) for column in (-3, -2)]
+        for step, column in zip(_STEP * np.eye(8), columns, strict=True):
+            one, other = pair[0] + step[:3], pair[1] + step[3:6]
+            changed = self._match_residuals(one, other, log_focal + step[6], nearness + step[7])
+            parts.append(((changed - base) / _STEP, rows, np.tile(column, 2)))
         slope, row, column = self._prior_slopes
         parts.append((slope, len(base) + row, column))
         value, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -329,12 +326,10 @@ class _Fit:
 
     @cached_property
     def _prior_slopes(self) -> tuple[Float[np.ndarray, "s"], Int[np.ndarray, "s"], Int[np.ndarray, "s"]]:
-        """Derivatives of the priors' residuals, with their rows and columns: they are the same everywhere."""
-        # Where headings by lines do not wrap.
+        """Derivatives of the priors' residuals, with rows and columns: the same where no heading by lines wraps."""
         values = np.append(np.column_stack([-self._yaw, self._tilt]), np.zeros(3))
-        prior = self._prior_residuals(values)
-        slopes = np.array([self._prior_residuals(changed) - prior for changed in values + _STEP * np.eye(len(values))])
-        column, row = np.nonzero(slopes)
+        changed = [self._prior_residuals(changed) for changed in values + _STEP * np.eye(len(values))]
+        column, row = np.nonzero(slopes := np.array(changed) - self._prior_residuals(values))
         return slopes[column, row] / _STEP, row, column
 
 

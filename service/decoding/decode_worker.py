@@ -52,8 +52,9 @@ class Decoding:
 
     def film(self, content: bytes, stated: StatedCamera, threads: int) -> Film:
         """Read a film of a turn."""
-        limits = replace(self.film_limits, threads=threads)
-        return read_film(content, stated=stated, patch_size=self.patch, limits=limits)
+        return read_film(
+            content, stated=stated, patch_size=self.patch, limits=replace(self.film_limits, threads=threads)
+        )
 
     def turn(self, photographs: Sequence[Photograph]) -> tuple[list[Photograph], list[TurnAngles]]:
         """Return photographs of one spot with their patches, and their angles to each other."""

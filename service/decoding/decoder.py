@@ -91,8 +91,7 @@ class Decoder:
         # Films take so long that photographs must not wait for them.
         self._film_stall_s = settings.photographs.max_film_cpu_s + _FILM_MARGIN_S
         self._films = pool("film", self._film_stall_s, settings.decode.film_workers, _FILM_QUEUE)
-        self._films_started, self._lock = False, threading.Lock()
-        self._long_jobs = 0
+        self._films_started, self._long_jobs, self._lock = False, 0, threading.Lock()
         telemetry.gauge(
             "lalaloc_decode_queue_depth", "Photographs waiting for a decoding worker.", lambda: self._pool.waiting
         )
@@ -167,7 +166,9 @@ class Decoder:
         return await self._run_job(DecodeJob("drawing", (svg,)), context)
 
     async def _run_job(self, job: DecodeJob, context: QueryContext) -> Any:
-        is_long = _is_long(job) or self._can_be_beside(job)
+        # Photographs of a turn also go where films are read, on another core, if that is idle.
+        is_idle = not self._long_jobs and self._films.state.ready > 0
+        is_long = _is_long(job) or (is_idle and job.task == "photograph" and job.arguments[2] == "turn")
         pool = self._started_films() if is_long else self._pool
         self._long_jobs += is_long
         try:
@@ -178,11 +179,6 @@ class Decoder:
             raise type(error)(f"{error}; see {_HELP}") from error
         finally:
             self._long_jobs -= is_long
-
-    def _can_be_beside(self, job: DecodeJob) -> bool:
-        """Return whether a photograph of a turn can be decoded where films are read, on another core, at once."""
-        is_of_turn = job.task == "photograph" and job.arguments[2] == "turn"
-        return is_of_turn and not self._long_jobs and self._films.state.ready > 0
 
     def _started_films(self) -> WorkerPool[DecodeJob, Any]:
         """Return the pool of films, whose workers the first long job starts."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -53,17 +52,13 @@ class PhotographReader:
                 return await self._decoder.decode(contents[index], stated, context, purpose=purpose)
 
         photographs: list[Photograph] = []
-        begun: deque[asyncio.Task[Photograph]] = deque()
-        try:
-            for index in range(len(contents)):
-                begun.append(asyncio.create_task(decode(index)))
-                if len(begun) == _BESIDE:
-                    photographs.append(await begun.popleft())
-            return photographs + [await task for task in begun]
-        finally:
-            for task in begun:
-                task.cancel()
-            await asyncio.gather(*begun, return_exceptions=True)
+        for first in range(0, len(contents), _BESIDE):
+            group = range(first, min(first + _BESIDE, len(contents)))
+            for decoded in await asyncio.gather(*map(decode, group), return_exceptions=True):
+                if isinstance(decoded, BaseException):
+                    raise decoded
+                photographs.append(decoded)
+        return photographs
 
     async def decode_turn(
         self, contents: Sequence[Content], stated: StatedCamera, context: QueryContext

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 import zlib
 from collections.abc import Sequence
@@ -14,9 +13,9 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.draw.canvas import jpeg as encode_jpeg
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, WithoutDepth
 from lalaloc_core.photograph.cameras import Perspective, camera_axes
@@ -34,7 +33,6 @@ _VIEW_SIZE = (640, 480)
 # Normal spreads and limits of pitch and roll (degrees).
 _PITCH_DEG, _MAX_PITCH_DEG = 8.0, 20.0
 _ROLL_DEG, _MAX_ROLL_DEG = 2.0, 5.0
-_JPEG_QUALITY = 90
 
 
 @dataclass(frozen=True)
@@ -162,13 +160,6 @@ class ViewPhotograph(WithoutDepth):
         """Return the whole sphere at the given size, turned to the view."""
         pixels = self.sphere.photograph.image(height, width)
         return np.roll(pixels, -round(self.azimuth / TWO_PI * width), axis=1)
-
-
-def encode_jpeg(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Return a picture as a JPEG file."""
-    content = io.BytesIO()
-    Image.fromarray(pixels).save(content, "JPEG", quality=_JPEG_QUALITY)
-    return content.getvalue()
 
 
 def cut_view(

@@ -91,11 +91,8 @@ class PhotographEncoder:
             for view, turn in turned
             if view.wall_direction is not None
         )
-        several = {
-            "objects": self.seen_objects(turned, objects()),
-            "wall_directions": directions,
-            "is_turn": bool(others),
-        }
+        seen = self.seen_objects(turned, objects())
+        several = {"objects": seen, "wall_directions": directions, "is_turn": bool(others)}
         searched = None if query.searched is None else replace(query.searched, **several)
         return replace(query, **several, searched=searched)
 
@@ -120,13 +117,12 @@ class PhotographEncoder:
     def _objects_beside(
         self, photographs: Sequence[Photograph], *, detects: bool = False
     ) -> Callable[[], list[dict[str, np.ndarray]]]:
-        """Return a function with the outputs of recognising objects, meanwhile on an idle core if there is one."""
+        """Return a function that recognises the objects which an idle core, if any, has not begun; with all outputs."""
         helper = None if self._objects is None else self.layouts.helper()
         work = partial(self._object_outputs, detects=detects)
         begun = [Future() if helper is None else helper.submit(work, photograph) for photograph in photographs]
 
         def outputs() -> list[dict[str, np.ndarray]]:
-            # The caller recognises what the helper has not begun, from the last photograph on.
             for number in reversed(range(len(begun))):
                 if begun[number].cancel():
                     begun[number] = Future()
