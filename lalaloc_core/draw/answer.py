@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, jpeg, shortened, words
+from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
 from lalaloc_core.draw.outline import Outline, layout_outline, photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
@@ -20,6 +20,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.answers.documents import Answer, Position, PossiblePose
 from lalaloc_core.localise.belief import RIGHT_WITHIN_M, probability_map
 from lalaloc_core.photograph import Photograph
+from lalaloc_core.photograph.picture_files import jpeg
 from lalaloc_core.shown_text import probability_text
 
 Picture = Literal["both", "plan", "photograph"]

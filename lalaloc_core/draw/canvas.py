@@ -42,7 +42,6 @@ _EAST_ASIAN = {
 _OTHER_SCRIPTS = re.compile(
     "[\u0700-\u07bf\u0800-\u0e7f\u0f00-\u109f\u1100-\u13ff\u1680-\u1cff\u3130-\u318f\ua4d0-\uabff\ud7a4-\ud7ff\U00010000-\U0010ffff]"
 )
-_JPEG_QUALITY = 90
 
 
 def document(width: Number, height: Number, title: str, parts: Iterable[str]) -> str:
@@ -135,11 +134,4 @@ def png(values: UInt8[np.ndarray, "h w c"]) -> bytes:
     """Encode pixels as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(values).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
-def jpeg(values: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Encode pixels as JPEG."""
-    buffer = io.BytesIO()
-    Image.fromarray(values).save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return buffer.getvalue()

@@ -19,7 +19,8 @@ import pypdfium2.raw as pdfium
 from defusedxml.ElementTree import fromstring
 from jaxtyping import Float
 
-from lalaloc_core.draw.canvas import font_runs, jpeg, pixels
+from lalaloc_core.draw.canvas import font_runs, pixels
+from lalaloc_core.photograph.picture_files import jpeg
 
 _POINTS_PER_INCH = 72.0
 _LANGUAGE = "en"

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any, Final
 
-from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, jpeg, shortened, words, xml_text
+from lalaloc_core.draw.canvas import INK, MUTED, RULE, document, image, shortened, words, xml_text
 from lalaloc_core.draw.plan import extent_m, plan_part
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.photograph.photograph import open_picture
+from lalaloc_core.photograph.picture_files import jpeg
 from lalaloc_core.shown_text import probability_text
 
 # Blue, orange and green of Okabe and Ito's palette, distinct for colour-blind readers.

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import process_time
 
 import cv2
@@ -185,9 +184,9 @@ def _turned(
     lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
     if lens.is_sphere:
         raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
-    read = partial(photograph_of_picture, full_size=full_size, lens=lens, stated=stated, size=size, purpose="film")
     with ThreadPoolExecutor(threads) as pool:
-        photographs = list(pool.map(read, [sample.picture for sample in kept]))
+        jobs = [pool.submit(photograph_of_picture, its.picture, full_size, lens, stated, size, "film") for its in kept]
+        photographs = [job.result() for job in jobs]
     views = turn_views(photographs)
     tracker.calibrate(views[0].camera.hfov, full_size)
     heading, error = (values[[sample.number for sample in kept]] for values in tracker.reckoned())

@@ -168,12 +168,10 @@ def _edges_shift(one: Float[np.ndarray, "w"], other: Float[np.ndarray, "w"]) -> 
         return None
     width, most = len(one), round(_SHIFT * len(one))
     shift = np.arange(-most, most + 1)
-    # Sums of squares of the columns that both show, from their running totals.
     ahead, behind = np.maximum(shift, 0), np.maximum(-shift, 0)
     first, second = (np.concatenate([[0.0], np.cumsum(np.square(values, dtype=float))]) for values in (one, other))
     square = (first[width - ahead] - first[behind]) * (second[width - behind] - second[ahead])
-    product = np.correlate(other, one, "full")[width - 1 + shift]
-    alike = product / np.maximum(np.sqrt(np.maximum(square, 0.0)), 1e-9)
+    alike = np.correlate(other, one, "full")[width - 1 + shift] / np.maximum(np.sqrt(np.maximum(square, 0.0)), 1e-9)
     best = int(alike.argmax())
     return float(shift[best]) if alike[best] > _CORRELATION else None
 

@@ -154,7 +154,6 @@ def find_links(
     values = (found.descriptor.astype(np.float32) for found in features)
     rooted = [np.sqrt(value / np.maximum(value.sum(axis=1, keepdims=True), 1.0)) for value in values]
     axes = [camera_axes(pitch=attitude.pitch, roll=attitude.roll) for attitude in attitudes]
-    fields = [camera.hfov for camera in cameras]
 
     def link(pair: tuple[int, int], min_matches: int, min_share: float) -> Link | None:
         first, second = pair
@@ -169,7 +168,7 @@ def find_links(
         return Link(first, second, matched[:, np.flatnonzero(turned[1])[:_MAX_MATCHES]], turned[0])
 
     def overlap(first: int, second: int, turn: float) -> bool:
-        return abs(turn) < 0.5 * (fields[first] + fields[second])
+        return abs(turn) < 0.5 * (cameras[first].hfov + cameras[second].hfov)
 
     near = [link(pair, _MIN_MATCHES, _MIN_SHARE) for pair, step in steps.items() if step <= _NEAR_STEPS]
     links = [found for found in near if found is not None]

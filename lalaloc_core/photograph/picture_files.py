@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPhotographError
@@ -230,6 +231,13 @@ def _scaled_part(file: PictureFile, size: tuple[int, int]) -> Image.Image:
     picture = scaled(replace(file, box=_WHOLE), (min(width, finest[0]), min(height, finest[1])))
     pixels = left * picture.width, top * picture.height, right * picture.width, bottom * picture.height
     return picture.resize(size, Image.Resampling.BOX, box=pixels)
+
+
+def jpeg(pixels: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Encode pixels as JPEG."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=90)
+    return buffer.getvalue()
 
 
 def _check_missing(pixels: np.ndarray) -> None:

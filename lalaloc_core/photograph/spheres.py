@@ -109,12 +109,10 @@ def level(
     """
     height, width = pixels.shape[:2]
     # A row beyond a pole is the row before it, half a turn away.
-    beyond = [np.roll(pixels[[row]], width // 2, axis=1) for row in (0, -1)]
-    around = np.concatenate([beyond[0], pixels, beyond[1]])
-    azimuth, elevation = column_azimuths(width) + turn, row_elevations(height)
-    axes, parts = camera_axes(pitch=pitch, roll=roll), []
+    around = np.concatenate([np.roll(pixels[:1], width // 2, axis=1), pixels, np.roll(pixels[-1:], width // 2, axis=1)])
+    elevation, axes, parts = row_elevations(height)[:, None], camera_axes(pitch=pitch, roll=roll), []
     for top in range(0, height, _ROWS):
-        rays = unit_rays(azimuth, elevation[top : top + _ROWS, None]) @ axes.T
+        rays = unit_rays(column_azimuths(width) + turn, elevation[top : top + _ROWS]) @ axes.T
         column = (np.arctan2(rays[..., 0], rays[..., 1]) / TWO_PI + 0.5) * width - 0.5
         row = (0.5 - np.arcsin(np.clip(rays[..., 2], -1.0, 1.0)) / math.pi) * height + 0.5
         where = column.astype(np.float32), row.astype(np.float32)

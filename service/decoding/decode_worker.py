@@ -13,11 +13,11 @@ from typing import Any, Literal, NamedTuple
 import cv2
 import numpy as np
 
-from lalaloc_core.draw.canvas import jpeg, rasterise
+from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.photograph import PatchSize, Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.film import Film, FilmLimits, read_film
 from lalaloc_core.photograph.photograph import Purpose, open_picture, warm_up
-from lalaloc_core.photograph.picture_files import PhotographLimits
+from lalaloc_core.photograph.picture_files import PhotographLimits, jpeg
 from lalaloc_core.photograph.placed_copy import Place, PlacedHead, placed_head
 from lalaloc_core.photograph.turn_angles import TurnAngles
 from lalaloc_core.photograph.turned import level_turn

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.draw.canvas import jpeg as encode_jpeg
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, DatasetPhotograph, Scene, Split, WithoutDepth
 from lalaloc_core.photograph.cameras import Perspective, camera_axes
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photograph import Photograph, open_photograph
+from lalaloc_core.photograph.picture_files import jpeg as encode_jpeg
 from lalaloc_core.photograph.stated_camera import StatedCamera
 
 # What is stated about photographs: nothing, the field of view, or the tilt as well.

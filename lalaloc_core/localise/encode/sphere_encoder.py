@@ -171,10 +171,9 @@ class SphereEncoder:
         both, helper = np.stack([image, image[:, ::-1]]), self.helper()
         if helper is None:
             return self.run(both, camera_height_m, outputs)
-        begun = helper.submit(self.run, both[1:], camera_height_m, outputs)
+        mirrored = helper.submit(self.run, both[1:], camera_height_m, outputs)
         own = self.run(both[:1], camera_height_m, outputs)
-        mirrored = self.run(both[1:], camera_height_m, outputs) if begun.cancel() else begun.result()
-        return [np.concatenate(pair) for pair in zip(own, mirrored, strict=True)]
+        return [np.concatenate(pair) for pair in zip(own, mirrored.result(), strict=True)]
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
