@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -119,14 +118,16 @@ class PhotographEncoder:
     ) -> Callable[[], list[dict[str, np.ndarray]]]:
         """Return a function that recognises the objects which an idle core, if any, has not begun; with all outputs."""
         helper = None if self._objects is None else self.layouts.helper()
-        work = partial(self._object_outputs, detects=detects)
-        begun = [Future() if helper is None else helper.submit(work, photograph) for photograph in photographs]
+        begun = [
+            Future() if helper is None else helper.submit(self._object_outputs, photograph, detects=detects)
+            for photograph in photographs
+        ]
 
         def outputs() -> list[dict[str, np.ndarray]]:
             for number in reversed(range(len(begun))):
                 if begun[number].cancel():
                     begun[number] = Future()
-                    begun[number].set_result(work(photographs[number]))
+                    begun[number].set_result(self._object_outputs(photographs[number], detects=detects))
             return [future.result() for future in begun]
 
         return outputs
