@@ -83,10 +83,11 @@ export class PhotoView {
   }
 
   /** Show a photograph; null shows none. Rejects if the file is not a picture. */
-  async setPicture(file: Blob | null): Promise<void> {
+  async setPicture(file: File | null): Promise<void> {
     this.release(this.url);
     this.url = file === null ? null : URL.createObjectURL(ended(file));
     this.stage.classList.toggle("empty", file === null);
+    this.stage.dataset.name = file?.name ?? "";
     if (this.url === null) {
       this.picture.removeAttribute("src");
       this.setLines([], 0);
@@ -97,7 +98,7 @@ export class PhotoView {
       await this.picture.decode();
     } catch {
       this.stage.classList.add("empty");
-      throw new InputError("The browser cannot show this file as a picture; the service may still read it.");
+      throw new InputError(`The browser cannot show “${file!.name}” as a picture; the service may still read it.`);
     }
     const sphere = await isSphere(file!, this.picture);
     if (sphere === (this.shape === "flat")) this.shape = sphere ? "around" : "flat";

@@ -234,7 +234,7 @@ export class Photos {
             "aria-label": `Photograph ${name}${photo.answer === null ? "" : `, found in ${photo.answer.room}`}`,
             onclick: () => this.choose(photo),
           },
-          h("img", { src: photo.url, alt: "" }),
+          h("img", { src: photo.url, alt: "", onerror: (event) => (event.target as Element).remove() }),
           h("span", {}, photo.answer === null ? name : `✓ ${photo.answer.room}`),
         );
         const remove = button("×", () => this.remove(photo), { class: "remove", "aria-label": `Remove ${name}` });
