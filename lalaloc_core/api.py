@@ -226,7 +226,9 @@ class LaLaLoc:
         read = [read_plan(plan) for plan in several]
         sources = pictures_in(Path(photographs)) if isinstance(photographs, str | PathLike) else photographs
         if len(sources) > MAX_PHOTOGRAPHS:
-            raise InvalidInputError(f"{len(sources)} photographs are given; the limit is {MAX_PHOTOGRAPHS}")
+            raise InvalidInputError(
+                f"{len(sources)} photographs are too many; the limit is {MAX_PHOTOGRAPHS}: divide them"
+            )
         rows: list[PinnedPhotograph] = []
         entries: dict[str, AlbumPhotograph] = {}
         for number, source in enumerate(sources, start=1):

@@ -110,14 +110,9 @@ def _check_out(out: Path, sources: Iterable[Path | None], *, replace: bool) -> N
 
 def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:
     """Return the picture files of a folder, and notes on what is left out."""
-    from lalaloc_core.api import MAX_PHOTOGRAPHS
     from lalaloc_core.photograph.picture_folders import pictures_in
 
     found = [path for path in pictures_in(folder) if path.resolve() != plan.resolve()]
-    if len(found) > MAX_PHOTOGRAPHS:
-        raise InvalidInputError(
-            f"'{folder}' has {len(found)} photographs; the limit is {MAX_PHOTOGRAPHS}: divide them into several folders"
-        )
     others = [path for path in folder.iterdir() if not path.name.startswith(".") and path not in found]
     others = [path for path in others if path.resolve() not in (out.resolve(), plan.resolve())]
     folders, notes = sum(path.is_dir() for path in others), []

@@ -1,8 +1,8 @@
 """Focal length, time and camera of a photograph by its EXIF metadata, without its position or owner.
 
 Phones write `FocalLengthIn35mmFilm`, which is preferred: it holds after scaling, and phones include digital zoom.
-Otherwise `FocalLength` is divided by the width of the sensor, from `FocalPlaneXResolution` or a table, and multiplied
-by `DigitalZoomRatio`. Values are not trusted: a zero means unknown by the standard (CIPA DC-008), and values out of
+Otherwise `FocalLength` is divided by the width of the sensor, from `FocalPlaneXResolution`, and multiplied by
+`DigitalZoomRatio`. Values are not trusted: a zero means unknown by the standard (CIPA DC-008), and values out of
 range are ignored with a warning.
 """
 
@@ -20,16 +20,6 @@ from PIL import ExifTags, Image
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 # Sides of a 4:3 sensor with that diagonal.
 _LONG_MM, _SHORT_MM = 0.8 * _FILM_DIAGONAL_MM, 0.6 * _FILM_DIAGONAL_MM
-# Phones that write no equivalent focal length, at least with their first software: focal length of the rear camera (mm,
-# as in its files) and longer side of the sensor (mm, openMVG's CameraSensorSizeDatabase).
-_SENSORS_MM = {
-    "iphone 4": (3.85, 4.54),
-    "iphone 4s": (4.28, 4.54),
-    "iphone 5": (4.13, 4.54),
-    "iphone 5s": (4.15, 4.89),
-    "iphone 6": (4.15, 4.89),
-    "iphone 6 plus": (4.15, 4.89),
-}
 # Action cameras whose wide lens is a fisheye: maker and model, and the angle (degrees) across the longer side at 4:3:
 # as the maker states it (GoPro), else 0.8 of the diagonal that it states.
 _FISHEYES = tuple(
@@ -46,8 +36,12 @@ _FISHEYES = tuple(
 )
 # Longer equivalent focal lengths of these cameras are those of linear and narrow modes.
 _MAX_FISHEYE_MM = 18.0
-# A crop that an editor states, as an attribute or element of the Camera Raw schema.
-_HAS_CROP = re.compile(rb"crs:HasCrop\s{0,9}(?:=\s{0,9}[\"']|>)\s{0,9}True", re.IGNORECASE)
+# A crop that Lightroom, unless the pixels do not have it yet, or darktable states.
+_HAS_CROP = re.compile(rb":HasCrop(?:=.|>)\s{0,9}[Tt]rue|:operation=.(?:crop|clipping).[^<>]{1,99}enabled=.1")
+_NOT_APPLIED = re.compile(rb":AlreadyApplied\s{0,9}(?:=\s{0,9}.|>)\s{0,9}[Ff]alse")
+_SIZES = re.compile(rb"tiff:Image(Width|Length)\s{0,9}(?:=\s{0,9}.|>)\s{0,9}(\d{1,6})")
+# Editors, after which a picture can be a part of what its focal length is for.
+_EDITORS = re.compile("affinity|canva|darktable|gimp|google|irfan|light ?room|paint|photo|pic|pix|snap|therapee", re.I)
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_RANGE_MM = (4.0, 250.0)
 _FOCAL_RANGE_MM = (0.5, 250.0)
@@ -84,12 +78,14 @@ class ExifLens:
     Attributes:
         focal: focal length, pixels of the full picture; None if unknown.
         strip: the picture is a strip of a phone's panorama mode.
+        is_doubtful: the picture was edited, or its size changed, so it can be a part of what the focal length is for.
         fisheye: angle (radians) across the longer side, if the camera's wide lens is a fisheye; else None.
     """
 
     focal: float | None = None
     focal_sd: float = 0.0
     strip: bool = False
+    is_doubtful: bool = False
     fisheye: float | None = None
     camera: str = ""
     warnings: tuple[str, ...] = ()
@@ -123,17 +119,20 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
     zoom = _in_range(tags, ExifTags.Base.DigitalZoomRatio, _ZOOM_RANGE, "", warnings) or 1.0
     film = _in_range(tags, ExifTags.Base.FocalLengthIn35mmFilm, _FILM_RANGE_MM, " mm", warnings)
     lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)
-    if _is_cropped(tags, width, height) or any(map(_HAS_CROP.search, packets)):
+    sizes, ratio = stated_sizes(exif, packets), max(width, height) / min(width, height)
+    has_crop = any(map(_HAS_CROP.search, packets)) and not any(map(_NOT_APPLIED.search, packets))
+    if has_crop or any(abs(max(size) / min(size) / ratio - 1.0) > _CROPPED for size in sizes):
         if film is not None or lens is not None:
             warnings.append("the photograph was cropped after it was taken, so its EXIF focal length is not used")
         return ExifLens(warnings=tuple(warnings))
-    long, ratio = max(width, height), max(width, height) / min(width, height)
+    long = max(width, height)
     usual = min(abs(ratio - 4.0 / 3.0), abs(ratio - 1.5)) < 0.05
     focal = None
     if film is not None:
         focal = film / _film_side_mm(ratio) * long
-    elif lens is not None and (side_mm := _sensor_side_mm(exif, tags, lens, warnings)) is not None:
+    elif lens is not None and (side_mm := _sensor_side_mm(tags, warnings)) is not None:
         focal = zoom * lens / side_mm * long
+    is_edited = _EDITORS.search(_text(exif.get(ExifTags.Base.Software))) is not None
     # Makers disagree whether the equivalent focal length includes digital zoom.
     doubt = 0.5 * math.log(zoom) if film is not None else 0.0
     camera = " ".join(_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)).strip()
@@ -142,6 +141,7 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
     return ExifLens(
         focal=focal,
         focal_sd=max(_SD if usual else _CROPPED_SD, doubt),
+        is_doubtful=is_edited or any(sorted(size) != sorted((width, height)) for size in sizes),
         fisheye=None if angle_deg is None else math.radians(angle_deg),
         camera="" if angle_deg is None else camera,
         warnings=tuple(warnings),
@@ -155,8 +155,8 @@ def _film_side_mm(ratio: float) -> float:
     return _LONG_MM if ratio >= 4.0 / 3.0 else _SHORT_MM * ratio
 
 
-def _sensor_side_mm(exif: Image.Exif, tags: dict[int, object], lens_mm: float, warnings: list[str]) -> float | None:
-    """Return the longer side of the sensor, from the pixels per unit on it or the model."""
+def _sensor_side_mm(tags: dict[int, object], warnings: list[str]) -> float | None:
+    """Return the longer side of the sensor, from the pixels per unit on it."""
     density = finite_number(tags.get(ExifTags.Base.FocalPlaneXResolution))
     unit = finite_number(tags.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     unit_mm = None if unit is None else _UNITS_MM.get(round(unit))
@@ -171,18 +171,16 @@ def _sensor_side_mm(exif: Image.Exif, tags: dict[int, object], lens_mm: float, w
             f"EXIF FocalPlaneXResolution gives a sensor of {side_mm:.3g} mm; it must be between "
             f"{_SENSOR_RANGE_MM[0]:g} and {_SENSOR_RANGE_MM[1]:g} mm, so it is ignored"
         )
-    model = str(exif.get(ExifTags.Base.Model, "")).strip("\0 ").lower()
-    known_mm, side_mm = _SENSORS_MM.get(model, (0.0, 0.0))
-    # The front camera has another sensor.
-    return side_mm if abs(lens_mm - known_mm) < 0.05 * lens_mm else None
+    return None
 
 
-def _is_cropped(tags: dict[int, object], width: int, height: int) -> bool:
-    sides = [finite_number(tags.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-    if not sides[0] or not sides[1] or min(sides[0], sides[1]) < 1.0:
-        return False
-    taken = max(sides[0], sides[1]) / min(sides[0], sides[1])
-    return abs(taken * min(width, height) / max(width, height) - 1.0) > _CROPPED
+def stated_sizes(exif: Image.Exif, packets: Sequence[bytes]) -> list[tuple[int, int]]:
+    """Return the sizes (width, height) that metadata state of the stored picture; editors leave old ones."""
+    base, tags = ExifTags.Base, dict(exif) | exif.get_ifd(ExifTags.IFD.Exif)
+    tags |= dict(found for packet in packets for found in _SIZES.findall(packet))
+    names = ((base.ExifImageWidth, base.ExifImageHeight), (base.ImageWidth, base.ImageLength), (b"Width", b"Length"))
+    sizes = [(finite_number(tags.get(width)) or 0.0, finite_number(tags.get(height)) or 0.0) for width, height in names]
+    return [(round(width), round(height)) for width, height in sizes if min(width, height) >= 1.0]
 
 
 def _in_range(

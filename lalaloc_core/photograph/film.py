@@ -31,7 +31,7 @@ from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
 from lalaloc_core.photograph.projection import find_lens
-from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, between_bars
+from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, inside_bars
 from lalaloc_core.photograph.stated_camera import StatedCamera
 from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
@@ -51,6 +51,8 @@ _RATE, _SAMPLES = 12.0, 240
 _TIME_ROUNDED_S = 0.002
 # Longer side (pixels) of kept frames.
 _LONG_SIDE = 960
+# Share of the duration that a film states, less 1 s, that it has at least unless it is cut off.
+_WHOLE_SHARE = 0.9
 # Mean grey level of frames that are too dark.
 _DARK = 12.0
 # Standard deviation (radians) of turns by optical flow, besides what the tracker tells.
@@ -101,6 +103,7 @@ class _Samples:
     dropped: Counter[str] = field(default_factory=Counter)
     frames: int = 0
     last_s: float = 0.0
+    claimed_s: float = 0.0
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -226,37 +229,29 @@ def _on_side(tracker: FlowTracker, statement: str) -> str:
 
 
 def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
-    warnings = []
     inside = math.prod(samples.full_size) / math.prod(samples.stored_size)
-    if inside < 1.0:
-        warnings.append(f"the film has bars, {1.0 - inside:.0%} of its picture: they were cut off")
-    if tracker.nodded > max(_LEAST_TURN, _SIDEWAYS * tracker.turned):
-        warnings.append(_on_side(tracker, "may lie on its side"))
-    if tracker.turned < _LEAST_TURN:
-        warnings.append(
-            f"the camera turns by {math.degrees(tracker.turned):.0f}° only: film one slow turn, once around on the spot"
-        )
-    if tracker.walks:
-        warnings.append(
-            "the camera walks: things grow or shift as they do not in a turn; stay on one spot, and turn about yourself"
-        )
-    if tracker.shakes:
-        warnings.append(
-            f"the camera shakes: it nods by {math.degrees(tracker.nod):.1f}° from one sample to the next; hold it with "
-            "both hands, and turn slowly"
-        )
-    if tracker.lost_share > 0.5:
-        warnings.append(
-            f"{100.0 * tracker.lost_share:.0f} % of the film shows nothing that can be followed, such as blank walls "
-            "or blur: its angles are less sure; turn slowly, in a lit room"
-        )
-    return warnings
+    turned, is_on_side = tracker.turned, tracker.nodded > max(_LEAST_TURN, _SIDEWAYS * tracker.turned)
+    is_cut = samples.last_s < _WHOLE_SHARE * samples.claimed_s - 1.0
+    faults = {
+        f"the film has bars, {1.0 - inside:.0%} of its picture: they were cut off": inside < 1.0,
+        f"the film ends after {samples.last_s:.1f} of {samples.claimed_s:.1f} s, as if cut off: send all of it": is_cut,
+        _on_side(tracker, "may lie on its side"): is_on_side,
+        f"the camera turns by {math.degrees(turned):.0f}° only: film one slow turn, once around on the spot": turned
+        < _LEAST_TURN,
+        "the camera walks: things grow or shift as they do not in a turn; stay on one spot, and turn about "
+        "yourself": tracker.walks,
+        f"the camera shakes: it nods by {math.degrees(tracker.nod):.1f}° from one sample to the next; hold it with "
+        "both hands, and turn slowly": tracker.shakes,
+        f"{100.0 * tracker.lost_share:.0f} % of the film shows nothing that can be followed, such as blank walls or "
+        "blur: its angles are less sure; turn slowly, in a lit room": tracker.lost_share > 0.5,
+    }
+    return [text for text, applies in faults.items() if applies]
 
 
 def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float) -> None:
     """Decode a film, and add its sharpest frames by angle; its CPU time counts from `begin`."""
-    with _opened(content, limits) as (capture, claimed_s):
-        interval_s = max(1.0 / _RATE, claimed_s / _SAMPLES)
+    with _opened(content, limits) as (capture, samples.claimed_s):
+        interval_s = max(1.0 / _RATE, samples.claimed_s / _SAMPLES)
         next_s = 0.0
         while capture.grab():
             samples.frames += 1
@@ -315,10 +310,8 @@ def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
     """Return the rows and columns of frames between bars, by some of all frames; all of them without bars."""
     if not samples.looks:
         return _WHOLE
-    looks, parts = (samples.looks, [cv2.transpose(look) for look in samples.looks]), []
-    for side, pictures in zip(samples.stored_size[::-1], map(np.stack, looks), strict=True):
-        begin, end = between_bars(pictures)
-        rows = pictures.shape[1]
+    looks, parts = np.stack(samples.looks), []
+    for side, rows, (begin, end) in zip(samples.stored_size[::-1], looks.shape[1:3], inside_bars(looks), strict=True):
         # A row at each bar can be mixed with it.
         begin, end = begin + (begin > 0), end - (end < rows)
         parts.append(slice(round(begin * side / rows), round(end * side / rows)))
@@ -369,7 +362,7 @@ def film_kind(content: bytes) -> str | None:
 def _checked(capture: cv2.VideoCapture, kind: str, limits: FilmLimits) -> float:
     """Check a film's header; return the duration (s) that it claims."""
     if not capture.isOpened():
-        raise InvalidFilmError(f"the {kind} file has no film that can be read: it is damaged, or holds sound only")
+        raise InvalidFilmError(f"the {kind} file has no film that can be read: it is cut off, damaged or sound only")
     code = struct.pack("<I", int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF)
     if code not in _CODECS:
         known = ", ".join(sorted(set(_CODECS.values())))

@@ -52,6 +52,9 @@ _JPEG_FACTORS = (8, 4, 2, 1)
 _MAX_RATIO = 500
 # Ratios of sides of photographs, and their relative deviation.
 _USUAL_RATIOS, _USUAL_TOLERANCE = (4.0 / 3.0, 1.5, 16.0 / 9.0), 0.02
+# Log ratio by which lines, and twice their deviation, contradict the focal length of an edited picture: in 2 % of 848
+# views of real rooms, and in 88 % (65 %) of these cropped to 0.5 (0.7) of their sides.
+_NARROWER = 0.2
 # Standard deviation of a stated pitch or roll.
 _GIVEN_SD = math.radians(0.5)
 
@@ -362,12 +365,17 @@ def photograph_of_picture(
     is_of_turn = purpose in ("turn", "film")
     segments = find_segments(picture)
     camera, focal_sd, attitude, warnings = lens.camera, lens.focal_sd, None, lens.warnings
-    if camera is None:
-        estimated_hfov, focal_sd, attitude = estimate_calibration(segments, width=columns, height=rows)
-        camera = Perspective.of_hfov(*full_size, estimated_hfov)
-        if not is_of_turn:
-            origin = "was estimated from straight lines" if len(segments) else "is only usual"
-            warnings = (*warnings, field_warning(camera.hfov, _hfov_sd(camera, focal_sd), origin))
+    if camera is None or lens.is_doubtful:
+        hfov, sd, tilt_by_lines = estimate_calibration(segments, width=columns, height=rows)
+        by_lines = Perspective.of_hfov(*full_size, hfov)
+        origin = "was estimated from straight lines" if len(segments) else "is only usual"
+        if camera is not None and math.log(by_lines.fx / camera.resolution) > max(_NARROWER, 2.0 * sd):
+            origin += f", as the picture was edited and its EXIF focal length gives {math.degrees(camera.hfov):.0f}°"
+            camera, lens = None, replace(lens, hfov_source="estimated")
+        if camera is None:
+            camera, focal_sd, attitude = by_lines, sd, tilt_by_lines
+            if not is_of_turn:
+                warnings = (*warnings, field_warning(hfov, _hfov_sd(camera, focal_sd), origin))
     small = camera.scaled(columns, rows)
     lines = lines_of(segments, small)
     attitude = attitude or estimate_attitude(lines)

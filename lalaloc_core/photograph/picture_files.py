@@ -10,7 +10,7 @@ import io
 import math
 import struct
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -20,6 +20,7 @@ from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.file_kinds import HEIC, STAND_INS, describe_file
+from lalaloc_core.photograph.exif import stated_sizes
 from lalaloc_core.photograph.file_segments import (
     END,
     MAX_TEXT_BYTES,
@@ -138,8 +139,9 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
     if isinstance(image.info.get("xmp"), str):
         del image.info["xmp"]
     packets, unread = xmp_packets(content)
+    packets = packets or [packet for packet in [image.info.get("xmp")] if packet]
     exif, is_damaged = _exif_of(image)
-    was_turned, orientation = _was_turned(exif, size), exif.get(ExifTags.Base.Orientation)
+    was_turned, orientation = _was_turned(exif, packets, size), exif.get(ExifTags.Base.Orientation)
     faults = {
         f"the Exif orientation {orientation} was ignored, because the picture was turned after it was taken: the Exif "
         "size is that of a picture on its side; send the camera's original file if this is wrong": was_turned,
@@ -153,7 +155,7 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
         kind=image.format,
         size=size,
         exif=exif,
-        packets=packets or [packet for packet in [image.info.get("xmp")] if packet],
+        packets=packets,
         is_upright=was_turned,
         is_cut=is_cut,
         warnings=[text for text, applies in faults.items() if applies],
@@ -170,17 +172,14 @@ def _exif_of(image: Image.Image) -> tuple[Image.Exif, bool]:
     return exif, False
 
 
-def _was_turned(exif: Image.Exif, size: tuple[int, int]) -> bool:
-    """Return whether a picture was turned upright but kept its orientation: it has its Exif size, turned.
+def _was_turned(exif: Image.Exif, packets: Sequence[bytes], size: tuple[int, int]) -> bool:
+    """Return whether a picture was turned upright but kept its orientation: it has a size that is stated, turned.
 
     Sensors are wider than high; some cameras state the size of the upright picture.
     """
-    tags = exif.get_ifd(ExifTags.IFD.Exif)
-    width, height = (tags.get(tag) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
-    if exif.get(ExifTags.Base.Orientation) not in SIDEWAYS or not isinstance(width, int) or not isinstance(height, int):
-        return False
-    is_alike = abs(width * size[0] - height * size[1]) <= _SAME_RATIO * width * size[0]
-    return is_alike and width > height and size[0] < size[1]
+    ratios = [width / height for width, height in stated_sizes(exif, packets) if width > height]
+    is_upright = size[0] < size[1] and any(abs(ratio * size[0] / size[1] - 1.0) <= _SAME_RATIO for ratio in ratios)
+    return is_upright and exif.get(ExifTags.Base.Orientation) in SIDEWAYS
 
 
 def _formats(content: bytes) -> tuple[str, ...]:
@@ -265,7 +264,7 @@ def _reduced(image: Image.Image, factor: int) -> Image.Image:
 def _to_rgb(image: Image.Image) -> Image.Image:
     """Convert to 8-bit RGB; 16-bit grey is scaled (Pillow would clip it), transparent pixels become neutral."""
     if image.mode == "I" or image.mode.startswith("I;16"):
-        image = _eight_bit(image)
+        image = Image.fromarray((np.asarray(image).clip(0, 65535) // 256).astype(np.uint8))
     if image.mode == "CMYK" and "adobe" not in image.info:
         # Pillow assumes that CMYK pictures are stored inverted, but only Adobe's are.
         image = ImageChops.invert(image)
@@ -273,16 +272,6 @@ def _to_rgb(image: Image.Image) -> Image.Image:
         opaque = Image.new("RGBA", image.size, (*NEUTRAL, 255))
         image = Image.alpha_composite(opaque, image.convert("RGBA"))
     return image.convert("RGB")
-
-
-def _eight_bit(image: Image.Image) -> Image.Image:
-    values = np.asarray(image)
-    grey = Image.fromarray((values.clip(0, 65535) // 256).astype(np.uint8))
-    transparent = image.info.get("transparency")
-    if not isinstance(transparent, int):
-        return grey
-    opacity = np.where(values == transparent, 0, 255).astype(np.uint8)
-    return Image.merge("LA", (grey, Image.fromarray(opacity)))
 
 
 @contextmanager

@@ -59,6 +59,7 @@ class Lens:
 
     Attributes:
         camera: camera of the full upright picture; None if the field of view is to be estimated.
+        is_doubtful: straight lines can contradict the field of view.
     """
 
     projection: Projection
@@ -66,6 +67,7 @@ class Lens:
     camera: Camera | None = None
     hfov_source: Source = "estimated"
     focal_sd: float = 0.0
+    is_doubtful: bool = False
     warnings: tuple[str, ...] = ()
 
     @property
@@ -221,4 +223,4 @@ def _perspective(width: int, height: int, lens: Lens, exif: ExifLens) -> Lens:
     if not low <= math.degrees(camera.hfov) <= high:
         warning = f"the EXIF focal length gives a field of view of {math.degrees(camera.hfov):.3g}° and is ignored"
         return replace(lens, warnings=(*exif.warnings, warning))
-    return replace(lens, camera=camera, hfov_source="exif", focal_sd=exif.focal_sd)
+    return replace(lens, camera=camera, hfov_source="exif", focal_sd=exif.focal_sd, is_doubtful=exif.is_doubtful)

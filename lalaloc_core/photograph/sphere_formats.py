@@ -26,8 +26,10 @@ _TOLERANCE = 0.01
 # pictures reach 0.57, a plain corridor seen both ways), and the largest shift between them (pixels).
 _EYE, _MIN_CORRELATION, _MAX_SHIFT = (64, 128), 0.75, 6
 # Bars: largest spread of grey levels along a row, share of a row that is of the bar, beside texts, and least share of
-# the height; shares of the picture that bars around photographs have, and fewest rows between them.
+# the height; shares of the picture that bars around photographs have, and fewest rows between them. Share of
+# the rows of a bar that have its colour.
 _MAX_BAR_SPREAD, _OF_BAR, _MIN_BARS, _PHOTOGRAPH_BARS, _FEWEST_ROWS = 4.0, 0.8, 0.02, (0.08, 0.85), 48
+_PLAIN_OF_BARS = 0.3
 # Bars that are not alike: largest difference from their colour. All: share of a row beside their edge that is of them.
 # Blurred ones: ratio of the step at their edge to those beside it, and of the detail within to theirs; largest step.
 _EXACT_SPREAD, _WHOLE_ROW, _EDGE_OF_BLUR, _MAX_STEP = 2.0, 0.98, 2.5, 40
@@ -82,9 +84,9 @@ class Thumbnail:
         return looks_spherical(self.pixels)
 
     @cached_property
-    def between_bars(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """`between_bars` of its rows, and of its columns, as OpenCV reads arrays that numpy transposed very slowly."""
-        return between_bars(self.pixels[None]), between_bars(cv2.transpose(self.pixels)[None])
+    def inside_bars(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """`inside_bars` of its pixels."""
+        return inside_bars(self.pixels[None])
 
 
 def find_sphere_format(thumbnail: Thumbnail) -> SphereFormat | None:
@@ -212,7 +214,7 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a sphere within bars of one colour."""
     pixels = thumbnail.pixels
     height, width = pixels.shape[:2]
-    (top, bottom), (left, right) = thumbnail.between_bars
+    (top, bottom), (left, right) = thumbnail.inside_bars
     if (bottom - top) * (right - left) > (1.0 - _MIN_BARS) * height * width or min(bottom - top, right - left) < 16:
         return None
     # The bars are equal and the sphere twice as wide as high, which is more exact than the judged pixels.
@@ -236,7 +238,7 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
 def _find_photograph_in_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a photograph within bars of one colour, such as a screenshot, which can have texts there."""
     height, width = thumbnail.pixels.shape[:2]
-    (top, bottom), (left, right) = thumbnail.between_bars
+    (top, bottom), (left, right) = thumbnail.inside_bars
     share = 1.0 - (bottom - top) * (right - left) / (height * width)
     if not _PHOTOGRAPH_BARS[0] <= share <= _PHOTOGRAPH_BARS[1] or min(bottom - top, right - left) < _FEWEST_ROWS:
         return None
@@ -255,10 +257,17 @@ def _find_photograph_in_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     )
 
 
-def between_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[int, int]:
-    """Return the first row and the end of the rows between bars at the top and bottom of one or several pictures.
+def inside_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the first and the end of the rows, and of the columns, between bars in one or several pictures."""
+    rows = _between_bars(pictures)
+    # OpenCV reads arrays that numpy transposed very slowly.
+    return rows, _between_bars(np.stack([cv2.transpose(picture) for picture in pictures[:, slice(*rows)]]))
 
-    Bars have one colour, or are a blurred copy of the picture.
+
+def _between_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[int, int]:
+    """Return the first row and the end of the rows between bars at the top and bottom.
+
+    Bars have one colour, beside texts, buttons and strips of small pictures, or are a blurred copy of the picture.
     """
     rows = pictures.shape[1]
     ends = pictures, pictures[:, ::-1]
@@ -270,17 +279,19 @@ def between_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[int, int]:
     return top, rows - bottom
 
 
-def _plain_rows(pictures: UInt8[np.ndarray, "f n m 3"], spread: float) -> tuple[int, Float[np.ndarray, "3"]]:
-    """Return the number of rows at the top that have one colour, up to a straight edge, and the colour."""
-    mean, found = cv2.meanStdDev(np.ascontiguousarray(pictures[:, :1]).reshape(-1, 1, 3))
+def _plain_rows(pictures: UInt8[np.ndarray, "f n m 3"], spread: float) -> tuple[int, Float[np.ndarray, "3 1"]]:
+    """Return the number of rows above the picture that have the colour of the first, up to a straight edge, and it."""
+    colour, found = cv2.meanStdDev(np.ascontiguousarray(pictures[:, :1]).reshape(-1, 1, 3))
     if found.max() > 0.5 * spread:
-        return 0, mean.ravel()
-    lowest, highest = np.floor(mean - spread) + 1.0, np.ceil(mean + spread) - 1.0
+        return 0, colour
+    lowest, highest = np.floor(colour - spread) + 1.0, np.ceil(colour + spread) - 1.0
     masks = [cv2.inRange(np.ascontiguousarray(picture), lowest, highest) for picture in pictures]
     shares = np.min([cv2.reduce(mask, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] for mask in masks], axis=0) / 255.0
-    rows = int(np.argmax(shares < _OF_BAR))
+    # The picture is the longest part without a row of that colour: texts and strips of small pictures are shorter.
+    parts = np.flatnonzero(np.diff(shares <= _WHOLE_ROW, prepend=False, append=False)).reshape(-1, 2)
+    rows = int(parts[np.argmax(np.ptp(parts, axis=1)), 0]) if len(parts) else 0
     is_sharp = 2 < rows < len(shares) - 2 and shares[rows - 2] > _WHOLE_ROW and shares[rows + 2] < 0.5
-    return rows if is_sharp else 0, mean.ravel()
+    return rows if is_sharp and (shares[:rows] > _OF_BAR).mean() > _PLAIN_OF_BARS else 0, colour
 
 
 def _blurred_rows(greys: UInt8[np.ndarray, "f n m"]) -> int:

@@ -82,4 +82,6 @@ def within_bars(picture: np.ndarray, kind: str) -> np.ndarray:
     barred[above : above + len(picture)] = picture
     if kind != "blurred":
         barred[:above], barred[above + len(picture) :] = 255 * (kind == "of two colours"), 0
+    if kind == "with a strip":
+        barred[-50:-20] = picture[:30]
     return barred

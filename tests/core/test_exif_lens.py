@@ -15,11 +15,10 @@ Tag = ExifTags.Base
 FULL_SIZE: dict[Any, Any] = {Tag.ExifImageWidth: 4032, Tag.ExifImageHeight: 3024}
 
 
-def read(tags: dict[Any, Any], model: str = "", size: tuple[int, int] = (4032, 3024)) -> ExifLens:
+def read(tags: dict[Any, Any], size: tuple[int, int] = (4032, 3024), packets: tuple[bytes, ...] = ()) -> ExifLens:
     exif = Image.Exif()
-    exif[Tag.Model] = model
     exif.get_ifd(ExifTags.IFD.Exif).update(tags)
-    return read_exif_lens(exif, width=size[0], height=size[1])
+    return read_exif_lens(exif, packets, width=size[0], height=size[1])
 
 
 def hfov_deg(lens: ExifLens, width: int) -> float:
@@ -47,23 +46,13 @@ def test_equivalent_focal_length_gives_the_field_of_view(
     assert lens.warnings == ()
 
 
-def test_sensor_by_resolution_or_model_replaces_the_equivalent() -> None:
-    by_model = read({Tag.FocalLength: IFDRational(415, 100)}, model="iPhone 6")
-    assert hfov_deg(by_model, 4032) == pytest.approx(61.0, abs=0.2)
-    by_plane = read(
-        FULL_SIZE
-        | {
-            Tag.FocalLength: 4.15,
-            Tag.FocalPlaneXResolution: IFDRational(4_032_000, 489),
-            Tag.FocalPlaneResolutionUnit: 3,
-            Tag.DigitalZoomRatio: 1.0,
-        }
-    )
-    assert by_plane.focal == pytest.approx(by_model.focal, rel=1e-6)
-    zoomed = read({Tag.FocalLength: 4.15, Tag.DigitalZoomRatio: 2.0}, model="iPhone 6")
-    assert zoomed.focal == pytest.approx(2.0 * (by_model.focal or 0.0))
-    # The front camera has another sensor.
-    assert read({Tag.FocalLength: 2.65}, model="iPhone 6").focal is None
+def test_sensor_by_resolution_replaces_the_equivalent() -> None:
+    plane = {Tag.FocalPlaneXResolution: IFDRational(4_032_000, 489), Tag.FocalPlaneResolutionUnit: 3}
+    by_plane = read(FULL_SIZE | plane | {Tag.FocalLength: IFDRational(415, 100), Tag.DigitalZoomRatio: 1.0})
+    assert hfov_deg(by_plane, 4032) == pytest.approx(61.0, abs=0.2)
+    zoomed = read(FULL_SIZE | plane | {Tag.FocalLength: 4.15, Tag.DigitalZoomRatio: 2.0})
+    assert zoomed.focal == pytest.approx(2.0 * (by_plane.focal or 0.0))
+    assert read(FULL_SIZE | {Tag.FocalLength: 4.15}).focal is None
 
 
 def test_digital_zoom_widens_the_uncertainty() -> None:
@@ -99,8 +88,23 @@ def test_zero_means_unknown() -> None:
 
 def test_picture_cropped_later_has_no_focal_length() -> None:
     tags = FULL_SIZE | {Tag.FocalLengthIn35mmFilm: 26}
-    assert read(tags, size=(2016, 1512)).focal is not None
+    assert not read(tags).is_doubtful
+    assert read(tags, size=(2016, 1512)).is_doubtful
     assert read(tags, size=(1512, 2016)).focal is not None
     cropped = read(tags, size=(1800, 1512))
     assert cropped.focal is None
     assert "was cropped" in cropped.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("packet", "is_cropped"),
+    [
+        (b"<x ns1:HasCrop='True'/>", True),
+        (b'<x crs:HasCrop="True" crs:AlreadyApplied="False"/>', False),
+        (b'<x tiff:ImageWidth="4032" tiff:ImageLength="2268"/>', True),
+        (b'<li darktable:operation="crop" darktable:enabled="1"/>', True),
+        (b'<li darktable:operation="crop" darktable:enabled="0"/><li darktable:operation="flip"/>', False),
+    ],
+)
+def test_crops_are_stated_by_editors(packet: bytes, is_cropped: bool) -> None:
+    assert (read({Tag.FocalLengthIn35mmFilm: 26}, packets=(packet,)).focal is None) == is_cropped

@@ -10,7 +10,7 @@ import pytest
 from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.photograph.film import read_film
 from tests.core.fault_photographs import FOLDER
-from tests.core.filmed import encode, needs_ffmpeg, turn
+from tests.core.filmed import H264, encode, needs_ffmpeg, turn
 from tests.core.taken import within_bars
 from tests.strategies import present
 
@@ -31,6 +31,12 @@ def test_bars_above_and_below_a_film_are_cut_off(tmp_path: Path, kind: str) -> N
     assert "the film has bars" in film.warnings[0]
     assert math.degrees(film.turned) == pytest.approx(180.0, abs=15.0)
     assert present(film.photographs[0].camera).height == pytest.approx(480, abs=8)
+
+
+@needs_ffmpeg
+def test_film_that_is_cut_off_is_named(tmp_path: Path) -> None:
+    content = encode(turn()[:46], tmp_path / "whole.mp4", *H264, "-movflags", "+faststart")
+    assert "of 4.6 s, as if cut off" in read_film(content[: len(content) // 2]).warnings[0]
 
 
 def test_film_on_its_side_is_named() -> None:

@@ -20,7 +20,7 @@ from lalaloc_core.photograph.file_segments import count_scans
 from lalaloc_core.photograph.spheres import NEUTRAL, PhotographLimits, read_sphere
 from tests.growth import assert_no_worse_than_linear
 from tests.painted import picture_file as encoded
-from tests.painted import png_chunk, png_file
+from tests.painted import png_file
 
 HEIGHT, WIDTH = 32, 64
 NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8))
@@ -101,16 +101,6 @@ class TestAccepted:
         pixels = read(encoded(picture(), transparency=(0, 255, 0)))
         assert pixels[24, 24].tolist() == list(NEUTRAL)
         assert pixels[24, 8].tolist() == [255, 0, 0]
-
-    def test_transparent_16_bit_grey_becomes_neutral(self) -> None:
-        values = np.full((128, 256), 51_400, np.uint16)
-        values[:, :128] = 1000
-        content = encoded(Image.fromarray(values))
-        # Pillow does not write tRNS for 16 bits; the chunk follows IHDR's 33 bytes.
-        content = content[:33] + png_chunk(b"tRNS", struct.pack(">H", 1000)) + content[33:]
-        pixels = read(content)
-        assert pixels[10, 10].tolist() == list(NEUTRAL)
-        assert pixels[10, 50].tolist() == [200, 200, 200]
 
     @pytest.mark.parametrize(("colour_type", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
     def test_16_bit_tones_are_kept(self, colour_type: int, channels: int) -> None:

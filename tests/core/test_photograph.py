@@ -55,6 +55,14 @@ class TestProjection:
         same = opened(jpeg(upright, PHONE))
         assert np.abs(view.patches[0].pixels.astype(int) - same.patches[0].pixels).mean() < 4.0
 
+    def test_focal_length_of_a_picture_that_was_cropped_is_not_used_against_its_lines(self) -> None:
+        whole = view_of(Perspective.of_hfov(1280, 960, math.radians(106.2)), heading_deg=30.0)
+        tags = {Tag.FocalLengthIn35mmFilm: 13, Tag.ExifImageWidth: 1280, Tag.ExifImageHeight: 960}
+        assert opened(jpeg(whole[::2, ::2].copy(), tags)).hfov.source == "exif"
+        view = opened(jpeg(whole[240:720, 320:960].copy(), tags))
+        assert "its EXIF focal length gives 106°" in view.warnings[0]
+        assert math.degrees(view.hfov.value) == pytest.approx(67.3, abs=10.0)
+
     @pytest.mark.parametrize("name", ["bedroom", "kitchen", "living_room", "study"])
     def test_sphere_without_metadata_is_recognised(self, name: str) -> None:
         view = opened((EXAMPLES / f"{name}.jpg").read_bytes())

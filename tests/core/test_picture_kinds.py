@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from benchmarks.plan_drawing import STYLES, Style, draw_plan
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidPhotographError
 from lalaloc_core.file_kinds import Tones, is_drawing
-from lalaloc_core.importers import ImportOptions, import_plan
+from lalaloc_core.importers import import_plan
 from lalaloc_core.importers.drawing.sketch_drawing import naming_text
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.photograph import StatedCamera, open_photograph
@@ -106,10 +106,3 @@ def test_map_of_streets_is_refused() -> None:
     ]
     with pytest.raises(InvalidFloorPlanError, match="is a map with 1 outdoor features"):
         import_plan(json.dumps({"type": "FeatureCollection", "features": features}).encode())
-
-
-@pytest.mark.slow
-def test_scanned_plan_is_read_as_before() -> None:
-    drawn = draw_plan("scanned", 3)
-    plan = import_plan(drawn.jpeg(), ImportOptions(metres_per_pixel=drawn.metres_per_pixel))
-    assert len(plan.document["rooms"]) >= 2

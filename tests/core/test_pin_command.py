@@ -206,7 +206,7 @@ def test_a_new_revision_lists_what_moved(
         ({}, "has no photographs"),
         ({"a.txt": b"x"}, "has no photographs"),
         ({"a.jpg": b"x"}, "none of 1 photographs can be read; the first: the photograph is not a readable JPEG"),
-        ({f"{number}.jpg": b"x" for number in range(501)}, "has 501 photographs; the limit is 500"),
+        ({f"{number}.jpg": b"x" for number in range(501)}, "501 photographs are too many; the limit is 500"),
     ],
 )
 def test_folder_without_usable_photographs_is_refused(

@@ -228,7 +228,7 @@ class TestParts:
             opened(encoded(part, "JPEG", xmp(**stated)))
 
 
-@pytest.mark.parametrize("kind", ["black", "unequal", "of two colours", "on one side", "blurred"])
+@pytest.mark.parametrize("kind", ["black", "unequal", "of two colours", "on one side", "blurred", "with a strip"])
 def test_photograph_is_taken_out_of_its_bars(kind: str) -> None:
     view = take(small("study"), Perspective.of_hfov(640, 400, math.radians(80.0)))
     found = opened(picture_file(within_bars(view, kind)))

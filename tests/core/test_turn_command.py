@@ -52,9 +52,8 @@ def test_warning_names_the_photographs_of_a_turn_once(tmp_path: Path, capsys: py
 @pytest.mark.slow
 @needs_ffmpeg
 def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "turn.mp4"
-    encode(turn()[:46], path)
-    answer = answer_of(capsys, path)
+    encode(turn()[:46], tmp_path / "turn.mp4")
+    answer = answer_of(capsys, tmp_path / "turn.mp4")
     assert answer["film"]["frames_read"] == 46
     assert answer["film"]["frames_kept"] == len(answer["poses"])
     assert answer["poses"][0]["time_s"] < 0.2

@@ -64,15 +64,19 @@ def test_photograph_with_a_fault_is_shown_and_what_is_said_about_it(desktop: Vis
         expect(place.filter(has_text=fault.said.replace("hfov_deg", "“Field of view”"))).to_be_visible()
 
 
-@pytest.mark.slow
-def test_photograph_of_which_half_is_lost_is_shown_from_inside(desktop: Visit, tmp_path: Path) -> None:
-    content = (EXAMPLES / "kitchen.jpg").read_bytes()
-    (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
-    page = desktop.open_example()
-    page.locator("#photo-file").set_input_files(tmp_path / "cut.jpg")
-    expect(page.locator("#photo-strip li")).to_have_count(1)
-    desktop.find()
-    expect(page.locator("#answer-body .warning").filter(has_text="the file ends before its picture")).to_be_visible()
+def test_photographs_are_in_the_order_of_their_times(desktop: Visit, tmp_path: Path) -> None:
+    for name, minute in (("1.jpg", 2), ("2.jpg", 1)):
+        time = {ExifTags.Base.DateTimeOriginal: f"2026:05:01 10:{minute:02}:00"}
+        (tmp_path / name).write_bytes(jpeg(sphere("study")[:480, :640], time))
+    (tmp_path / "cut.jpg").write_bytes((EXAMPLES / "kitchen.jpg").read_bytes()[:60_000])
+    (tmp_path / "none.heic").write_bytes(b"no picture")
+    page, chosen = desktop.open_example(), desktop.page.locator("#photo-file")
+    chosen.set_input_files([tmp_path / "1.jpg", tmp_path / "2.jpg"])
+    expect(page.locator(".thumb span")).to_have_text(["2.jpg", "1.jpg"])
+    chosen.set_input_files(tmp_path / "none.heic")
+    expect(page.locator("#photo-error")).to_contain_text("cannot show “none.heic” as a picture")
+    expect(page.locator(".thumb img")).to_have_count(2)
+    chosen.set_input_files(tmp_path / "cut.jpg")
     expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
 
 
