@@ -18,7 +18,7 @@ PICTURES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp
 
 
 def turn_files(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the photographs of a turn in a folder, and lines on the files that are left out: empty and hidden ones.
+    """Return the photographs of a turn in a folder, and lines on what is left out: empty, hidden and other files.
 
     They are in the order of their times, if all have different ones, else in that of the numbers in their names.
     """
@@ -29,7 +29,11 @@ def turn_files(folder: Path) -> tuple[list[Path], list[str]]:
         used.sort(key=lambda file: times[file] or 0.0)
     empty = [f"'{file.name}' is empty and was left out" for file in files if not file.stat().st_size]
     hidden = [file.name for file in folder.iterdir() if file.name.startswith(".") and file.suffix.lower() in PICTURES]
-    return used, empty + ([f"{len(hidden)} hidden files, such as '{min(hidden)}', were left out"] if hidden else [])
+    others = [file.name for file in folder.iterdir() if not file.name.startswith(".") and file not in files]
+    kinds = (("hidden files", hidden), ("folders or files that are no photographs", others))
+    return used, empty + [
+        f"{len(names)} {kind}, such as '{min(names)}', were left out" for kind, names in kinds if names
+    ]
 
 
 def _taken_at(file: Path) -> float | None:

@@ -56,7 +56,6 @@ def test_film_is_localised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     answer = answer_of(capsys, tmp_path / "turn.mp4")
     assert answer["film"]["frames_read"] == 46
     assert answer["film"]["frames_kept"] == len(answer["poses"])
-    assert answer["poses"][0]["time_s"] < 0.2
 
 
 @pytest.mark.slow

@@ -137,8 +137,8 @@ def test_turns_are_ordered_by_time_else_by_the_numbers_in_names(tmp_path: Path) 
 
 def test_empty_and_hidden_files_of_a_turn_are_left_out_and_named(tmp_path: Path) -> None:
     _picture(tmp_path / "1.jpg")
-    (tmp_path / "2.jpg").touch()
-    (tmp_path / "._1.jpg").write_bytes(b"Mac OS X")
+    for name in ("2.jpg", "._1.jpg", "3.gif"):
+        (tmp_path / name).touch()
     used, left_out = turn_files(tmp_path)
     assert [file.name for file in used] == ["1.jpg"]
-    assert left_out == ["'2.jpg' is empty and was left out", "1 hidden files, such as '._1.jpg', were left out"]
+    assert [text.split("'")[1] for text in left_out] == ["2.jpg", "._1.jpg", "3.gif"]
