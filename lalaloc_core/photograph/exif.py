@@ -119,13 +119,12 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
     zoom = _in_range(tags, ExifTags.Base.DigitalZoomRatio, _ZOOM_RANGE, "", warnings) or 1.0
     film = _in_range(tags, ExifTags.Base.FocalLengthIn35mmFilm, _FILM_RANGE_MM, " mm", warnings)
     lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)
-    sizes, ratio = stated_sizes(exif, packets), max(width, height) / min(width, height)
+    sizes, long, ratio = stated_sizes(exif, packets), max(width, height), max(width, height) / min(width, height)
     has_crop = any(map(_HAS_CROP.search, packets)) and not any(map(_NOT_APPLIED.search, packets))
     if has_crop or any(abs(max(size) / min(size) / ratio - 1.0) > _CROPPED for size in sizes):
         if film is not None or lens is not None:
             warnings.append("the photograph was cropped after it was taken, so its EXIF focal length is not used")
         return ExifLens(warnings=tuple(warnings))
-    long = max(width, height)
     usual = min(abs(ratio - 4.0 / 3.0), abs(ratio - 1.5)) < 0.05
     focal = None
     if film is not None:
@@ -176,7 +175,8 @@ def _sensor_side_mm(tags: dict[int, object], warnings: list[str]) -> float | Non
 
 def stated_sizes(exif: Image.Exif, packets: Sequence[bytes]) -> list[tuple[int, int]]:
     """Return the sizes (width, height) that metadata state of the stored picture; editors leave old ones."""
-    base, tags = ExifTags.Base, dict(exif) | exif.get_ifd(ExifTags.IFD.Exif)
+    base = ExifTags.Base
+    tags: dict[int | bytes, object] = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
     tags |= dict(found for packet in packets for found in _SIZES.findall(packet))
     names = ((base.ExifImageWidth, base.ExifImageHeight), (base.ImageWidth, base.ImageLength), (b"Width", b"Length"))
     sizes = [(finite_number(tags.get(width)) or 0.0, finite_number(tags.get(height)) or 0.0) for width, height in names]
