@@ -35,8 +35,9 @@ _SIMPLER_M = (0.005, 0.01, 0.02)
 _FAR_M = 10_000.0
 # Up to this distance from an anchor, lengths and directions are accurate to a few centimetres.
 _MAX_ANCHOR_SHIFT_M = 20_000.0
-# Share of a room that lies in a larger one, and of the larger one that such rooms cover.
-_INSIDE, _COVERED = 0.95, 0.5
+# Share of a room that lies in a larger one, and of the larger one that several such rooms cover, and a single one that
+# is the same room by other faces of its walls.
+_INSIDE, _COVERED, _SAME = 0.95, 0.5, 0.7
 # Resolution of coordinates: a tenth of a millimetre.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED, _MAX_USES = 5, 12
@@ -91,7 +92,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
             + "; "
             + "; ".join([*list(dict.fromkeys(builder.warnings))[:_MAX_NAMED], "check layers, level and the scale"])
         )
-    rooms = _without_areas(_without_low_rooms(rooms, builder), builder)
+    rooms = without_areas(rooms, builder)
     rooms, shift = _near_origin(rooms, builder)
     openings = [_shift_opening(opening, shift) for opening in sketch.openings]
     openings, off_wall, overlapping = place_openings(openings, [room.shape for room in rooms])
@@ -127,7 +128,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     builder.warnings += check_document(document, is_scale_certain=is_certain, metres_per_unit=metres_per_unit)
     # Validate now, while the error can still refer to the file.
     plan = FloorPlan.from_dict(document, limits)
-    builder.warnings += [warning for warning in plan.warnings if " overlap" in warning]
+    builder.warnings += [f"{line}; draw each area once" for line in plan.warnings if " overlap" in line]
     return ImportedPlan(document, builder.build(), sketch.level, anchor, (limits, plan))
 
 
@@ -229,26 +230,30 @@ def _clean(
     return cleaned
 
 
-def _without_areas(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:
-    """Leave out the areas that several other rooms lie in, such as the gross area of a storey, and say so."""
+def without_areas(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:
+    """Leave out low rooms, the areas of several other rooms, such as a storey's, and rooms drawn twice, and say so."""
+    rooms = _without_low_rooms(rooms, builder)
     check_overlaps([room.shape for room in rooms], what="rooms")
-    tree, kept = shapely.STRtree([room.shape for room in rooms]), []
-    for index, room in enumerate(rooms):
+    tree, left_out = shapely.STRtree([room.shape for room in rooms]), set[int]()
+    # Of equal areas the one without a type is left out, or else the later one.
+    order = [(room.shape.area, not room.types, index) for index, room in enumerate(rooms)]
+    for area_m2, _, index in sorted(order, reverse=True):
+        room = rooms[index]
         inside = [
             rooms[k]
             for k in tree.query(room.shape, predicate="intersects").tolist()
-            if k != index
-            and rooms[k].shape.area < room.shape.area
-            and room.shape.intersection(rooms[k].shape).area >= _INSIDE * rooms[k].shape.area
+            if order[k] < order[index] and room.shape.intersection(rooms[k].shape).area >= _INSIDE * rooms[k].shape.area
         ]
-        if len(inside) > 1 and shapely.union_all([part.shape for part in inside]).area > _COVERED * room.shape.area:
+        share = shapely.union_all([part.shape for part in inside]).area / area_m2
+        if share > (_COVERED if len(inside) > 1 else _SAME):
+            covered = f"covers {len(inside)} rooms, such as {_label(inside[0])}, and was left out as an area"
+            again = f"is {_label(inside[0])} ({inside[0].shape.area:.1f} m²) again and was left out"
             builder.warnings.append(
-                f"{_label(room)} ({room.shape.area:.1f} m²) covers {len(inside)} rooms, such as {_label(inside[0])}, "
-                "and was left out as an area; remove these if it is one room"
+                f"{_label(room)} ({area_m2:.1f} m²) {covered if len(inside) > 1 else again}; remove what lies in it if "
+                "it is one room"
             )
-        else:
-            kept.append(room)
-    return kept
+            left_out.add(index)
+    return [room for index, room in enumerate(rooms) if index not in left_out]
 
 
 def _without_low_rooms(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:

@@ -6,7 +6,7 @@ ifcopenshell (extra `ifc`) reads the model and computes its geometry in metres.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
-from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels
+from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels, without_areas
 from lalaloc_core.importers.common.geometry import check_coordinates, find_floor, join_faces, opening_line, report_floor
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.common.vocabulary import role_from_name
@@ -73,6 +73,7 @@ def _read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Impor
             raise NoRoomError(
                 f"the spaces of level '{level.name}' have no geometry; export spaces as solids, or choose another level"
             )
+        sketch.rooms = without_areas(sketch.rooms, builder)
         _join_touching(sketch, builder)
         return assemble(sketch, builder, options, budget.limits.plan)
 
@@ -95,19 +96,27 @@ def _storeys(model: Any, meshes: _Meshes) -> Mapping[str, tuple[Level, tuple[str
     places = sorted((_elevation_m(entity, unit), True, str(entity.id())) for entity in entities)
     spaces: dict[str, list[Any]] = {}
     for space in model.by_type("IfcSpace"):
-        storey = _storey_of(space) or _storey_around(space, model)
+        storey = _whole(space) or _storey_around(space, model)
         key = _storey_at(meshes.of(space), places) if storey is None else str(storey.id())
         if key is not None:
             spaces.setdefault(key, []).append(space)
-    heights = sorted((_stated_elevation_m(entity, unit), entity.id()) for entity in entities)
-    with_rooms = [(height, key) for height, key in heights if str(key) in spaces]
-    # The ground floor is the storey nearest to zero.
-    ground = min(range(len(with_rooms)), key=lambda i: abs(with_rooms[i][0]), default=0)
-    found = {}
-    for number, (height, key) in enumerate(with_rooms):
+    heights = sorted(
+        (_stated_elevation_m(entity, unit), entity.id()) for entity in entities if str(entity.id()) in spaces
+    )
+    buildings: defaultdict[Any, list[tuple[float, Any]]] = defaultdict(list)
+    for height, key in heights:
         storey = model.by_id(key)
-        name = str(storey.LongName or storey.Name or f"level {number - ground}")[:200]
-        found[str(key)] = (Level(name, float(number - ground), height), (str(key), spaces[str(key)]))
+        buildings[_whole(storey, "IfcBuilding")].append((height, storey))
+    names = Counter(storey.LongName or storey.Name for storeys in buildings.values() for _, storey in storeys)
+    found = {}
+    for building, storeys in buildings.items():
+        # The ground floor is the storey nearest to zero.
+        ground = min(range(len(storeys)), key=lambda i: abs(storeys[i][0]), default=0)
+        for number, (height, storey) in enumerate(storeys, -ground):
+            name, key = storey.LongName or storey.Name or f"level {number}", str(storey.id())
+            if names[name] > 1 and building is not None and len(buildings) > 1:
+                name = f"{building.LongName or building.Name or f'building {building.id()}'}, {name}"
+            found[key] = (Level(str(name)[:200], float(number), height), (key, spaces[key]))
     return found
 
 
@@ -116,14 +125,14 @@ def _storey_entities(model: Any) -> list[Any]:
     return list(model.by_type("IfcBuildingStorey") or model.by_type("IfcBuilding")[:1])
 
 
-def _storey_of(element: Any) -> Any:
-    """Return the storey of an element, also of a space inside another space; None if it has none."""
+def _whole(element: Any, kind: str = "IfcBuildingStorey") -> Any:
+    """Return the storey or building that an element, such as a space inside another space, is a part of, or None."""
     for _ in range(16):
         parents = [relation.RelatingObject for relation in getattr(element, "Decomposes", None) or ()]
         if not parents:
             return None
         element = parents[0]
-        if element.is_a("IfcBuildingStorey"):
+        if element.is_a(kind):
             return element
     return None
 
@@ -133,7 +142,7 @@ def _storey_around(space: Any, model: Any) -> Any:
     for relation in model.get_inverse(space):
         place = getattr(relation, "RelatingStructure", None)
         if place is not None and not place.is_a("IfcSpace"):
-            return place if place.is_a("IfcBuildingStorey") else _storey_of(place)
+            return place if place.is_a("IfcBuildingStorey") else _whole(place)
     return None
 
 
@@ -143,6 +152,14 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, m
     for space in spaces:
         mesh = meshes.of(space)
         name = str(space.LongName or space.Name or "")
+        outline = meshes.of(space, curves=True) if mesh is None else None
+        if outline is not None:
+            vertices, edges = outline
+            parts = shapely.get_parts(shapely.polygonize(np.asarray(shapely.linestrings(vertices[edges][:, :, :2]))))
+            sketch.rooms += [SketchedRoom(part, name or None) for part in parts]
+            floors.append(float(vertices[:, 2].min()))
+            builder.use("IfcSpace", "rooms (outlines)")
+            continue
         if mesh is None:
             builder.use("IfcSpace", "ignored (no geometry)")
             builder.warnings.append(f"space '{name}' ({space.GlobalId}) has no geometry and was left out")
@@ -204,7 +221,7 @@ def _container(element: Any) -> str | None:
     """Return the id of the storey that contains an element, also in a space; None if nothing contains it."""
     for relation in getattr(element, "ContainedInStructure", None) or ():
         place = relation.RelatingStructure
-        storey = place if place.is_a("IfcBuildingStorey") else _storey_of(place)
+        storey = place if place.is_a("IfcBuildingStorey") else _whole(place)
         if storey is not None:
             return str(storey.id())
     return None
@@ -277,7 +294,11 @@ def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
     tree = shapely.STRtree(shapes)
     first, second = tree.query(shapes, predicate="dwithin", distance=_THICK_M)
     pairs = [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
-    touching = [(i, j) for i, j in pairs if shapes[i].distance(shapes[j]) < _TOUCHING_M]
+    touching = [
+        (i, j)
+        for i, j in pairs
+        if shapes[i].distance(shapes[j]) < _TOUCHING_M and shapes[i].buffer(-_TOUCHING_M).disjoint(shapes[j])
+    ]
     if len(touching) > _MOSTLY * len(pairs):
         return
     for i, j in touching:
@@ -323,8 +344,11 @@ class _Meshes:
         """True while there is time to spare."""
         return self._budget.elapsed_s < _FIXTURES_SHARE * self._budget.limits.max_import_s
 
-    def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
-        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape."""
+    def of(self, element: Any, *, curves: bool = False) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
+        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape.
+
+        With `curves`, lines count as a shape, and its edges are returned.
+        """
         import ifcopenshell.geom
 
         self._budget.check_time()
@@ -337,16 +361,17 @@ class _Meshes:
             )
         settings = ifcopenshell.geom.settings()
         settings.set("use-world-coords", True)
+        if curves:
+            settings.set("dimensionality", ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS)
         try:
             shape = ifcopenshell.geom.create_shape(settings, element)
         except RuntimeError:
             return None
         vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
-        triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
+        parts = shape.geometry.edges if curves else shape.geometry.faces  # type: ignore[union-attr]
+        corners = np.array(parts, dtype=int).reshape(-1, 2 if curves else 3)
         check_coordinates(vertices, f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}'")
-        if not len(triangles):
-            return None
-        return vertices, triangles
+        return (vertices, corners) if len(corners) else None
 
     def _size(self, value: Any) -> float:
         """Count an entity and all that it refers to, repeated as often as referred to; infinite for a cycle."""

@@ -46,6 +46,10 @@ from lalaloc_core.importers.formats.svg_limits import check_work
 
 # Attribute of the root element with the scale of exported drawings.
 _SCALE_ATTRIBUTE = "data-metres-per-unit"
+_SVG = "{http://www.w3.org/2000/svg}"
+_GROUPS = (svgelements.Group, svgelements.Use)
+# Selectors of styles that the library does not apply, after their declarations.
+_COMBINED = re.compile(r"(?:^|,)\s*([^\s@,][^,]*[\s>+~\[:][^\s,][^,]*)")
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 # Names that editors generate.
 _AUTOMATIC = re.compile(
@@ -101,8 +105,17 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     pictures = sum(local_name(element) == "image" for element in root.iter())
     hypertexts = (element for element in root.iter() if local_name(element) == "foreignObject")
     texts = sum(any(text.strip() for text in element.itertext()) for element in hypertexts)
-    for parent in root.iter():
+    for parent in list(root.iter()):
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
+        # Symbols are drawn where they are used, as the library draws all but definitions.
+        if local_name(parent) == "symbol":
+            inner = Element(f"{_SVG}g", parent.attrib)
+            inner[:] = list(parent)
+            parent.clear()
+            parent.tag = f"{_SVG}defs"
+            parent.append(inner)
+        elif local_name(parent) == "text":
+            _join_parts(parent)
     check_work(root, budget)
     # The title of a shape is its name, unless it has one; the title of the drawing names nothing.
     for element in root.iter():
@@ -111,7 +124,30 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             element.attrib.setdefault("data-name", title.strip())
     with _naming_pictures(pictures):
         warnings = [_picture_text(pictures)] * (pictures > 0) + [_html_text(texts)] * (texts > 0)
+        styles = "".join(element.text or "" for element in root.iter() if local_name(element) == "style")
+        if found := _COMBINED.search(re.sub(r"\{[^}]*\}", ",", styles)):
+            warnings.append(
+                f"styles of '{found[1].strip()[:50]}' are not applied: only those of an element, a class or an id are; "
+                "save the styles as attributes"
+            )
         return _read_plan(root, warnings, options, budget)
+
+
+def _join_parts(text: Element) -> None:
+    """Join the parts of each line of a text, which programs divide at changes of style and for the distance of letters.
+
+    A part with another y than the one before, or moved down by `dy`, begins a line.
+    """
+    line = text
+    for part in list(text):
+        words = "".join(part.itertext())
+        part[:] = []
+        if part.get("y", line.get("y")) != line.get("y") or part.get("dy", "").strip(".0"):
+            line, part.text = part, words
+        else:
+            line.text = f"{line.text or ''}{words}"
+            text.remove(part)
+        line.text = f"{line.text}{part.tail or ''}"
 
 
 @contextmanager
@@ -237,14 +273,14 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
     return drawing
 
 
-def _walk(group: svgelements.Group, context: _Context) -> Iterator[tuple[Any, _Context]]:
+def _walk(group: svgelements.Group | svgelements.Use, context: _Context) -> Iterator[tuple[Any, _Context]]:
     for element in group:
         nested = context.nested(element)
         # Words such as "furniture" or "sanitary" tell a bath from a bathroom.
         fixture = fixture_from_name(*nested.labels[len(context.labels) :]) if nested.role == "ignored" else None
         if fixture is not None:
             yield element, _Context(nested.labels, nested.role, nested.layer, fixture, is_fixture=True)
-        elif isinstance(element, svgelements.Group):
+        elif isinstance(element, _GROUPS):
             yield from _walk(element, nested)
         else:
             yield element, nested
@@ -252,7 +288,7 @@ def _walk(group: svgelements.Group, context: _Context) -> Iterator[tuple[Any, _C
 
 def _add_fixture(fixture: Any, context: _Context, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
     """Add the smallest rectangle around a shape or the shapes of a group."""
-    parts = fixture.select() if isinstance(fixture, svgelements.Group) else [fixture]
+    parts = fixture.select() if isinstance(fixture, _GROUPS) else [fixture]
     points = []
     for part in parts:
         budget.spend()
