@@ -17,7 +17,7 @@ from scipy import ndimage
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, import_plan, import_plans
 from lalaloc_core.importers.common.geometry import find_floor
-from lalaloc_core.importers.drawing.drawing_scale import _written_scale
+from lalaloc_core.importers.drawing.drawing_scale import _written_scales
 from tests.importers.conftest import dxf_file, lines, shapes
 from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import _map
@@ -313,11 +313,12 @@ def test_room_with_an_area_drawn_twice_in_it_stays():
         ("1:100  A1.01", 0.42, 100), ("1:100 (A1)", 0.42, 200), ("1:50 @ A1", 0.25, 50), ("1:50|1:200", 0.841, None),
         ("1:50 @ A1, 1:200 @ A1", 0.841, None), ('1/4" = 1\'-0" @ ARCH D', 0.457, 96), ("3/16'' = 1' - 0''", None, 64),
         ('1/4" = 1\'-0"', None, 48), ('1/2"=1\'', None, 24), ('1 1/2" = 1\'-0"', None, None),
+        ("M 1:50 im Original DIN A1", 0.42, 100), ('1/4"=1\'-0" @ 22"x34"', 0.432, 96), ("1:50 (HALF SIZE, A1)", 0.42, 100),
     ],
 )  # fmt: skip
 def test_scale_that_is_written_for_a_sheet_or_in_inches(texts: str, paper_m: float | None, scale: int | None):
-    found = _written_scale(texts.split("|"), paper_m or math.inf)
-    assert (found and found[0]) == (scale and pytest.approx(scale, rel=0.01))
+    found = _written_scales(texts.split("|"), paper_m or math.inf)
+    assert (found[0][0] if len(found) == 1 else None) == (scale and pytest.approx(scale, rel=0.01))
 
 
 def test_svg_on_paper_of_another_size_than_its_scale_is_for():

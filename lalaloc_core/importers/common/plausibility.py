@@ -34,6 +34,8 @@ _WALL_M, _REACH_M, _OUTER_M = 0.6, 0.65, 1.5
 # Usual door leaves, sides of rooms and buildings in drawings without a unit (m).
 _USUAL_LEAF_M, _USUAL_SIDE_M, _USUAL_EXTENT_M = (0.55, 1.3), (1.0, 40.0), (4.0, 120.0)
 _IMPERIAL = 0.7
+# Doors of one drawing are alike within this share, and so few other arcs are as wide as their leaves (m) by chance.
+_ALIKE, _SOME, _WIDTHS_M, _LEAF_M = 0.3, 0.1, (0.55, 1.2), 0.84
 _MAX_NAMED, _MAX_ROOMS_COMPARED = 5, 2000
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
 # q and n of entries and windows, as in generated homes; prior probabilities of a part and of none; c.
@@ -120,6 +122,18 @@ def _unit_hints(subject: str, value: float, usual_m: tuple[float, float], metres
         else "check the scale"
     )
     return [f"{subject} is {value:g} m; the usual range is {low:.2g} to {high:.2g} m; {advice}"]
+
+
+def check_leaves(leaves_m: Sequence[float], metres_per_unit: float) -> list[str]:
+    """Return a warning if the leaves of doors in a drawing are alike, but not as wide as usual."""
+    median = float(np.median(leaves_m or [0.0]))
+    alike = sum(abs(leaf / median - 1.0) <= _ALIKE for leaf in leaves_m)
+    usual = sum(_WIDTHS_M[0] <= leaf <= _WIDTHS_M[1] for leaf in leaves_m)
+    if alike < max(2, 0.5 * len(leaves_m)) or usual > _SOME * len(leaves_m):
+        return []
+    subject = f"the median width of the leaves of {len(leaves_m)} doors"
+    found = _unit_hints(subject, round(median, 4), _WIDTHS_M, metres_per_unit)
+    return [f"{line}, or set multiply to about {_LEAF_M / median:.2g}" for line in found]
 
 
 def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:

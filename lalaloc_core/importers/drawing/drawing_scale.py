@@ -30,9 +30,14 @@ _INCHES = re.compile(
 # Longer sides of sheets (m), and a scale that is for one of them: "1:50 @ A1", "1:100 (A3)", "Scale at A1: 1:50".
 _SHEETS_M = {"A0": 1.189, "A1": 0.841, "A2": 0.594, "A3": 0.42, "A4": 0.297, "ARCH D": 0.914, "ARCH E": 1.219,
              "ARCH C": 0.61, "ARCH B": 0.457, "ANSI A": 0.279, "ANSI B": 0.432, "ANSI C": 0.559, "ANSI D": 0.864,
-             "ANSI E": 1.118}  # fmt: skip
-_SCALE, _FOR = r"1\s?[:/]\s?(\d{1,4})\b", r"\W{0,3}(?:(?:at|on|auf|sur|en|su|in|op|din|iso)\W{0,3}){0,2}"
-_SHEET = rf"\b({'|'.join(_SHEETS_M)})(?!\w|[.-]\w)"
+             "ANSI E": 1.118, "11 X 17": 0.432, "18 X 24": 0.61, "22 X 34": 0.864, "24 X 36": 0.914, "30 X 42": 1.067,
+             "36 X 48": 1.219}  # fmt: skip
+_SCALE, _FOR = (
+    r"1\s?[:/]\s?(\d{1,4})\b",
+    r"\W{0,3}(?:(?:at|on|auf|sur|en|su|in|im|op|din|iso|format|formato|original|papier|paper|sheet|size|half|full|print|"
+    r"blatt|plotted|printed)\b\W{0,3}){0,4}",
+)
+_SHEET = rf"\b({'|'.join(_SHEETS_M)})(?!\w|[.-]\w)".replace(" X ", "\\W{0,3}X\\W{0,2}")
 _AT_SHEET = re.compile(rf"{_SCALE}{_FOR}{_SHEET}|(?:{_SHEET}{_FOR}{_SCALE}|(?:scale|@){_FOR}{_SHEET})", re.IGNORECASE)
 # Common scales of building drawings.
 _USUAL = {10, 20, 24, 25, 32, 33, 48, 50, 64, 75, 96, 100, 120, 125, 128, 150, 192, 200, 240, 250, 300, 400, 500, 1000}
@@ -100,13 +105,14 @@ def drawing_scale(
     paper_m_per_unit: float | None = None,
     paper_m: float | None = None,
     own: tuple[float, str] | None = None,
-    guess: Callable[[], tuple[float, str] | None] = lambda: None,
+    guess: Callable[[Sequence[tuple[float, str]]], tuple[float, str] | None] = lambda written: None,
 ) -> tuple[float, str]:
     """Return metres per unit of a drawing, and the source of that value.
 
     The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
     a unit has a length on paper (also "1:50 @ A1", on a page whose longer side is `paper_m`), then the dimensions of
-    the first drawing that has them, then the `guess`. `subject` names the file in the error message, and `check_time`
+    the first drawing that has them, then the `guess`, which is given the scales that are written if they are several.
+    `subject` names the file in the error message, and `check_time`
     raises an exception to stop. The option `multiply` multiplies any of them.
     """
 
@@ -136,15 +142,17 @@ def drawing_scale(
         if own is not None:
             return checked(*own)
         texts = [lettering.text for drawing in drawings for lettering in drawing.letterings]
-        written = _written_scale(texts, paper_m or math.inf)
-        if written is not None and paper_m_per_unit is not None:
-            return checked(written[0] * paper_m_per_unit, written[1])
+        written = _written_scales(texts, paper_m or math.inf)
+        on_paper = [(ratio * paper_m_per_unit, source) for ratio, source in written if paper_m_per_unit is not None]
+        if on_paper and max(on_paper)[0] <= (1.0 + _TOLERANCE) * min(on_paper)[0]:
+            return checked(*on_paper[0])
         drawn = (drawing for drawing in drawings if drawing.shapes)
         by_dimensions = (scale_by_dimensions(written_dimensions(part, check_time), part.extent) for part in drawn)
-        found = next(filter(None, by_dimensions), None) or guess()
+        found = next(filter(None, by_dimensions), None) or guess(on_paper)
         if found:
             return checked(*found)
-        hint = f" (1:{written[0]:g} is written in it, but it has no size on paper)" if written is not None else ""
+        hint = f" ({written[0][1]}, but it has no size on paper)" if written and not on_paper else ""
+        hint = f" ({' and '.join(source for _, source in on_paper)})" if on_paper else hint
         if sizes := [text for text in texts if _has_size(text)]:
             hint += f" ({len(sizes)} texts such as '{sizes[0][:50]}' are sizes of rooms, but no two rooms have these)"
         raise InvalidFloorPlanError(
@@ -159,8 +167,8 @@ def drawing_scale(
     return checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)")
 
 
-def _written_scale(texts: Sequence[str], paper_m: float) -> tuple[float, str] | None:
-    """Return the denominator of the only scale written, for a page with the longer side `paper_m`, and its source."""
+def _written_scales(texts: Sequence[str], paper_m: float) -> list[tuple[float, str]]:
+    """Return the denominators of the scales written, for a page with the longer side `paper_m`, and their sources."""
     texts = [
         _INCHES.sub(lambda found: f"1:{12 * int(found[3]) * int(found[2] or 1) / int(found[1]):g}", text)
         for text in texts
@@ -171,7 +179,7 @@ def _written_scale(texts: Sequence[str], paper_m: float) -> tuple[float, str] | 
     sheets: dict[int, tuple[str, float]] = {}
     for_sheets = [found for text in texts if is_sheet for found in _AT_SHEET.findall(text)]
     for number, first, second, other, third in for_sheets:
-        name = " ".join((first or second or third).upper().split())
+        name = re.sub(r"(?<=\d)\W*X\W*", " X ", " ".join((first or second or third).upper().split()))
         for scale in scales & {int(number or other)} if number or other else scales:
             sheets.setdefault(scale, (name, _SHEETS_M[name] / paper_m))
     own = {scale for scale, (_, larger) in sheets.items() if abs(larger - 1.0) <= _TOLERANCE}
@@ -179,12 +187,12 @@ def _written_scale(texts: Sequence[str], paper_m: float) -> tuple[float, str] | 
     # "1:50 @ A1 / 1:100 @ A3" is one scale.
     if len(scales) > 1 and sheets.keys() == scales and (own or max(sizes) <= (1.0 + _TOLERANCE) * min(sizes)):
         scales = own or {min(scales)}
-    if len(scales) != 1:
-        return None
-    scale = next(iter(scales))
-    name, larger = ("", 1.0) if scale in own else sheets.get(scale, ("", 1.0))
-    source = f"1:{scale}, written in the drawing" + (f" for {name}, {larger:.3g} times the page" if name else "")
-    return scale * larger, source
+    found = []
+    for scale in sorted(scales):
+        name, larger = ("", 1.0) if scale in own else sheets.get(scale, ("", 1.0))
+        source = f"1:{scale}, written in the drawing" + (f" for {name}, {larger:.3g} times the page" if name else "")
+        found.append((scale * larger, source))
+    return found
 
 
 def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:

@@ -45,6 +45,8 @@ _QUANTILES = (0.1587, 0.5, 0.8413)
 # A scale with a larger error is not used; so many parts of a kind must agree on it, within so many standard deviations.
 _MAX_STD, _MIN_PARTS, _AGREE_STDS, _AGREE, _CONTRADICTS = 0.1, 2, 3.0, 0.03, 0.14
 _MAX_PASSES, _CONVERGED, _SHARE_OF_TIME = 4, 0.04, 0.4
+# Difference of the logarithms of a guess and a scale that is written beside others.
+_NEAR_WRITTEN = 0.35
 # First scales that are tried, relative to the likeliest.
 _FIRST_SHARES = (1.0, 1.6, 1.0 / 1.6, 2.56)
 _NAMES: Mapping[str, tuple[str, str]] = {
@@ -99,10 +101,17 @@ class ScaleGuess:
         )
 
 
-def assume_scale(guess: ScaleGuess | None, builder: ReportBuilder) -> tuple[float, str] | None:
-    """Return a guessed scale with its source, and report it as an assumption; None without a guess."""
+def assume_scale(
+    guess: ScaleGuess | None, builder: ReportBuilder, written: Sequence[tuple[float, str]] = ()
+) -> tuple[float, str] | None:
+    """Return the only scale written that is near a guessed one, else that as an assumption; None without a guess."""
     if guess is None:
         return None
+    near = [scale for scale in written if abs(math.log(scale[0] / guess.metres_per_unit)) <= _NEAR_WRITTEN]
+    if len(near) == 1:
+        others = ", ".join(source.partition(",")[0] for _, source in written)
+        builder.notes.append(f"of the scales written, {others}, {near[0][1]}, is nearest to that {guess.source}")
+        return near[0]
     builder.scale_std, builder.scale_clues = guess.std, guess.clues
     builder.warnings.append(guess.assumption)
     return guess.metres_per_unit, guess.source

@@ -21,6 +21,7 @@ from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
+from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import Role
@@ -163,6 +164,8 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     # Widths of leaves that close a gap, one for every gap; of all leaves without gaps.
     leaf_m = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
     sketch.leaves_m = list(leaf_m.values()) or [swing.radius for swing in swings]
+    drawn_m = [swing.radius for swing in (*drawing.swings, *leaves)]
+    builder.warnings += check_leaves(drawn_m, builder.metres_per_unit)
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
     taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
     rooms = shapely.STRtree([room.shape for room in shapes])

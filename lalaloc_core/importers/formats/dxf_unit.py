@@ -21,7 +21,11 @@ from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Drawing
 
 # (metres, value of the option `units`) by $INSUNITS; DXF reference.
-_INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
+_INSUNITS = {
+    1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 9: (2.54e-5, "mil"),
+    10: (0.9144, "yd"), 13: (1e-6, "µm"), 14: (0.1, "dm"), 15: (10.0, "dam"), 21: (1200 / 3937, "US survey feet"),
+    22: (100 / 3937, "US survey inches"), 23: (3600 / 3937, "US survey yards"),
+}  # fmt: skip
 # Extents (m) of drawings beyond which the unit is doubted.
 _EXTENT_M = (4.0, 1000.0)
 _MAX_DIMENSIONS, _MAX_WARNINGS = 1000, 3

@@ -6,6 +6,7 @@ A PDF has neither rooms nor meaningful layers, so the result is always a draft.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -35,7 +36,7 @@ from lalaloc_core.importers.picture.ink import blank_outside
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
-_METRES_PER_POINT = 0.0254 / 72.0
+_METRES_PER_POINT, _USER_UNIT = 0.0254 / 72.0, re.compile(rb"/UserUnit\s+(\d{1,5}(?:\.\d{1,9})?)")
 # A page with fewer lines, or with a larger share covered by pictures, is a scan; smaller pictures are logos.
 _MIN_LINES, _MOSTLY, _LEAST = 12, 0.5, 0.02
 _FINEST_M, _COARSEST_PT = 0.01, 4.0
@@ -49,13 +50,23 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     `metres_per_pixel` is metres per point (1/72 inch); `known_distance` is in points from the page's lower left corner.
     """
     document, page = open_page(content, options.page)
+    where = f"page {options.page} of {len(document)}"
     try:
-        budget.begin(f"reading page {options.page} of {len(document)}")
+        budget.begin(f"reading {where}")
         found = read_page(page, budget)
+        # The library takes the unit for a point.
+        unit = _USER_UNIT.search(content)
+        found.unit_m = _METRES_PER_POINT * ((unit and float(unit[1])) or 1.0)
         if options.crop is not None:
             found.crop, found.drawing = options.crop, found.drawing.cropped(options.crop)
         with naming_text(found.drawing.letterings, f"page {options.page} of the PDF"):
-            return _read_plan(found, options, budget)
+            plans = _read_plan(found, options, budget)
+        notes = (f"{where} was read; set page to read another",) if len(document) > 1 else ()
+        return tuple(replace(plan, report=replace(plan.report, notes=(*notes, *plan.report.notes))) for plan in plans)
+    except InvalidFloorPlanError as error:
+        if len(document) == 1:
+            raise
+        raise InvalidFloorPlanError(f"{error} ({where} was read: set page to that of the plan)") from error
     finally:
         document.close()
 
@@ -72,9 +83,9 @@ def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tu
         "the PDF",
         drawings,
         budget.check_time,
-        paper_m_per_unit=_METRES_PER_POINT,
-        paper_m=max(found.size_pt) * _METRES_PER_POINT,
-        guess=lambda: assume_scale(_guess(found, scan, budget), builder),
+        paper_m_per_unit=found.unit_m,
+        paper_m=max(found.size_pt) * found.unit_m,
+        guess=lambda written: assume_scale(_guess(found, scan, budget), builder, written),
     )
     # Marks of dimensions can be read as letters, so these are removed after the scale is known.
     _remove_letters(found)

@@ -47,7 +47,8 @@ class PageContent:
     """Drawing on a page, the page's size (points), the share of it that pictures cover, and outlines of drawn texts.
 
     `out_of_range` lines are left out, as their coordinates are out of range. `painted` is the area of all fills and
-    pictures, in pages. `crop` is the part of the page that is read (points); None for all of it.
+    pictures, in pages. `crop` is the part of the page that is read (points); None for all of it. `unit_m` is the length
+    of a point on paper.
     """
 
     page: pypdfium2.PdfPage
@@ -58,6 +59,7 @@ class PageContent:
     letters: list[shapely.Polygon] = field(default_factory=list)
     out_of_range: int = 0
     painted: float = 0.0
+    unit_m: float = 0.0
 
 
 @dataclass

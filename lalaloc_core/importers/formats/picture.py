@@ -90,7 +90,9 @@ def _read_plan(
         paper_m_per_unit=paper_m_per_pixel,
         paper_m=None if paper_m_per_pixel is None else max(gray.shape) * paper_m_per_pixel,
         own=measured,
-        guess=lambda: assume_scale(guess_scale(measure, first_scale(drawn_extent(gray)), budget), builder),
+        guess=lambda written: assume_scale(
+            guess_scale(measure, first_scale(drawn_extent(gray)), budget), builder, written
+        ),
     )
     check_scale(factor, source, measured, builder)
     reject_dimensions(dimensions, factor, builder)

@@ -185,7 +185,9 @@ def _read_plan(root: Element, warnings: list[str], options: ImportOptions, budge
         paper_m_per_unit=unit_m,
         paper_m=paper_m,
         own=own,
-        guess=lambda: assume_scale(guess_drawing(drawing, budget, flip_y=options.y_axis != "up"), builder),
+        guess=lambda written: assume_scale(
+            guess_drawing(drawing, budget, flip_y=options.y_axis != "up"), builder, written
+        ),
     )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
