@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from difflib import get_close_matches
 from functools import lru_cache
@@ -17,7 +18,9 @@ _ROLE_OF = cast("dict[str, Role]", keys_by_word("roles"))
 # The first match wins: "A-WALL-DOOR" is a door layer, "window dimensions" is ignored.
 _ORDER = cast("list[Role]", list(PLAN_WORDS["roles"]))
 _ENDINGS = cast("dict[str, Role]", keys_by_word("role_endings"))
-_JAPANESE_ROLES = cast("dict[str, Role]", keys_by_word("roles_in_japanese"))
+_OTHER_SCRIPTS = cast("dict[str, Role]", keys_by_word("roles_in_other_scripts"))
+# Layers of the US National CAD Standard with the status "demolish".
+_DEMOLISHED = re.compile(r"[A-Z]{1,2}-[A-Z]{4}(?:-[A-Z]{4})*-D", re.IGNORECASE)
 # Words for roofs, and those that stand beside them in names of levels.
 _ROOFS, _OF_LEVELS = (frozenset(PLAN_WORDS["levels"][key].split()) for key in ("roof", "beside"))
 
@@ -35,9 +38,11 @@ def mentions_roof(level: str) -> bool:
 
 def role_from_name(text: str) -> Role | None:
     """Return the role of a layer, block or class from its name, None if the name gives none."""
+    if _DEMOLISHED.fullmatch(text):
+        return "demolished"
     found = {role for word in split_words(text) if (role := _role_of_word(word)) is not None}
-    japanese = unicodedata.normalize("NFKC", text)
-    found |= {role for word, role in _JAPANESE_ROLES.items() if word in japanese}
+    composed = unicodedata.normalize("NFKC", text)
+    found |= {role for word, role in _OTHER_SCRIPTS.items() if word in composed}
     return next((role for role in _ORDER if role in found), None)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -34,16 +35,22 @@ _SHARE, _MIN_M2 = 0.3, 12.0
 # Margin (m) around the rooms of a storey, for its walls and leaves outside; most storeys that a warning names.
 _MARGIN_M, _MAX_NAMED = (0.5, 1.4), 6
 _STOREYS = keys_by_word("storeys")
-_NUMBERS = _STOREYS | keys_by_word("storeys_in_titles")
-_BESIDE, _COUNTED, _JOINED = (frozenset(PLAN_WORDS["levels"][key].split()) for key in ("beside", "counted", "joined"))
+_BESIDE, _ARTICLES, _COUNTED, _JOINED = (
+    frozenset(PLAN_WORDS["levels"][key].split()) for key in ("beside", "articles", "counted", "joined")
+)
 _WORDS = re.compile(r"[^\W_]+")
 # A word of the name of a layer with a number before or after it: "2.OG", "4OG", "Level -1".
 _NUMBERED = re.compile(
     r"(?<![^\W_])(?:([12]\d(?=\.|[^\W\d_])|[1-9])[. _-]{0,2})?((?:[^\W\d_]|\+)+)"
     r"(?:(?=([ ._-]?)((?:(?<=[ ._])-)?[0-2]?\d)(?![^\W_]))|(?![^\W_]))"
 )
-# Parts of names of layers, shortest word apart from its number, and share of a smaller storey's box that one covers.
-_PARTS, _SHORTEST, _OVER = re.compile(r"[^\w+]+|_"), 3, 0.5
+# A number of a storey with a word of another script, parts of names of layers, and share of a smaller storey's box that
+# one covers.
+_OTHER_SCRIPTS, _PARTS, _OVER = (
+    re.compile(r"(\d{1,2}) ?(?:[階层層]|этаж)", re.IGNORECASE),
+    re.compile(r"[^\w+]+|_"),
+    0.5,
+)
 
 
 def assemble_storeys(
@@ -154,9 +161,9 @@ def _levels(storeys: Sequence[BaseGeometry], letterings: Sequence[Lettering]) ->
 def title_of(text: str) -> Level | None:
     """Return the level that a text is the title of, such as "FIRST FLOOR", "2. Obergeschoss" or "Level 2"."""
     words = ["".join(split_words(word)) if word.isalpha() else word.casefold() for word in _WORDS.findall(text)]
-    known = [float(_NUMBERS[word]) for word in words if word in _NUMBERS]
+    known = [float(_STOREYS[word]) for word in words if word in _STOREYS]
     digits = [float(word) for word in words if word.isdecimal() and len(word) == 1]
-    is_title = len(known) + len(digits) + sum(word in _BESIDE for word in words) >= len(words)
+    is_title = len(known) + len(digits) + sum(word in _BESIDE | _ARTICLES for word in words) >= len(words)
     if not is_title or not (known or (digits and len(words) > 1)) or len(digits) > 1:
         return None
     return Level(" ".join(text.split()), _counted(known[0] if known else None, *digits))
@@ -252,6 +259,7 @@ def storeys_of(drawing: Drawing) -> dict[str, tuple[Level, Drawing]]:
 @lru_cache(maxsize=1024)
 def _storey(layer: str) -> tuple[str, float] | None:
     """Return the name and number of the storey that the name of a layer has; None without one."""
+    layer = _OTHER_SCRIPTS.sub(r" \1F ", unicodedata.normalize("NFKC", layer))
     for found in _NUMBERED.finditer(layer):
         before, letters, gap, after = found.groups("")
         word = letters.casefold() if "+" in letters else "".join(split_words(letters))
@@ -262,7 +270,7 @@ def _storey(layer: str) -> tuple[str, float] | None:
         for key in (word, found[0].casefold(), f"{word}{after}" if is_joined else word):
             if key in _STOREYS:
                 return whole if digit or key != word else letters, _counted(float(_STOREYS[key]), abs(digit))
-        if (after or before) and ((word in _BESIDE and len(word) > _SHORTEST) or (is_joined and word in _JOINED)):
+        if (after or before) and (word in _BESIDE or (is_joined and word in _JOINED)):
             return layer[found.start() : max(found.end(), found.end(4))], float(after or before)
     numbers = (part for part in _PARTS.split(layer) if part.isdecimal() and len(part) <= 2 and part != layer)
     return next(((part, float(part)) for part in numbers), None)
