@@ -313,7 +313,7 @@ def test_room_with_an_area_drawn_twice_in_it_stays():
         ("1:100  A1.01", 0.42, 100), ("1:100 (A1)", 0.42, 200), ("1:50 @ A1", 0.25, 50), ("1:50|1:200", 0.841, None),
         ("1:50 @ A1, 1:200 @ A1", 0.841, None), ('1/4" = 1\'-0" @ ARCH D', 0.457, 96), ("3/16'' = 1' - 0''", None, 64),
         ('1/4" = 1\'-0"', None, 48), ('1/2"=1\'', None, 24), ('1 1/2" = 1\'-0"', None, None),
-        ("M 1:50 im Original DIN A1", 0.42, 100), ('1/4"=1\'-0" @ 22"x34"', 0.432, 96), ("1:50 (HALF SIZE, A1)", 0.42, 100),
+        ("M 1:50 im Original DIN A1", 0.42, 100), ('1/4"=1\'-0" @ 22"x34"', 0.432, 96), ("1:50 (HALF, A1)", 0.42, 100),
     ],
 )  # fmt: skip
 def test_scale_that_is_written_for_a_sheet_or_in_inches(texts: str, paper_m: float | None, scale: int | None):

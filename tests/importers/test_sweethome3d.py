@@ -10,7 +10,6 @@ import pytest
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan, import_plans
 from lalaloc_core.importers.common.import_limits import ImportLimits
-from lalaloc_core.importers.common.plausibility import unit_by_parts
 from tests.importers.conftest import lines, shapes, zip_file
 
 
@@ -110,21 +109,3 @@ def test_files_of_other_programs_are_named(content: bytes, words: str) -> None:
 def test_usdz_says_how_to_export_json() -> None:
     with pytest.raises(InvalidFloorPlanError, match=r"USDZ.*CapturedRoom.*JSON"):
         import_plan(zip_file({"Room.usdc": b"PXR-USDC"}))
-
-
-@pytest.mark.parametrize(
-    ("doors", "extent", "sides", "unit"),
-    [
-        ([90.0, 80.0], 1200.0, [], "cm"),
-        ([], 1200.0, [], "cm"),
-        ([885.0], 12_000.0, [3500.0], "mm"),
-        ([0.9], 12.0, [3.5], "m"),
-        ([3.0], 40.0, [12.0], "ft"),
-        ([36.0], 480.0, [140.0], "in"),
-        ([5000.0], 12_000.0, [], None),
-    ],
-)
-def test_unit_is_that_in_which_doors_and_rooms_are_usual(
-    doors: list[float], extent: float, sides: list[float], unit: str | None
-) -> None:
-    assert unit_by_parts(doors, extent, sides) == unit

@@ -131,7 +131,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
         plan = FloorPlan.from_dict(document, limits)
     except InvalidFloorPlanError as error:
         hints = [line for line in builder.warnings if "units=" in line]
-        raise InvalidFloorPlanError("; ".join([str(error), *hints[:1]])) from error
+        raise InvalidFloorPlanError("; ".join([str(error), *hints[-1:]])) from error
     builder.warnings += [f"{line}; draw each area once" for line in plan.warnings if " overlap" in line]
     return ImportedPlan(document, builder.build(), sketch.level, anchor, (limits, plan))
 

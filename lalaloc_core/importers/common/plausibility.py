@@ -31,9 +31,6 @@ _USUAL_DOOR_M = (0.5, 3.0)
 _USUAL_ROOM_M2 = (0.64, 1600.0)
 # Largest distance of two rooms that share a wall, reach of an opening to either side, and shortest outer wall (m).
 _WALL_M, _REACH_M, _OUTER_M = 0.6, 0.65, 1.5
-# Usual door leaves, sides of rooms and buildings in drawings without a unit (m).
-_USUAL_LEAF_M, _USUAL_SIDE_M, _USUAL_EXTENT_M = (0.55, 1.3), (1.0, 40.0), (4.0, 120.0)
-_IMPERIAL = 0.7
 # Doors of one drawing are alike within this share, and so few other arcs are as wide as their leaves (m) by chance.
 _ALIKE, _SOME, _WIDTHS_M, _LEAF_M = 0.3, 0.1, (0.55, 1.2), 0.84
 _MAX_NAMED, _MAX_ROOMS_COMPARED = 5, 2000
@@ -87,38 +84,16 @@ def likely_unit(value: float, usual_m: tuple[float, float]) -> str | None:
     return min(fitting, key=lambda unit: abs(math.log(value * METRES_PER_UNIT[unit] / usual)), default=None)
 
 
-def unit_by_parts(doors: Sequence[float], extent: float, sides: Sequence[float] = ()) -> str | None:
-    """Return the unit of a drawing in which door leaves, rooms and the whole have usual sizes, None if none does.
-
-    `doors` are the widths of leaves, `sides` those of typical rooms, and `extent` the size of the drawing, all in its
-    units. Of the units in which all are usual, the one in which they are nearest to the middle is chosen; imperial
-    ones are less frequent.
-    """
-    measures = [(doors, _USUAL_LEAF_M), (sides, _USUAL_SIDE_M), ([extent], _USUAL_EXTENT_M)]
-
-    def score(unit: str) -> tuple[int, float]:
-        fitting, off = 0, _IMPERIAL if unit in ("in", "ft") else 0.0
-        for values, (low, high) in measures:
-            if values:
-                value = float(np.median(values)) * METRES_PER_UNIT[unit]
-                fitting += low <= value <= high
-                off += abs(math.log(max(value, 1e-9) / math.sqrt(low * high)))
-        return fitting, -off
-
-    best = max(METRES_PER_UNIT, key=score)
-    return best if score(best)[0] == sum(bool(values) for values, _ in measures) else None
-
-
-def _unit_hints(subject: str, value: float, usual_m: tuple[float, float], metres_per_unit: float = 1.0) -> list[str]:
+def unit_hints(subject: str, value: float, usual_m: tuple[float, float], metres_per_unit: float = 1.0) -> list[str]:
     """Return a warning about a length if it is unusual in metres, with the unit in which that of the file is not."""
     low, high = usual_m
     if low <= value <= high:
         return []
     stated = value / metres_per_unit
-    unit = likely_unit(stated, usual_m) if metres_per_unit in METRES_PER_UNIT.values() else None
+    unit = "m" if low <= stated <= high else likely_unit(stated, usual_m)
     advice = (
         f"it looks like {UNIT_NAMES[unit]} (with units={unit} it is {stated * METRES_PER_UNIT[unit]:.2f} m)"
-        if unit is not None
+        if unit is not None and metres_per_unit in METRES_PER_UNIT.values()
         else "check the scale"
     )
     return [f"{subject} is {value:g} m; the usual range is {low:.2g} to {high:.2g} m; {advice}"]
@@ -132,7 +107,7 @@ def check_leaves(leaves_m: Sequence[float], metres_per_unit: float) -> list[str]
     if alike < max(2, 0.5 * len(leaves_m)) or usual > _SOME * len(leaves_m):
         return []
     subject = f"the median width of the leaves of {len(leaves_m)} doors"
-    found = _unit_hints(subject, round(median, 4), _WIDTHS_M, metres_per_unit)
+    found = unit_hints(subject, round(median, 4), _WIDTHS_M, metres_per_unit)
     return [f"{line}, or set multiply to about {_LEAF_M / median:.2g}" for line in found]
 
 
@@ -143,7 +118,7 @@ def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list
     for name, height in zip(names, heights, strict=True):
         if height is not None:
             first_room.setdefault(float(height), name)
-    hints = [_unit_hints(f"the ceiling of '{name}'", height, USUAL_CEILING_M) for height, name in first_room.items()]
+    hints = [unit_hints(f"the ceiling of '{name}'", height, USUAL_CEILING_M) for height, name in first_room.items()]
     return list(chain.from_iterable(hints))[:_MAX_NAMED]
 
 
@@ -151,7 +126,7 @@ def _door_warnings(document: Mapping[str, Any], metres_per_unit: float) -> list[
     widths = [line.length for line in _lines(document, "door")]
     if not widths:
         return []
-    return _unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M, metres_per_unit)
+    return unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M, metres_per_unit)
 
 
 def _size_warnings(rooms: Sequence[shapely.Polygon], metres_per_unit: float) -> list[str]:
@@ -160,7 +135,7 @@ def _size_warnings(rooms: Sequence[shapely.Polygon], metres_per_unit: float) -> 
     # Median weighted by area, so that closets and ducts hardly count.
     side = float(np.sqrt(areas[np.searchsorted(np.cumsum(areas), 0.5 * areas.sum())]))
     low, high = (float(np.sqrt(area)) for area in _USUAL_ROOM_M2)
-    return _unit_hints("the side of a typical room", round(side, 3), (low, high), metres_per_unit)
+    return unit_hints("the side of a typical room", round(side, 3), (low, high), metres_per_unit)
 
 
 def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:

@@ -262,7 +262,9 @@ class _Drawer:
             builder.leave_out(layer, role)
 
     def _add_rooms(self, feature: Feature, shape: BaseGeometry, layer: str) -> None:
-        properties, parts = feature.properties, polygons_from_geometry(shape)
+        # Some tools write the outline of a room as a line.
+        area = shape if shapely.get_dimensions(shape) == 2 else shapely.build_area(shape)
+        properties, parts = feature.properties, polygons_from_geometry(area)
         self._builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
         name = _name(properties)
         types = _room_types(properties, name)

@@ -49,14 +49,13 @@ from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Letteri
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
+_STRAIGHT = {"LINE", "LWPOLYLINE", "POLYLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
 _READ = _LINES | _FILLED | _TEXTS | {"INSERT", "3DFACE"}
-# Alignments of texts that reach from one point to another, or end at one. Half of the width of a letter and of the
-# distance of lines, relative to the height of letters, and letters of a name.
-_BETWEEN, _RIGHT = (3, 5), 2
-_HALF_LETTER, _HALF_LINE, _LETTERS = 0.3, 0.8, 12
-_WALL_ROLES: tuple[Role | None, ...] = ("wall", None)
+# Alignments of texts that reach from one point to another. Half of the width of a letter and of the distance of lines,
+# relative to the height of letters, and letters of a name.
+_BETWEEN, _HALF_LETTER, _HALF_LINE, _LETTERS = (3, 5), 0.3, 0.8, 12
 # Roles that blocks have by their own names.
 _OF_BLOCKS = {"door", "window", "passage", "obstacle", "ignored", "demolished"}
 # Entities that draw no part of a building.
@@ -64,6 +63,7 @@ _NO_LINES = {"POINT", "DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "L
              "VIEWPORT", "WIPEOUT", "RAY", "XLINE", "ATTDEF", "LIGHT", "ACAD_TABLE", "OLE2FRAME", "IMAGE"}  # fmt: skip
 # Remedies for what is not read; EXPLODE makes lines of other kinds.
 _BIND = "bind it (XREF, Bind), or send that drawing"
+_DASHED = " is to be demolished or lies above and was left out: draw walls with whole lines"
 _MAKE_PLAIN = "turn such objects into lines (EXPORTTOAUTOCAD), or print a PDF"
 _REMEDIES = {"PDFUNDERLAY": "send that PDF, or import it (PDFIMPORT)", "DGNUNDERLAY": "import it (DGNIMPORT)",
              "DWFUNDERLAY": "send the drawing it was made of", "ACAD_PROXY_ENTITY": _MAKE_PLAIN}  # fmt: skip
@@ -80,8 +80,6 @@ _CLOSED = 1e-5
 # Layers of exported drawings, with their colours.
 _LAYERS = {"ROOM": 7, "COLUMN": 8, "WALL": 1, "DOOR": 3, "WINDOW": 5, "PASSAGE": 30, "ROOM-TEXT": 2}
 _INSUNITS_METRES = 6
-# Code of lengths of dashes and, negative, gaps in the pattern of a line type.
-_DASH = 49
 # Held while the options of ezdxf, which all threads share, are changed.
 _OPTIONS = threading.Lock()
 
@@ -229,7 +227,6 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     # The maximum distance of a curve from its polyline, in drawing units.
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     missing = _count_missing(document, builder)
-    dashed = Drawing()
     for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
             builder.use(context.layer, "ignored (layer is off)")
@@ -238,14 +235,16 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
         elif context.role in ("ignored", "demolished") or not options.includes_layer(context.layer):
             builder.leave_out(context.layer, context.role)
         elif (kind := entity.dxftype()) in _READ:
-            is_dashed = kind in _LINES and context.role in _WALL_ROLES and _is_dashed(entity, context, document)
-            _add(entity, context, dashed if is_dashed else drawing, builder, sag, budget)
+            if kind in _STRAIGHT and context.role in (None, "wall") and _is_dashed(entity, context, document):
+                builder.use(context.layer, "ignored (dashed)")
+                missing[f"a dashed line on layer '{context.layer[:50]}'", _DASHED] += 1
+            else:
+                _add(entity, context, drawing, builder, sag, budget)
         else:
             builder.use(context.layer, f"ignored ({kind})")
             if kind not in _NO_LINES and context.role != "text":
                 subject = f"{kind} on layer '{context.layer[:50]}'"
                 missing[subject, f" is not read: {_REMEDIES.get(kind, 'explode it (EXPLODE)')}"] += 1
-    _leave_out_dashed(dashed, drawing, builder)
     for (subject, remedy), count in missing.items():
         builder.warnings.append(f"{subject}{f' ({count} times)' if count > 1 else ''}{remedy}")
     if options.layers and not drawing.areas and not drawing.strokes:
@@ -263,29 +262,8 @@ def _is_dashed(entity: DXFGraphic, context: _Context, document: DxfDocument) -> 
     if name.upper() == "BYLAYER":
         name = document.layers.get(context.layer).dxf.linetype if document.layers.has_entry(context.layer) else ""
     pattern = document.linetypes.get(name).pattern_tags.tags if document.linetypes.has_entry(name) else []
-    return any(code == _DASH and length < 0.0 for code, length in pattern)
-
-
-def _leave_out_dashed(dashed: Drawing, drawing: Drawing, builder: ReportBuilder) -> None:
-    """Add the door swings among dashed lines to a drawing, and the lines only if most lines are dashed."""
-    drawing.swings += dashed.swings
-    for role in _WALL_ROLES:
-        (strokes, areas, length), (_, _, others) = _parts_of(dashed, role), _parts_of(drawing, role)
-        if length > others:
-            drawing.strokes += strokes
-            drawing.areas += areas
-        elif layers := sorted({f"'{part.layer[:50]}'" for part in (*strokes, *areas)}):
-            (builder.warnings if role == "wall" else builder.notes).append(
-                f"{len(strokes) + len(areas)} dashed lines on {', '.join(layers[:_MAX_NAMED_LAYERS])} were left out: "
-                "they show what is to be demolished or lies above; draw walls with whole lines"
-            )
-
-
-def _parts_of(drawing: Drawing, role: Role | None) -> tuple[list[Stroke], list[Area], float]:
-    """Return the lines and areas of one role, and the length of all."""
-    strokes = [stroke for stroke in drawing.strokes if stroke.role == role]
-    areas = [area for area in drawing.areas if area.role == role]
-    return strokes, areas, sum(part.line.length for part in strokes) + sum(part.shape.length for part in areas)
+    # Code 49 has the lengths of dashes and, negative, of gaps.
+    return any(code == 49 and length < 0.0 for code, length in pattern)
 
 
 def _count_missing(document: DxfDocument, builder: ReportBuilder) -> Counter[tuple[str, str]]:
@@ -390,27 +368,23 @@ def _add(
 
 
 def _anchor(entity: DXFGraphic) -> tuple[float, float] | None:
-    """Return the middle of a text, or of its first letters, in world coordinates: its insert can be in another room."""
+    """Return the middle of a text's first letters, in world coordinates: where it begins can be another room."""
     point = entity.dxf.get("insert")
     if point is None or not isinstance(entity, Text | MText):
         return None
     lines = str(entity.plain_text()).splitlines()
-    longest = min(max(map(len, lines), default=0), _LETTERS)
+    half = _HALF_LETTER * min(max(map(len, lines), default=0), _LETTERS)
     if isinstance(entity, MText):
-        across, down = (entity.dxf.attachment_point - 1) % 3, (entity.dxf.attachment_point - 1) // 3
-        size = entity.dxf.char_height
-        middle = Vec3((1 - across) * _HALF_LETTER * longest, (down - 1) * _HALF_LINE * len(lines)) * size
+        down, across = divmod(entity.dxf.attachment_point - 1, 3)
+        middle = Vec3((1 - across) * half, (down - 1) * _HALF_LINE * len(lines)) * entity.dxf.char_height
         point = entity.ucs().to_wcs(middle)
     else:
         halign, other = entity.dxf.get("halign", 0), entity.dxf.get("align_point")
-        right = Vec3.from_deg_angle(entity.dxf.rotation) * entity.dxf.height * _HALF_LETTER * longest
-        if other is not None and halign in _BETWEEN:
-            point = 0.5 * (Vec3(point) + Vec3(other))
-        elif other is not None and (halign or entity.dxf.get("valign", 0)):
-            point = Vec3(other) + (right if halign == 0 else -right if halign == _RIGHT else Vec3())
-        else:
-            point = Vec3(point) + right
-        point = entity.ocs().to_wcs(point)
+        if other is not None and (halign or entity.dxf.get("valign", 0)):
+            point = 0.5 * (Vec3(point) + Vec3(other)) if halign in _BETWEEN else Vec3(other)
+        # Texts begin at their anchor, or end at it.
+        side = {0: half, 2: -half}.get(halign, 0.0) * entity.dxf.height
+        point = entity.ocs().to_wcs(Vec3(point) + side * Vec3.from_deg_angle(entity.dxf.rotation))
     return float(point[0]), float(point[1])
 
 
@@ -480,20 +454,19 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
 
 
 def _widths(entity: DXFGraphic) -> list[float]:
-    """Return the width of a polyline, or of each of its straight parts if they differ; 0 for other lines."""
-    if isinstance(entity, LWPolyline) and not entity.dxf.get("const_width", 0.0):
-        ends = list(entity.get_points("se"))
-        is_straight = not entity.has_arc
+    """Return the width of a polyline, or of each of its parts if they differ; 0 for other lines."""
+    if isinstance(entity, LWPolyline):
+        usual, ends = entity.dxf.get("const_width", 0.0), list(entity.get_points("se"))
     elif isinstance(entity, Polyline) and entity.is_2d_polyline:
-        usual = tuple(entity.dxf.get(name, 0.0) for name in ("default_start_width", "default_end_width"))
-        ends = [tuple(vertex.dxf.get(n, 0.0) for n in ("start_width", "end_width")) for vertex in entity.vertices]
-        ends, is_straight = ends if any(map(any, ends)) else [usual] * len(ends), not entity.has_arc
+        usual, keys = entity.dxf.get("default_start_width", 0.0), ("start_width", "end_width")
+        ends = [tuple(vertex.dxf.get(key, 0.0) for key in keys) for vertex in entity.vertices]
     else:
-        return [float(entity.dxf.get("const_width", 0.0)) if isinstance(entity, LWPolyline) else 0.0]
+        return [0.0]
     # The last vertex of an open line begins no part.
-    widths = [float(np.mean(pair)) for pair in ends[: len(ends) if entity.is_closed else -1]]
-    is_one = not is_straight or max(widths, default=0.0) <= _SAME_WIDTH * min(widths, default=0.0)
-    return [max(widths, default=0.0)] if is_one else widths
+    widths = [float(np.mean(pair)) for pair in ends[: None if entity.is_closed else -1]]
+    if usual or not any(widths):
+        return [usual]
+    return [max(widths)] if max(widths) <= _SAME_WIDTH * min(widths) else widths
 
 
 def _ends_meet(points: np.ndarray) -> bool:

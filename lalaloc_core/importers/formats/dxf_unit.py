@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from itertools import islice
 
-import numpy as np
 from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dimension import Dimension as DimensionEntity
 from ezdxf.lldxf.const import DXFError
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import side_lengths
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.common.plausibility import UNIT_NAMES, unit_by_parts
+from lalaloc_core.importers.common.plausibility import UNIT_NAMES, likely_unit, unit_hints
 from lalaloc_core.importers.drawing.drawing_scale import Dimension, drawing_scale, scale_by_dimensions
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
@@ -26,8 +24,8 @@ _INSUNITS = {
     10: (0.9144, "yd"), 13: (1e-6, "µm"), 14: (0.1, "dm"), 15: (10.0, "dam"), 21: (1200 / 3937, "US survey feet"),
     22: (100 / 3937, "US survey inches"), 23: (3600 / 3937, "US survey yards"),
 }  # fmt: skip
-# Extents (m) of drawings beyond which the unit is doubted.
-_EXTENT_M = (4.0, 1000.0)
+# Extents (m) of drawings beyond which the unit is doubted, and those of homes.
+_EXTENT_M, _USUAL_M = (4.0, 1000.0), (4.0, 120.0)
 _MAX_DIMENSIONS, _MAX_WARNINGS = 1000, 3
 # A unit is meant within so many standard deviations of the estimated scale, or this share of it.
 _NEAR_STDS, _NEAR = 3.0, 0.1
@@ -44,13 +42,11 @@ def find_unit(
         raise InvalidFloorPlanError(f"the DXF's model space has no lines, areas or hatches; {remedy}")
     extent = drawing.extent
     measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
-    sides = [float(np.sqrt(area.shape.area)) for area in drawing.areas if area.role == "room"]
-    doors = [side_lengths(area.shape)[1] for area in drawing.areas if area.role == "door"]
-    fitting = unit_by_parts([*doors, *(swing.radius for swing in drawing.swings)], extent, sides)
     given = (options.units, options.known_distance, options.metres_per_pixel, own_unit, measured)
     if all(scale is None for scale in given):
         measured = _assumed_unit(drawing, options, builder, budget)
     if measured is None and all(scale is None for scale in given):
+        fitting = likely_unit(extent, _USUAL_M)
         hint = f" and looks like {UNIT_NAMES[fitting]}: units={fitting}" if fitting else ""
         raise InvalidFloorPlanError(
             f"the DXF gives no unit ($INSUNITS is {code}); it is {extent:g} units across{hint}; "
@@ -58,11 +54,7 @@ def find_unit(
         )
     own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
     factor, source = drawing_scale(options, "the DXF", own=own)
-    if not _EXTENT_M[0] <= extent * factor <= _EXTENT_M[1]:
-        hint = "check units"
-        if fitting is not None and own_unit and fitting != own_unit[1]:
-            hint = f"it looks like {UNIT_NAMES[fitting]}: set units={fitting}"
-        builder.warnings.append(f"the drawing is {extent * factor:.4g} m across; {hint}")
+    builder.warnings += unit_hints("the drawing's longer side", extent * factor, _EXTENT_M, factor)
     return factor, source
 
 

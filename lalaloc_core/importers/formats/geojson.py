@@ -74,6 +74,8 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     if geometry is None:
         return
     budget.spend(1 + _count_numbers(geometry, where) // 2)
+    if isinstance(geometry, Mapping) and geometry.get("type") in ("Polygon", "MultiPolygon"):
+        geometry = {**geometry, "coordinates": _closed(geometry.get("coordinates"))}
     try:
         shape = shapely.from_geojson(json.dumps(geometry))
     except (shapely.errors.ShapelyError, ValueError, TypeError) as error:
@@ -95,6 +97,15 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
         properties["feature_type"] = raw["feature_type"]
     identity = raw.get("id", properties.get("id"))
     yield Feature(shape, properties, str(identity)[:200] if isinstance(identity, str | int) else None)
+
+
+def _closed(rings: Any) -> Any:
+    """Return a ring, or those in nested lists, with its first position as the last."""
+    if not isinstance(rings, list) or not all(isinstance(part, list) and part for part in rings):
+        return rings
+    if rings and isinstance(rings[0][0], list):
+        return [_closed(part) for part in rings]
+    return rings if not rings or rings[0] == rings[-1] else [*rings, rings[0]]
 
 
 def _count_numbers(value: Any, where: str) -> int:
@@ -122,7 +133,7 @@ def _crs(document: Any) -> str | None:
     name = properties.get("name") if isinstance(properties, Mapping) else None
     if not isinstance(name, str) or "CRS84" in name or name.endswith(":4326"):
         return "OGC:CRS84" if "CRS84" in str(name) else None
-    digits = name.rpartition(":")[2]
+    digits = name.replace("/", ":").rpartition(":")[2]
     if not digits.isascii() or not digits.isdigit() or len(digits) > 6:
         raise InvalidFloorPlanError(f"the crs '{name[:100]}' is not an EPSG code; export the file in WGS84")
     return f"EPSG:{digits}"

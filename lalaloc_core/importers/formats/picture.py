@@ -144,7 +144,7 @@ def _open(
                 # A PNG can have a text of this name, in which Pillow would look for an orientation.
                 if isinstance(picture.info.get("xmp"), str):
                     del picture.info["xmp"]
-                upright = ImageOps.exif_transpose(picture)
+                upright = in_bytes(ImageOps.exif_transpose(picture))
                 drawn = upright.convert("RGBA")
                 flat = Image.new("RGBA", upright.size, "black" if _is_light(drawn) else "white")
                 flat.alpha_composite(drawn)
@@ -163,6 +163,12 @@ def _open(
     except (OSError, ValueError, SyntaxError, EOFError, TypeError, ZeroDivisionError) as error:
         raise InvalidFloorPlanError("the picture is damaged and cannot be read; save it again as PNG") from error
     return gray, warmth, _paper(dpi)
+
+
+def in_bytes(picture: Image.Image) -> Image.Image:
+    """Return a grey picture of 16 bits with 8, which Pillow would cut off; others as they are."""
+    is_wide = picture.mode.startswith("I")
+    return Image.fromarray((np.asarray(picture, np.int64) >> 8).clip(0, 255).astype(np.uint8)) if is_wide else picture
 
 
 def _is_light(picture: Image.Image) -> bool:

@@ -114,6 +114,8 @@ def _picture_alone(content: bytes, options: ImportOptions, budget: Budget) -> Oc
 
 def _open(files: Mapping[str, bytes], budget: Budget) -> OccupancyGrid:
     names = [name for name in files if name.casefold().endswith(YAML_SUFFIXES)]
+    # Archives can have the parameters of a robot, too.
+    names = [name for name in names if b"image:" in files[name]] or names
     if len(names) != 1:
         raise InvalidFloorPlanError(f"the archive has {len(names)} YAML files; a ROS map has one, and a picture")
     settings = _settings(files[names[0]])
@@ -175,6 +177,9 @@ def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> Oc
     free_at = _number(settings, "free_thresh", _FREE_THRESHOLD, (0.0, 1.0))
     values = np.arange(256) / 255.0
     occupancy = values if str(settings.get("negate")).casefold() in _YES else 1.0 - values
+    if str(settings.get("mode")).casefold() == "raw":
+        # Occupancy in percent; others are unknown.
+        occupancy = np.where(np.arange(256) <= 100, np.arange(256) / 100.0, 0.5 * (occupied_at + free_at))
     rows, columns = gray.shape
     return OccupancyGrid(
         MapFrame(resolution_m, (x, y, yaw), (rows, columns)),
@@ -185,6 +190,8 @@ def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> Oc
 
 def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
     from PIL import Image
+
+    from lalaloc_core.importers.formats.picture import in_bytes
 
     try:
         with warnings.catch_warnings():
@@ -198,7 +205,7 @@ def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
                     )
                 # Transparent cells are unknown.
                 flat = Image.new("RGBA", picture.size, (_UNKNOWN, _UNKNOWN, _UNKNOWN, 255))
-                flat.alpha_composite(picture.convert("RGBA"))
+                flat.alpha_composite(in_bytes(picture).convert("RGBA"))
                 return np.asarray(flat.convert("L"))
     except InvalidFloorPlanError:
         raise

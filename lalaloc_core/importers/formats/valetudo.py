@@ -78,7 +78,11 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
     if not sketch.rooms:
         raise InvalidFloorPlanError("the map has no segments: let the robot divide it into rooms, and send it again")
     builder.notes.append("rooms are where the robot drives: their outlines leave out furniture that stands at walls")
-    sketch.openings += _passages(outlines, shapely.union_all(walls), cell_m, budget)
+    if walls:
+        sketch.openings += _passages(outlines, shapely.union_all(walls), cell_m, budget)
+    else:
+        sketch.opening_kinds = ()
+        builder.warnings.append("the map has no walls, so passages between rooms are unknown: add them in the editor")
     return (assemble(sketch, builder, options, budget.limits.plan),)
 
 

@@ -96,6 +96,9 @@ def read_ink(
         even = rotate_picture(even, skew_deg)
         warmth = None if warmth is None else rotate_picture(warmth, skew_deg, fill=COLOURLESS)
     mask = even < threshold
+    if warmth is not None and mask.any():
+        # Drawings in brown or blue ink have no colours.
+        warmth = np.clip(warmth - (np.median(warmth[mask]) - COLOURLESS), 0, 255).astype(np.uint8)
     return Ink(
         gray=even,
         warmth=warmth,

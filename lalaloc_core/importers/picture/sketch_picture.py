@@ -50,7 +50,7 @@ _RECALL = 0.95
 # are no rooms. A smaller share covered by rooms gives a warning, with its largest parts.
 _CLOSING_M, _CLEARANCE_M, _COVERED, _MAX_NAMED = 1.5, 0.2, 0.9, 5
 _COARSE_M = 0.03
-_MAX_WALL_THICKNESS_M = 1.2
+_MAX_WALL_THICKNESS_M, _THICK_M = 1.2, 0.6
 # Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
 _WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
 # Least number of doors that are drawn without a swing, least share of other openings that have more lines, and share of
@@ -354,6 +354,11 @@ def _report_coverage(reading: _Reading, builder: ReportBuilder) -> None:
 def _report(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: ReportBuilder) -> None:
     style = "dark and thick" if reading.is_dark else "drawn with two lines"
     builder.notes.append(f"walls are {style}, usually {reading.walls.thickness_m:.2f} m thick")
+    if reading.walls.thickness_m > _THICK_M:
+        builder.warnings.append(
+            f"the walls are usually {reading.walls.thickness_m:.2f} m thick, more than {_THICK_M:g} m: check the scale; if "
+            "dark or coloured floors were taken for walls, save the picture with white floors"
+        )
     if ink.skew_deg:
         builder.turned_deg = -ink.skew_deg
         builder.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to straighten it")
