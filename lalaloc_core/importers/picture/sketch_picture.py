@@ -356,8 +356,8 @@ def _report(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: Repor
     builder.notes.append(f"walls are {style}, usually {reading.walls.thickness_m:.2f} m thick")
     if reading.walls.thickness_m > _THICK_M:
         builder.warnings.append(
-            f"walls of {reading.walls.thickness_m:.2f} m are thicker than usual, {_THICK_M:g} m: check the scale; if dark "
-            "or coloured floors were taken for walls, save the picture with white floors"
+            f"walls of {reading.walls.thickness_m:.2f} m are thicker than usual ({_THICK_M:g} m): check the scale; if "
+            "dark or coloured floors were taken for walls, save the picture with white floors"
         )
     if ink.skew_deg:
         builder.turned_deg = -ink.skew_deg
