@@ -188,9 +188,12 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
     kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel, thickness_range)
     if cavities is not None:
         # What is drawn across a wall of two lines cuts it into pieces; no opening is as narrow.
-        notch = np.ones((round(_NOTCH_M / ink.metres_per_pixel),) * 2, np.uint8)
+        notch = np.ones((round(_NOTCH_M / ink.metres_per_pixel) | 1,) * 2, np.uint8)
         closed = cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_CLOSE, notch)
-        _, found, stats, _ = cv2.connectedComponentsWithStats((closed & ~kept).astype(np.uint8), connectivity=8)
+        # Without the rims along panes, which join notches.
+        pair = np.ones((2, 2), np.uint8)
+        filled = cv2.dilate(cv2.erode((closed & ~kept).astype(np.uint8), pair), pair, anchor=(0, 0))
+        _, found, stats, _ = cv2.connectedComponentsWithStats(filled, connectivity=8)
         # Longer areas are panes of windows.
         kept |= (stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) <= 2 * len(notch))[np.asarray(found)]
     return WallMask(kept, thickness, cavities) if kept.any() else None
