@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lalaloc_core.importers import import_plan
-from lalaloc_core.importers.common.plausibility import estimate_trust
+from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
 
 SIDE_M = 4.0
 
@@ -54,6 +54,13 @@ def test_passages_without_doors_are_trusted_less() -> None:
     trust = trust_of(row_of_rooms(6, 6, kind="passage"))
     assert trust["door"] == 0.0
     assert 0.4 < trust["passage"] < 0.7
+
+
+@pytest.mark.parametrize(("x0", "x1", "unreached"), [(3.1, 4.1, 2), (4.0, 5.0, 1)])
+def test_room_beside_whose_corner_a_door_ends_is_named(x0: float, x1: float, unreached: int) -> None:
+    document = row_of_rooms(0, 0, rooms=2)
+    document["openings"] = [{"kind": "door", "line": [[x0, 4.05], [x1, 4.05]]}]
+    assert f"no door or passage reaches 'room {unreached}'" in check_document(document)
 
 
 def test_rooms_without_an_outer_wall_need_no_window() -> None:
