@@ -42,9 +42,6 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """Read the plan in a picture, as a draft."""
     builder = ReportBuilder("picture", is_draft=True)
     gray, warmth, paper_m_per_pixel = _open(content, builder, budget)
-    if _has_dark_ground(gray):
-        gray, warmth = 255 - gray, None
-        builder.notes.append("the picture shows light lines on a dark ground and was inverted")
     tones = Tones.of(gray)
     if tones is not None and tones.is_photograph:
         if not options.plan:
@@ -154,6 +151,13 @@ def _open(
                 if (with_dark_walls := darken_pale_walls(np.asarray(flat.convert("RGB")))) is not None:
                     gray, warmth = with_dark_walls, None
                     builder.notes.append("walls are the areas of one colour between the floors, which are darker")
+                elif _has_dark_ground(gray):
+                    # Red and blue lines are nearly as dark as the ground.
+                    colours = np.asarray(flat.convert("RGB"))
+                    ground = np.median(colours[::8, ::8].reshape(-1, 3), axis=0).astype(np.uint8)
+                    apart = np.maximum(colours, ground) - np.minimum(colours, ground)
+                    gray, warmth = 255 - apart.max(axis=2), None
+                    builder.notes.append("the picture shows light lines on a dark ground and was inverted")
     except InvalidFloorPlanError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:

@@ -97,8 +97,10 @@ def read_ink(
         warmth = None if warmth is None else rotate_picture(warmth, skew_deg, fill=COLOURLESS)
     mask = even < threshold
     if warmth is not None and mask.any():
-        # Drawings in brown or blue ink have no colours.
-        warmth = np.clip(warmth - (np.median(warmth[mask]) - COLOURLESS), 0, 255).astype(np.uint8)
+        # Lines of the colour of most ink, which can be brown or blue, have none.
+        usual, colour = float(np.median(warmth[mask])) - COLOURLESS, warmth.astype(np.float32) - COLOURLESS
+        colour -= np.clip(usual, np.minimum(colour, 0.0), np.maximum(colour, 0.0))
+        warmth = (colour + COLOURLESS).astype(np.uint8)
     return Ink(
         gray=even,
         warmth=warmth,
