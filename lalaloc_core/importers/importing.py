@@ -182,6 +182,9 @@ def import_plans(
         raise InvalidFloorPlanError(
             f"the file is nested too deep; the limit is {limits.max_depth} levels (max_depth)"
         ) from error
+    except InvalidFloorPlanError as error:
+        hints = [hint for hint in budget.hints if hint not in error.reason]
+        raise InvalidFloorPlanError("; ".join([error.reason, *hints]), room=error.room) from error
     except InvalidInputError:
         raise
     except Exception as error:

@@ -127,11 +127,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     is_certain, metres_per_unit = sketch.anchor is not None, builder.metres_per_unit
     builder.warnings += check_document(document, is_scale_certain=is_certain, metres_per_unit=metres_per_unit)
     # Validate now, while the error can still refer to the file.
-    try:
-        plan = FloorPlan.from_dict(document, limits)
-    except InvalidFloorPlanError as error:
-        hints = [line for line in builder.warnings if "units=" in line]
-        raise InvalidFloorPlanError("; ".join([str(error), *hints[-1:]])) from error
+    plan = FloorPlan.from_dict(document, limits)
     builder.warnings += [f"{line}; draw each area once" for line in plan.warnings if " overlap" in line]
     return ImportedPlan(document, builder.build(), sketch.level, anchor, (limits, plan))
 

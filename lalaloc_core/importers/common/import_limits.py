@@ -84,6 +84,7 @@ class Budget:
         trace: receives what is read from a drawing, if anyone asks for it.
         on_step: called with every step of the import as it begins.
         size_bytes: size of the file, which bounds the copies of its shapes; 0 if unknown.
+        hints: what the message of an error says besides, such as the page that was read.
     """
 
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS
@@ -93,6 +94,7 @@ class Budget:
     on_step: OnStep | None = None
     size_bytes: int = 0
     entities: int = 0
+    hints: list[str] = field(default_factory=list)
     started_s: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -7,8 +7,7 @@ passage without a symbol that is wider than a door are divided where their names
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -16,7 +15,6 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
@@ -106,18 +104,12 @@ def _division(
     return None
 
 
-@contextmanager
-def naming_text(letterings: Sequence[Lettering], subject: str) -> Iterator[None]:
-    """Say in errors that a file is a page of text if most of its texts are lines of prose."""
-    try:
-        yield
-    except InvalidFloorPlanError as error:
-        prose = sum(len(lettering.text) >= _LINE_LETTERS for lettering in letterings)
-        if prose < max(_MIN_LINES_OF_TEXT, 0.5 * len(letterings)):
-            raise
-        raise InvalidFloorPlanError(
-            f"{subject} is a page of text with {prose} lines, not a floor plan; send the page with the plan ({error})"
-        ) from error
+def text_hints(letterings: Sequence[Lettering], subject: str) -> list[str]:
+    """Return what errors say of a page of text, most of whose texts are lines of prose; empty for another one."""
+    prose = sum(len(lettering.text) >= _LINE_LETTERS for lettering in letterings)
+    if prose < max(_MIN_LINES_OF_TEXT, 0.5 * len(letterings)):
+        return []
+    return [f"{subject} is a page of text with {prose} lines, not a floor plan; send the page with the plan"]
 
 
 def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:

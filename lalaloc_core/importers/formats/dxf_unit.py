@@ -54,7 +54,8 @@ def find_unit(
         )
     own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
     factor, source = drawing_scale(options, "the DXF", own=own)
-    builder.warnings += unit_hints("the drawing's longer side", extent * factor, _EXTENT_M, factor)
+    builder.warnings += (hints := unit_hints("the drawing's longer side", extent * factor, _EXTENT_M, factor))
+    budget.hints += hints
     return factor, source
 
 

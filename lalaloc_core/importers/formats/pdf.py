@@ -28,7 +28,7 @@ from lalaloc_core.importers.drawing.scale_guess import (
     guess_scale,
     measures_of,
 )
-from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, naming_text, sketch_drawing
+from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, sketch_drawing, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
 from lalaloc_core.importers.formats.pdf_page import PageContent, open_page, read_page
@@ -50,29 +50,24 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     `metres_per_pixel` is metres per point (1/72 inch); `known_distance` is in points from the page's lower left corner.
     """
     document, page = open_page(content, options.page)
-    where = f"page {options.page} of {len(document)}"
     try:
-        budget.begin(f"reading {where}")
+        where = f"page {options.page} of {len(document)} was read: set page to that of the plan"
+        budget.hints += [where] * (len(document) > 1)
+        budget.begin(f"reading page {options.page} of {len(document)}")
         found = read_page(page, budget)
         # The library takes the unit for a point.
         unit = _USER_UNIT.search(content)
         found.unit_m = _METRES_PER_POINT * ((unit and float(unit[1])) or 1.0)
         if options.crop is not None:
             found.crop, found.drawing = options.crop, found.drawing.cropped(options.crop)
-        with naming_text(found.drawing.letterings, f"page {options.page} of the PDF"):
-            plans = _read_plan(found, options, budget)
-        notes = (f"{where} was read; set page to read another",) if len(document) > 1 else ()
-        return tuple(replace(plan, report=replace(plan.report, notes=(*notes, *plan.report.notes))) for plan in plans)
-    except InvalidFloorPlanError as error:
-        if len(document) == 1:
-            raise
-        raise InvalidFloorPlanError(f"{error} ({where} was read: set page to that of the plan)") from error
+        budget.hints += text_hints(found.drawing.letterings, f"page {options.page} of the PDF")
+        return _read_plan(found, options, budget)
     finally:
         document.close()
 
 
 def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    builder = ReportBuilder("pdf", is_draft=True)
+    builder = ReportBuilder("pdf", is_draft=True, notes=[hint for hint in budget.hints if "set page" in hint])
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
     scan = _read_scan(found, builder, budget)

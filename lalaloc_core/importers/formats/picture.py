@@ -21,7 +21,7 @@ from lalaloc_core.importers.drawing.drawing_scale import (
     written_dimensions,
 )
 from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
-from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, naming_text
+from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
@@ -54,8 +54,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         gray = blank_outside(gray, options.crop)
         warmth = None if warmth is None else blank_outside(warmth, options.crop)
     texts = read_texts(gray, builder, budget)
-    with naming_text(texts.drawing.letterings, "the picture"):
-        return _read_plan(gray, warmth, texts, paper_m_per_pixel, options, builder, budget)
+    budget.hints += text_hints(texts.drawing.letterings, "the picture")
+    return _read_plan(gray, warmth, texts, paper_m_per_pixel, options, builder, budget)
 
 
 def _read_plan(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
@@ -18,10 +17,10 @@ import numpy as np
 import shapely
 import svgelements
 
-from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
-from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError
+from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
@@ -122,15 +121,15 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         title = next((child.text for child in element if local_name(child) == "title"), None)
         if element is not root and title and title.strip():
             element.attrib.setdefault("data-name", title.strip())
-    with _naming_pictures(pictures):
-        warnings = [_picture_text(pictures)] * (pictures > 0) + [_html_text(texts)] * (texts > 0)
-        styles = "".join(element.text or "" for element in root.iter() if local_name(element) == "style")
-        if found := _COMBINED.search(re.sub(r"\{[^}]*\}", ",", styles)):
-            warnings.append(
-                f"styles of '{found[1].strip()[:50]}' are not applied: only those of an element, a class or an id are; "
-                "save the styles as attributes"
-            )
-        return _read_plan(root, warnings, options, budget)
+    warnings = [_picture_text(pictures)] * (pictures > 0) + [_html_text(texts)] * (texts > 0)
+    budget.hints += warnings[: pictures > 0]
+    styles = "".join(element.text or "" for element in root.iter() if local_name(element) == "style")
+    if found := _COMBINED.search(re.sub(r"\{[^}]*\}", ",", styles)):
+        warnings.append(
+            f"styles of '{found[1].strip()[:50]}' are not applied: only those of an element, a class or an id are; "
+            "save the styles as attributes"
+        )
+    return _read_plan(root, warnings, options, budget)
 
 
 def _join_parts(text: Element) -> None:
@@ -148,17 +147,6 @@ def _join_parts(text: Element) -> None:
             line.text = f"{line.text or ''}{words}"
             text.remove(part)
         line.text = f"{line.text}{part.tail or ''}"
-
-
-@contextmanager
-def _naming_pictures(pictures: int) -> Iterator[None]:
-    """Say in errors that a drawing has embedded pictures, which can be the plan."""
-    try:
-        yield
-    except InvalidFloorPlanError as error:
-        if not pictures or isinstance(error, SeveralLevelsError | NoRoomError):
-            raise
-        raise InvalidFloorPlanError(f"{_picture_text(pictures)} ({error})") from error
 
 
 def _picture_text(pictures: int) -> str:
