@@ -246,11 +246,9 @@ def without_areas(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[Ske
         ]
         share = shapely.union_all([part.shape for part in inside]).area / area_m2
         if share > (_COVERED if len(inside) > 1 else _SAME):
-            covered = f"covers {len(inside)} rooms, such as {_label(inside[0])}, and was left out as an area"
-            again = f"is {_label(inside[0])} ({inside[0].shape.area:.1f} m²) again and was left out"
             builder.warnings.append(
-                f"{_label(room)} ({area_m2:.1f} m²) {covered if len(inside) > 1 else again}; remove what lies in it if "
-                "it is one room"
+                f"{_label(room)} ({area_m2:.1f} m²) covers {len(inside)} rooms, such as {_label(inside[0])}, and was "
+                "left out as an area; remove these if it is one room"
             )
             left_out.add(index)
     return [room for index, room in enumerate(rooms) if index not in left_out]

@@ -14,6 +14,7 @@ METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in":
 _SCALE = re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)")
 _MAX_LENGTH, _MAX_LAYERS = 200, 100
 _CEILING_M = (1.0, 20.0)
+_NUMBERS = {"known_distance": (5, "x0, y0, x1, y1, metres"), "crop": (4, "x0, y0, x1, y1 of two opposite corners")}
 # Numbers of a known distance, and the lengths of a unit of a drawing that follow (m).
 _MAX_NUMBER, _METRES_PER_UNIT = 1e10, (1e-9, 1e4)
 
@@ -139,17 +140,15 @@ def _parse(name: str, text: str) -> object:
         if match is None:
             raise InvalidFloorPlanError(f"scale is '{text[:50]}'; it must look like 1:100")
         return float(match[1])
-    if name == "known_distance":
-        numbers = [_number(name, part) for part in re.split(r"[,;\s]+", text)]
-        if len(numbers) != 5:
-            raise InvalidFloorPlanError(f"known_distance has {len(numbers)} numbers; give x0, y0, x1, y1, metres")
-        x0, y0, x1, y1, metres = numbers
-        return KnownDistance((x0, y0), (x1, y1), metres)
-    if name == "crop":
-        corners = [_number(name, part) for part in re.split(r"[,;\s]+", text)]
-        if len(corners) != 4:
-            raise InvalidFloorPlanError(f"crop has {len(corners)} numbers; give x0, y0, x1, y1 of two opposite corners")
-        return tuple(corners)
+    if name in _NUMBERS:
+        numbers, (count, meaning) = [_number(name, part) for part in re.split(r"[,;\s]+", text)], _NUMBERS[name]
+        if len(numbers) != count:
+            raise InvalidFloorPlanError(f"{name} has {len(numbers)} numbers; give {meaning}")
+        return (
+            tuple(numbers)
+            if name == "crop"
+            else KnownDistance((numbers[0], numbers[1]), (numbers[2], numbers[3]), numbers[4])
+        )
     if name == "layers":
         return tuple(part.strip() for part in text.split(",") if part.strip())
     if name == "page":

@@ -36,26 +36,25 @@ def find_unit(
 ) -> tuple[float, str]:
     """Return the metres per unit and their source: the options, $INSUNITS, the dimensions, or sizes of parts."""
     code = document.header.get("$INSUNITS", 0)
-    own_unit = _INSUNITS.get(code)
     if not drawing.shapes:
         remedy = "; ".join(builder.warnings[:_MAX_WARNINGS]) or "move the plan from the layout to the model space"
         raise InvalidFloorPlanError(f"the DXF's model space has no lines, areas or hatches; {remedy}")
-    extent = drawing.extent
-    measured = None if own_unit is not None else scale_by_dimensions(_dimensions(document), extent)
-    given = (options.units, options.known_distance, options.metres_per_pixel, own_unit, measured)
-    if all(scale is None for scale in given):
-        measured = _assumed_unit(drawing, options, builder, budget)
-    if measured is None and all(scale is None for scale in given):
-        fitting = likely_unit(extent, _USUAL_M)
-        hint = f" and looks like {UNIT_NAMES[fitting]}: units={fitting}" if fitting else ""
-        raise InvalidFloorPlanError(
-            f"the DXF gives no unit ($INSUNITS is {code}); it is {extent:g} units across{hint}; "
-            "set units to mm, cm, m, in or ft"
-        )
-    own = measured if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
+    extent, unit = drawing.extent, _INSUNITS.get(code)
+    own = None if unit is None else (unit[0], f"$INSUNITS is {code} ({unit[1]})")
+    own = own or scale_by_dimensions(_dimensions(document), extent)
+    if not any((own, options.units, options.known_distance, options.metres_per_pixel)):
+        own = _assumed_unit(drawing, options, builder, budget)
+        if own is None:
+            fitting = likely_unit(extent, _USUAL_M)
+            hint = f" and looks like {UNIT_NAMES[fitting]}: units={fitting}" if fitting else ""
+            raise InvalidFloorPlanError(
+                f"the DXF gives no unit ($INSUNITS is {code}); it is {extent:g} units across{hint}; "
+                "set units to mm, cm, m, in or ft"
+            )
     factor, source = drawing_scale(options, "the DXF", own=own)
-    builder.warnings += (hints := unit_hints("the drawing's longer side", extent * factor, _EXTENT_M, factor))
-    budget.hints += hints
+    if not _EXTENT_M[0] <= extent * factor <= _EXTENT_M[1]:
+        builder.warnings += (hints := unit_hints("the drawing's longer side", extent * factor, _USUAL_M, factor))
+        budget.hints += hints
     return factor, source
 
 

@@ -74,8 +74,6 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     if geometry is None:
         return
     budget.spend(1 + _count_numbers(geometry, where) // 2)
-    if isinstance(geometry, Mapping) and geometry.get("type") in ("Polygon", "MultiPolygon"):
-        geometry = {**geometry, "coordinates": _closed(geometry.get("coordinates"))}
     try:
         shape = shapely.from_geojson(json.dumps(geometry))
     except (shapely.errors.ShapelyError, ValueError, TypeError) as error:
@@ -97,15 +95,6 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
         properties["feature_type"] = raw["feature_type"]
     identity = raw.get("id", properties.get("id"))
     yield Feature(shape, properties, str(identity)[:200] if isinstance(identity, str | int) else None)
-
-
-def _closed(rings: Any) -> Any:
-    """Return a ring, or those in nested lists, with its first position as the last."""
-    if not isinstance(rings, list) or not all(isinstance(part, list) and part for part in rings):
-        return rings
-    if rings and isinstance(rings[0][0], list):
-        return [_closed(part) for part in rings]
-    return rings if not rings or rings[0] == rings[-1] else [*rings, rings[0]]
 
 
 def _count_numbers(value: Any, where: str) -> int:

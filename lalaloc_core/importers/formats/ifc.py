@@ -107,14 +107,13 @@ def _storeys(model: Any, meshes: _Meshes) -> Mapping[str, tuple[Level, tuple[str
     for height, key in heights:
         storey = model.by_id(key)
         buildings[_whole(storey, "IfcBuilding")].append((height, storey))
-    names = Counter(storey.LongName or storey.Name for storeys in buildings.values() for _, storey in storeys)
     found = {}
     for building, storeys in buildings.items():
         # The ground floor is the storey nearest to zero.
         ground = min(range(len(storeys)), key=lambda i: abs(storeys[i][0]), default=0)
         for number, (height, storey) in enumerate(storeys, -ground):
             name, key = storey.LongName or storey.Name or f"level {number}", str(storey.id())
-            if names[name] > 1 and building is not None and len(buildings) > 1:
+            if building is not None and len(buildings) > 1:
                 name = f"{building.LongName or building.Name or f'building {building.id()}'}, {name}"
             found[key] = (Level(str(name)[:200], float(number), height), (key, spaces[key]))
     return found
@@ -152,14 +151,6 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, m
     for space in spaces:
         mesh = meshes.of(space)
         name = str(space.LongName or space.Name or "")
-        outline = meshes.of(space, curves=True) if mesh is None else None
-        if outline is not None:
-            vertices, edges = outline
-            parts = shapely.get_parts(shapely.polygonize(np.asarray(shapely.linestrings(vertices[edges][:, :, :2]))))
-            sketch.rooms += [SketchedRoom(part, name or None) for part in parts]
-            floors.append(float(vertices[:, 2].min()))
-            builder.use("IfcSpace", "rooms (outlines)")
-            continue
         if mesh is None:
             builder.use("IfcSpace", "ignored (no geometry)")
             builder.warnings.append(f"space '{name}' ({space.GlobalId}) has no geometry and was left out")
@@ -344,11 +335,8 @@ class _Meshes:
         """True while there is time to spare."""
         return self._budget.elapsed_s < _FIXTURES_SHARE * self._budget.limits.max_import_s
 
-    def of(self, element: Any, *, curves: bool = False) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
-        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape.
-
-        With `curves`, lines count as a shape, and its edges are returned.
-        """
+    def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
+        """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape."""
         import ifcopenshell.geom
 
         self._budget.check_time()
@@ -361,17 +349,14 @@ class _Meshes:
             )
         settings = ifcopenshell.geom.settings()
         settings.set("use-world-coords", True)
-        if curves:
-            settings.set("dimensionality", ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS)
         try:
             shape = ifcopenshell.geom.create_shape(settings, element)
         except RuntimeError:
             return None
         vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
-        parts = shape.geometry.edges if curves else shape.geometry.faces  # type: ignore[union-attr]
-        corners = np.array(parts, dtype=int).reshape(-1, 2 if curves else 3)
+        triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
         check_coordinates(vertices, f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}'")
-        return (vertices, corners) if len(corners) else None
+        return (vertices, triangles) if len(triangles) else None
 
     def _size(self, value: Any) -> float:
         """Count an entity and all that it refers to, repeated as often as referred to; infinite for a cycle."""
