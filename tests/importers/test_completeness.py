@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from typing import Any
 
 import pytest
@@ -71,13 +70,6 @@ def test_rooms_without_an_outer_wall_need_no_window() -> None:
     document["rooms"] += [middle, *({"polygon": outline, "type": "corridor"} for outline in around)]
     (reason,) = [entry.reason for entry in estimate_trust(document, 0.95) if entry.kind == "window"]
     assert not reason.startswith("6 of 7")
-
-
-def test_estimate_is_bounded_in_buildings_of_many_rooms() -> None:
-    document = row_of_rooms(3000, 3000, rooms=3000)
-    began = time.process_time()
-    assert trust_of(document)["door"] > 0.9
-    assert time.process_time() - began < 5.0
 
 
 @pytest.mark.parametrize("doors", [6, 1])

@@ -273,6 +273,7 @@ def test_french_polylines_and_blocks_in_feet():
         ("Abbruchwand", "demolished"), ("A-WALL-DEM", "demolished"), ("Wand zu entfernen", "demolished"),
         ("RÜCKBAU_WÄNDE", "demolished"), ("mur à déposer", "demolished"), ("walls to be removed", "demolished"),
         ("Rückbautür", "demolished"), ("muro a demolir", "demolished"), ("REMODEL-WALL", "wall"), ("A-WALL-E", "wall"),
+        ("A-WALL-FULL-D", "demolished"), ("Стены демонтаж", "demolished"), ("VÄGG RIVS", "demolished"),
     ],
 )  # fmt: skip
 def test_role_of_a_layer(layer: str, role: str | None):

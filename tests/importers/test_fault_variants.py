@@ -16,8 +16,11 @@ from scipy import ndimage
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, import_plan, import_plans
+from lalaloc_core.importers.common import ReportBuilder
 from lalaloc_core.importers.common.geometry import find_floor
+from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.drawing.drawing_scale import _written_scales
+from lalaloc_core.importers.drawing.scale_guess import ScaleGuess, assume_scale
 from tests.importers.conftest import dxf_file, lines, shapes
 from tests.importers.test_fault_files import FOLDER
 from tests.importers.test_ros_maps import _map
@@ -80,31 +83,24 @@ def test_turned_shapes_of_an_svg_are_walls(turn_deg: int):
     assert _areas(_svg(turned.format(outer + inner))) == [37.0, 30.1]
 
 
-def test_outlines_with_holes_are_faces_of_walls():
-    faces = "M0,0 H900 V600 H0 Z M20,20 V580 H440 V20 Z M460,20 V580 H880 V120 H780 V20 Z"
-    plan = _svg(f'<path fill="none" stroke="#333" stroke-width="2" d="{faces}"/>')
-    assert _areas(plan) == [23.5, 22.5]
-
-
-def test_html_text_of_an_svg_is_named():
-    plan = _svg('<rect id="room-1" width="500" height="400"/><foreignObject><div>Hall</div></foreignObject>')
-    assert any("1 texts are HTML (foreignObject)" in line for line in plan.report.warnings)
-
-
-def test_titles_name_the_shapes_of_an_svg():
-    shapes_of = "".join(
-        f'<rect id="room-{x}" x="{x}" width="500" height="400"><title>Bedroom</title></rect>' for x in (0, 515)
-    )
-    plan = _svg("<title>House</title>", shapes_of)
-    assert [room["name"] for room in plan.document["rooms"]] == ["Bedroom", "Bedroom"]
-
-
 @pytest.mark.parametrize("schema", ["IFC4X3", "IFC4X3_ADD1", "IFC4_ADD2", "ifc4"])
 def test_versions_of_ifc_schemas_are_read(schema: str):
     model = (FOLDER / "door_curtain.ifc").read_text().replace("'IFC4'", f"'{schema}'")
     plan = import_plan(model.encode())
     assert _areas(plan) == [19.2, 16.0]
     assert [len(lines(plan.document, kind)) for kind in ("door", "window")] == [1, 1]
+
+
+def test_copies_titles_and_parts_of_texts_of_an_svg_are_read():
+    text = '<text><tspan x="20" y="20">Bed</tspan><tspan x="50" y="20">room</tspan><tspan y="40">20 m²</tspan></text>'
+    room = '<symbol id="a"><rect class="room" width="500" height="400"/></symbol><defs><g id="b">{}</g></defs>'
+    named = '<rect id="room-1" x="1030" width="50" height="400"><title>Hall</title></rect>'
+    copies = room.format('<use href="#a"/>'), '<use href="#b"/><use href="#b" x="515"/>', named
+    plan = _svg("<style>#a rect{fill:red}</style><foreignObject>Bath</foreignObject>", *copies, text)
+    assert _areas(plan) == [20.0, 20.0, 2.0]
+    assert [room.get("name") for room in plan.document["rooms"]] == ["Bedroom", None, "Hall"]
+    for said in ("styles of '#a rect' are not applied", "1 texts are HTML (foreignObject)"):
+        assert any(said in line for line in plan.report.warnings)
 
 
 def test_unused_outlines_are_reported_with_layer_and_share():
@@ -159,17 +155,6 @@ def test_dark_pillars_beside_single_lines_are_no_walls(x: int):
     )
     assert len(shapes(plan.document)) == 2
     assert sum(_areas(plan)) == pytest.approx(60.0 - 0.25, abs=0.15)
-
-
-def test_chimney_in_a_hatched_wall_of_a_dxf():
-    document: Any = new_dxf("R2010", units=6)
-    hatch = document.modelspace().add_hatch()
-    outer = [(0, 0), (9, 0), (9, 6), (0, 6)]
-    left = [(0.2, 0.2), (4.4, 0.2), (4.4, 5.8), (1.3, 5.8), (1.3, 4.7), (0.2, 4.7)]
-    right = [(4.6, 0.2), (8.8, 0.2), (8.8, 5.8), (4.6, 5.8)]
-    for ring in (outer, left, right):
-        hatch.paths.add_polyline_path(ring, is_closed=True)
-    assert _areas(import_plan(dxf_file(document))) == [23.5, 22.3]
 
 
 def test_chimney_and_shaft_of_outlined_walls_divide_no_room():
@@ -239,6 +224,8 @@ def _storeys(*layers: str) -> dict[str, list[float]]:
         (("E10 Mur", "E9 Mur"), ("E9", "E10")), (("Étage 2 murs", "Étage 1 murs"), ("Étage 1", "Étage 2")),
         (("Level -1 Wall", "LEVEL-01-WALL"), ("Level -1", "LEVEL-01")), (("1.DG Wand", "1.OG Wand"), ("1.OG", "1.DG")),
         (("OG-1-Wand", "OG-2-Wand"), ("",)), (("Wand_EI30", "Wand_EI90"), ("",)), (("WALL-RC", "WALL-PB"), ("",)),
+        (("1NP-ZDI", "2NP-ZDI"), ("1NP", "2NP")), (("壁1階", "壁2階"), ("1F", "2F")), (("SEINAT_1KRS",) * 2, ("",)),
+        (("VEGG 2.etg", "VEGG 1.etg"), ("1.etg", "2.etg")), (("MURI_P1", "MURI_PT"), ("PT", "P1")),
         (("WALL_0", "EG-Wand", "OG-Wand"), ("EG", "OG")), (("EG-Wand", "WALL_0", "OG-Wand"), ("EG", "OG")),
     ],
 )  # fmt: skip
@@ -267,6 +254,9 @@ def test_walls_of_a_robots_map_with_a_jog_have_no_passage():
     door = [[80, 0, 2, 10], [79, 10, 2, 30], [79, 58, 2, 22]]
     (opening,) = import_plan(_robot_map(first, second, walls=door)).document["openings"]
     assert math.dist(*opening["line"]) == pytest.approx(0.9, abs=0.11)
+    plan = import_plan(_robot_map(first, second, walls=[]).replace(b'"wall"', b'"floor"'))
+    assert "openings" not in plan.document
+    assert "the map has no walls" in plan.report.warnings[0]
 
 
 @pytest.mark.parametrize("run", [[0, 0, 0], [0, 0, -5], [0, 0, 1.5], [0, 0]])
@@ -288,6 +278,34 @@ def test_fixtures_belong_to_the_storey_of_their_layer():
     ground, upper = import_plans(dxf_file(document))
     assert [room.get("type") for room in ground.document["rooms"]] == ["kitchen"]
     assert [room.get("type") for room in upper.document["rooms"]] == [None]
+
+
+def test_dashed_walls_are_left_out_and_each_part_of_a_wall_has_its_width():
+    document: Any = new_dxf("R2010", units=21, setup=True)
+    space, foot = document.modelspace(), 3937 / 1200
+    wide = [
+        (x * foot, y * foot, w * foot, w * foot) for x, y, w in [(5, 0, 0.4), (9, 0, 0.4), (9, 6, 0.2), (0, 6, 0.2)]
+    ]
+    ends = [(0.0, 0.0, 0.4 * foot, 0.4 * foot), (5 * foot, 0.0, 0.0, 0.0)]
+    space.add_lwpolyline([*wide, *ends], format="xyse", dxfattribs={"layer": "WALL"})
+    space.add_line((0, 3 * foot), (9 * foot, 3 * foot), dxfattribs={"layer": "WALL", "linetype": "DASHED"})
+    insert = {"insert": (-0.1, 6.0 * foot), "char_height": 0.5, "attachment_point": 1}
+    space.add_mtext("Kitchen", dxfattribs=insert)
+    plan = import_plan(dxf_file(document))
+    assert _areas(plan) == [round(8.7 * 5.7, 1)]
+    assert [room["name"] for room in plan.document["rooms"]] == ["Kitchen"]
+    assert any("a dashed line on layer 'WALL' is to be demolished" in line for line in plan.report.warnings)
+
+
+def test_leaves_of_doors_contradict_a_unit():
+    assert "it looks like millimetres (with units=mm it is 0.90 m)" in check_leaves([22.86] * 3, 0.0254)[0]
+    assert "check the scale, or set multiply to about 0.48" in check_leaves([1.8, 1.7], 0.01)[0]
+    assert check_leaves([0.9, 0.1, 0.1], 1.0) == check_leaves([], 1.0) == []
+
+
+def test_guess_chooses_among_scales_that_are_written():
+    written = [(0.00706, "1:20"), (0.0353, "1:100")]
+    assert assume_scale(ScaleGuess(0.031, 0.09), ReportBuilder(), written) == written[1]
 
 
 def test_fitted_text_is_in_the_middle_of_its_points():

@@ -249,12 +249,16 @@ def test_parts_of_a_high_curtain_wall_belong_to_the_storey_at_their_height():
     assert [opening["name"] for opening in upper.document["openings"]] == ["above"]
 
 
-def test_crawl_spaces_are_left_out_and_named():
+def test_crawl_spaces_areas_and_spaces_drawn_twice_are_left_out_and_named():
     model = ifc_flat()
-    model.spaces(model.prism("IfcSpace", _box(0, 3100, 4000, 5000), 0, 800, LongName="Kriechkeller"))
+    model.spaces(model.prism("IfcSpace", _box(0, 3000, 4000, 5000), 0, 800, LongName="Kriechkeller"))
+    for ring in (_box(-200, -200, 9000, 3300), _box(-50, -50, 4050, 3050)):
+        model.spaces(model.prism("IfcSpace", ring, 0, 2600, LongName="Area"))
     plan = import_plan(model.content())
     assert [room["name"] for room in plan.document["rooms"]] == ["Küche", "Wohnen"]
-    assert any("room 'Kriechkeller' (7.6 m²" in line and "0.80 m high" in line for line in plan.report.warnings)
+    assert plan.document["openings"] == import_plan(ifc_flat().content()).document["openings"]
+    assert sum("was left out as an area" in line for line in plan.report.warnings) == 2
+    assert any("room 'Kriechkeller' (8.0 m²" in line and "0.80 m high" in line for line in plan.report.warnings)
 
 
 def test_building_of_low_spaces_alone_is_refused():
