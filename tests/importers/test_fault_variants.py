@@ -289,8 +289,7 @@ def test_dashed_walls_are_left_out_and_each_part_of_a_wall_has_its_width():
     ends = [(0.0, 0.0, 0.4 * foot, 0.4 * foot), (5 * foot, 0.0, 0.0, 0.0)]
     space.add_lwpolyline([*wide, *ends], format="xyse", dxfattribs={"layer": "WALL"})
     space.add_line((0, 3 * foot), (9 * foot, 3 * foot), dxfattribs={"layer": "WALL", "linetype": "DASHED"})
-    insert = {"insert": (-0.1, 6.0 * foot), "char_height": 0.5, "attachment_point": 1}
-    space.add_mtext("Kitchen", dxfattribs=insert)
+    space.add_mtext("Kitchen", dxfattribs={"insert": (-0.1, 6.0 * foot), "char_height": 0.5, "attachment_point": 1})
     plan = import_plan(dxf_file(document))
     assert _areas(plan) == [round(8.7 * 5.7, 1)]
     assert [room["name"] for room in plan.document["rooms"]] == ["Kitchen"]
