@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -70,9 +71,6 @@ def _run(command: list[str], folder: str, budget: Budget) -> str:
     left_s = limits.max_import_s - (budget.clock() - budget.started_s)
     environment = {"PATH": os.environ.get("PATH", os.defpath), "HOME": folder, "QT_QPA_PLATFORM": "offscreen"}
 
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limits.max_unpacked_bytes, limits.max_unpacked_bytes))
-
     with tempfile.TemporaryFile() as output:
         process = subprocess.Popen(
             command,
@@ -82,7 +80,7 @@ def _run(command: list[str], folder: str, budget: Budget) -> str:
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            preexec_fn=limit,
+            preexec_fn=partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limits.max_unpacked_bytes,) * 2),
         )
         try:
             process.wait(max(left_s, 0.1))

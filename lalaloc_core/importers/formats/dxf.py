@@ -33,9 +33,10 @@ from ezdxf.entities.polyline import Polyface, Polyline, Polymesh
 from ezdxf.entities.text import Text
 from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
+from ezdxf.lldxf.tagger import binary_tags_loader
+from ezdxf.lldxf.tagwriter import TagWriter
 from ezdxf.math import Vec3
 from jaxtyping import Float
-from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
@@ -152,26 +153,16 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 def _open(content: bytes) -> DxfDocument:
     try:
         if content.startswith(b"AutoCAD Binary DXF"):
-            from ezdxf.lldxf.tagger import binary_tags_loader
-
-            return _from_tags(binary_tags_loader(content))
+            text = io.StringIO()
+            writer = TagWriter(text, dxfversion="AC1032")
+            for tag in binary_tags_loader(content):
+                writer.write_tag(tag)
+            content = text.getvalue().encode()
         document, _ = recover.read(io.BytesIO(content))
-    except (DXFError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
-            UnicodeError) as error:  # fmt: skip
+    except (DXFError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InvalidFloorPlanError(
             "the DXF is damaged and cannot be read; save it again, as DXF R2010 or later"
         ) from error
-    return document
-
-
-def _from_tags(tags: Iterable[Any]) -> DxfDocument:
-    from ezdxf.lldxf.tagwriter import TagWriter
-
-    text = io.StringIO()
-    writer = TagWriter(text, dxfversion="AC1032")
-    for tag in tags:
-        writer.write_tag(tag)
-    document, _ = recover.read(io.BytesIO(text.getvalue().encode()))
     return document
 
 
@@ -230,8 +221,8 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     for entity, context in _walk(document.modelspace(), None, 0, budget):
         if context.layer.casefold() in hidden:
             builder.use(context.layer, "ignored (layer is off)")
-        elif context.fixture is not None and options.includes_layer(context.layer):
-            _add_fixture(entity, context, drawing, builder, sag, budget)
+        elif isinstance(entity, Insert) and context.fixture is not None and options.includes_layer(context.layer):
+            _add_block(entity, context, drawing, builder, sag, budget)
         elif context.role in ("ignored", "demolished") or not options.includes_layer(context.layer):
             builder.leave_out(context.layer, context.role)
         elif (kind := entity.dxftype()) in _READ:
@@ -314,13 +305,10 @@ def _walk(
             role = block_role if block_role in _OF_BLOCKS else role
             for attribute in entity.attribs:
                 yield attribute, _Context(layer, "text")
+            context = _Context(layer, role, fixture_from_name(entity.dxf.name) if role in (None, "ignored") else None)
             for copy in entity.multi_insert() if entity.mcount > 1 else (entity,):
                 budget.check_time()
-                context = _Context(layer, role)
-                fixture = fixture_from_name(entity.dxf.name) if role in (None, "ignored") else None
-                if fixture is not None:
-                    yield copy, _Context(layer, role, fixture)
-                elif role in ("window", "passage", "obstacle"):
+                if context.fixture is not None or role in ("window", "passage", "obstacle"):
                     yield copy, context
                 else:
                     yield from _walk(copy.virtual_entities(), context, depth + 1, budget)
@@ -391,39 +379,26 @@ def _anchor(entity: DXFGraphic) -> tuple[float, float] | None:
 def _add_block(
     entity: Insert, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float, budget: Budget
 ) -> None:
-    """Add a window, passage or obstacle drawn as a block: the smallest rectangle around its entities."""
-    box = _box(entity, context, sag, budget)
-    if box is None:
-        return
-    builder.use(context.layer, f"blocks: {context.role}")
-    if isinstance(box, shapely.Polygon):
-        drawing.areas.append(Area(box, context.layer, context.role))
-    elif isinstance(box, shapely.LineString):
-        drawing.strokes.append(Stroke(box, context.layer, context.role))
-
-
-def _add_fixture(
-    entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float, budget: Budget
-) -> None:
-    assert isinstance(entity, Insert)
-    assert context.fixture is not None
+    """Add a window, passage, obstacle or fixture drawn as a block: the smallest rectangle around its entities."""
+    layer, role, fixture = context.layer, context.role, context.fixture
     # Lines of furniture count whatever the role of their layer.
-    box = _box(entity, _Context(context.layer, "obstacle"), sag, budget)
-    if isinstance(box, shapely.Polygon):
-        builder.use(context.layer, f"fixtures: {context.fixture}")
-        drawing.fixtures.append(SketchedFixture(context.fixture, box, context.layer))
-    else:
-        builder.use(context.layer, "ignored (block without area)")
-
-
-def _box(entity: Insert, context: _Context, sag: float, budget: Budget) -> BaseGeometry | None:
-    """Return the smallest rectangle around the lines and areas of a block, None without any."""
+    inside = _Context(layer, role if fixture is None else "obstacle")
     inner = Drawing()
-    for part, _ in _walk(entity.virtual_entities(), context, 1, budget):
+    for part, _ in _walk(entity.virtual_entities(), inside, 1, budget):
         if part.dxftype() in _LINES | _FILLED:
-            _add(part, context, inner, ReportBuilder(), sag, budget)
-    shapes = [*inner.shapes, *(fixture.shape for fixture in inner.fixtures)]
-    return shapely.minimum_rotated_rectangle(shapely.GeometryCollection(shapes)) if shapes else None
+            _add(part, inside, inner, ReportBuilder(), sag, budget)
+    box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(inner.shapes))
+    if fixture is not None and isinstance(box, shapely.Polygon) and not box.is_empty:
+        drawing.fixtures.append(SketchedFixture(fixture, box, layer))
+        builder.use(layer, f"fixtures: {fixture}")
+    elif fixture is not None:
+        builder.use(layer, "ignored (block without area)")
+    elif not box.is_empty:
+        if isinstance(box, shapely.Polygon):
+            drawing.areas.append(Area(box, layer, role))
+        elif isinstance(box, shapely.LineString):
+            drawing.strokes.append(Stroke(box, layer, role))
+        builder.use(layer, f"blocks: {role}")
 
 
 def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
@@ -434,8 +409,8 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
     role, widths = context.role, _widths(entity)
     width = float(np.mean(widths))
     if len(widths) > 1 and len(points) == len(widths) + 1:
-        for line, pen in zip(pairwise(points), widths, strict=True):
-            drawing.strokes.append(Stroke(shapely.LineString(line), context.layer, role, pen))
+        parts = zip(pairwise(points), widths, strict=True)
+        drawing.strokes += [Stroke(shapely.LineString(part), context.layer, role, pen) for part, pen in parts]
         builder.use(context.layer, f"lines: {role or 'possible walls'}")
         return
     if entity.dxftype() == "ARC" and role in (None, "door"):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -23,6 +23,8 @@ from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, Ske
 from lalaloc_core.importers.common.vocabulary import role_from_name
 from lalaloc_core.importers.formats.ifc_file import FURNISHINGS, find_anchor, fixture_kind, open_model
 
+# Vertices (m, model frame) and triangles.
+_Mesh = tuple[Float[np.ndarray, "n 3"], Any]
 # Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
@@ -92,20 +94,17 @@ def _storeys(model: Any, meshes: _Meshes) -> Mapping[str, tuple[Level, tuple[str
     A space belongs to the storey that it is a part of, else to the one that contains it, else to the one at its height.
     """
     unit = _unit(model)
-    entities = _storey_entities(model)
-    places = sorted((_elevation_m(entity, unit), True, str(entity.id())) for entity in entities)
+    places = _places(model)
     spaces: dict[str, list[Any]] = {}
     for space in model.by_type("IfcSpace"):
-        storey = _whole(space) or _storey_around(space, model)
-        key = _storey_at(meshes.of(space), places) if storey is None else str(storey.id())
+        storey = _whole(space) or _storey_around(space, model.get_inverse(space))
+        key = _storey_at(meshes.of(space), places, places) if storey is None else str(storey.id())
         if key is not None:
             spaces.setdefault(key, []).append(space)
-    heights = sorted(
-        (_stated_elevation_m(entity, unit), entity.id()) for entity in entities if str(entity.id()) in spaces
-    )
+    heights = sorted((_stated_elevation_m(model.by_id(int(key)), unit), int(key)) for key in spaces)
     buildings: defaultdict[Any, list[tuple[float, Any]]] = defaultdict(list)
-    for height, key in heights:
-        storey = model.by_id(key)
+    for height, number in heights:
+        storey = model.by_id(number)
         buildings[_whole(storey, "IfcBuilding")].append((height, storey))
     found = {}
     for building, storeys in buildings.items():
@@ -119,9 +118,12 @@ def _storeys(model: Any, meshes: _Meshes) -> Mapping[str, tuple[Level, tuple[str
     return found
 
 
-def _storey_entities(model: Any) -> list[Any]:
-    """Return the storeys of a model; a building without storeys counts as one."""
-    return list(model.by_type("IfcBuildingStorey") or model.by_type("IfcBuilding")[:1])
+def _places(model: Any) -> dict[str, float]:
+    """Return the heights (m) of storeys by id, lowest first; a building without storeys counts as one."""
+    unit = _unit(model)
+    storeys = model.by_type("IfcBuildingStorey") or model.by_type("IfcBuilding")[:1]
+    places = ((_elevation_m(storey, unit), str(storey.id())) for storey in storeys)
+    return {key: height for height, key in sorted(places)}
 
 
 def _whole(element: Any, kind: str = "IfcBuildingStorey") -> Any:
@@ -136,12 +138,14 @@ def _whole(element: Any, kind: str = "IfcBuildingStorey") -> Any:
     return None
 
 
-def _storey_around(space: Any, model: Any) -> Any:
-    """Return the storey that contains a space, as an element or by reference; None if none does."""
-    for relation in model.get_inverse(space):
+def _storey_around(element: Any, relations: Iterable[Any]) -> Any:
+    """Return the storey that contains an element by one of its relations, also in a space; None if none does."""
+    for relation in relations:
         place = getattr(relation, "RelatingStructure", None)
-        if place is not None and not place.is_a("IfcSpace"):
-            return place if place.is_a("IfcBuildingStorey") else _whole(place)
+        if place is not None and place != element:
+            storey = place if place.is_a("IfcBuildingStorey") else _whole(place)
+            if storey is not None:
+                return storey
     return None
 
 
@@ -186,11 +190,7 @@ def _elements(
     An element belongs to the storey that contains it or its space. Parts of curtain walls, elements that only fill an
     opening, and elements of storeys without spaces belong to the storey at their height.
     """
-    unit = _unit(model)
-    heights = sorted(
-        (_elevation_m(storey, unit), str(storey.id()) in storeys, str(storey.id()))
-        for storey in _storey_entities(model)
-    )
+    places = _places(model)
     found: dict[str, list[Any]] = {key: [] for key in storeys}
     placed = sum(len(spaces) for _, (_, spaces) in storeys.values())
     lost = Counter({"IfcSpace": len(model.by_type("IfcSpace")) - placed})
@@ -198,9 +198,10 @@ def _elements(
         for element in model.by_type(name):
             if name in FURNISHINGS and (fixture_kind(element) is None or not meshes.has_time_for_fixtures):
                 continue
-            key = _container(element)
+            storey = _storey_around(element, getattr(element, "ContainedInStructure", None) or ())
+            key = None if storey is None else str(storey.id())
             if key not in storeys:
-                key = _storey_at(_shape(element, meshes), heights)
+                key = _storey_at(_shape(element, meshes), places, storeys)
             if key is None:
                 lost[name] += 1
             else:
@@ -208,27 +209,15 @@ def _elements(
     return found, lost
 
 
-def _container(element: Any) -> str | None:
-    """Return the id of the storey that contains an element, also in a space; None if nothing contains it."""
-    for relation in getattr(element, "ContainedInStructure", None) or ():
-        place = relation.RelatingStructure
-        storey = place if place.is_a("IfcBuildingStorey") else _whole(place)
-        if storey is not None:
-            return str(storey.id())
-    return None
-
-
-def _storey_at(mesh: tuple[Float[np.ndarray, "n 3"], Any] | None, heights: list[tuple[float, bool, str]]) -> str | None:
+def _storey_at(mesh: _Mesh | None, places: Mapping[str, float], with_spaces: Container[str]) -> str | None:
     """Return the id of the storey that a shape stands in; None without a shape, or if that storey has no spaces."""
     if mesh is None:
         return None
     middle_m = float(np.mean([mesh[0][:, 2].min(), mesh[0][:, 2].max()]))
-    below = [(height, has_spaces, key) for height, has_spaces, key in heights if height <= middle_m]
-    with_spaces = [(height, key) for height, has_spaces, key in below if has_spaces]
+    below = [key for key, height in places.items() if height <= middle_m]
+    found = next((key for key in reversed(below) if key in with_spaces), None)
     # Files can have a storey for rooms and one for structure, with slightly different heights.
-    if not with_spaces or below[-1][0] - with_spaces[-1][0] > _SAME_STOREY_M:
-        return None
-    return with_spaces[-1][1]
+    return found if found is not None and places[below[-1]] - places[found] <= _SAME_STOREY_M else None
 
 
 def _elevation_m(storey: Any, unit: float) -> float:
@@ -301,7 +290,7 @@ def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
                     builder.use("IfcSpace", "passages between touching spaces")
 
 
-def _shape(element: Any, meshes: _Meshes) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
+def _shape(element: Any, meshes: _Meshes) -> _Mesh | None:
     """Return the mesh of the void that an element fills; without a void, its own."""
     voids = [relation.RelatingOpeningElement for relation in getattr(element, "FillsVoids", None) or ()]
     return next((found for void in voids if (found := meshes.of(void)) is not None), None) or meshes.of(element)
@@ -335,7 +324,7 @@ class _Meshes:
         """True while there is time to spare."""
         return self._budget.elapsed_s < _FIXTURES_SHARE * self._budget.limits.max_import_s
 
-    def of(self, element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
+    def of(self, element: Any) -> _Mesh | None:
         """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape."""
         import ifcopenshell.geom
 

@@ -191,14 +191,9 @@ def _levels(cells: list[_Cell]) -> Mapping[str, tuple[Level, list[_Cell]]]:
 
 def _rings(element: Element, member: str, budget: Budget) -> Iterator[Float[np.ndarray, "n 3"]]:
     """Yield the positions of every outer ring or line in a member of an element, with z 0 where there is none."""
-    for child in element:
-        if local_name(child) != member:
-            continue
-        for part in child.iter():
-            if _is_line(part):
-                points = _positions(part, budget)
-                if len(points) >= 2:
-                    yield points
+    for part in (part for child in element if local_name(child) == member for part in child.iter()):
+        if _is_line(part) and len(points := _positions(part, budget)) >= 2:
+            yield points
 
 
 def _is_line(element: Element) -> bool:
@@ -237,17 +232,14 @@ def _dimension(part: Element, values: list[float]) -> int:
     return 3 if len(values) % 3 == 0 else 2
 
 
-def _key(element: Element) -> str | None:
-    return next((value for name, value in element.attrib.items() if name.rpartition("}")[2] == "id"), None)
+def _key(element: Element, attribute: str = "id") -> str | None:
+    """Return an attribute of any namespace; None without it."""
+    return next((value for name, value in element.attrib.items() if name.rpartition("}")[2] == attribute), None)
 
 
 def _reference(element: Element, member: str) -> str | None:
-    for child in element:
-        if local_name(child) == member:
-            for name, value in child.attrib.items():
-                if name.rpartition("}")[2] == "href":
-                    return value.removeprefix("#")
-    return None
+    links = (_key(child, "href") for child in element if local_name(child) == member)
+    return next((link.removeprefix("#") for link in links if link is not None), None)
 
 
 def _text(element: Element, member: str) -> str | None:

@@ -154,12 +154,13 @@ def _as_picture(
             f"the page is {width * factor:.0f} m by {height * factor:.0f} m, {width * height * scale**2:.0f} pixels; "
             f"the limit is {budget.limits.max_plan_pixels} (max_plan_pixels); check the scale"
         )
-    gray = _cropped(_gray(found.page.render(scale=scale, grayscale=True)), found.crop, scale)  # type: ignore[arg-type]
+    gray = _gray(found.page.render(scale=scale, grayscale=True), found.crop, scale)  # type: ignore[arg-type]
     return sketch_picture(gray, factor / scale, builder, budget, has_symbols=has_symbols, letterings=letterings)
 
 
-def _cropped(gray: UInt8[np.ndarray, "h w"], crop: Box | None, scale: float) -> UInt8[np.ndarray, "h w"]:
-    """Return a rendered page that is blank outside a box in points, y up."""
+def _gray(bitmap: pypdfium2.PdfBitmap, crop: Box | None, scale: float) -> UInt8[np.ndarray, "h w"]:
+    """Return the pixels of a rendered page, blank outside a box in points, y up."""
+    gray = np.asarray(bitmap.to_numpy()).reshape(bitmap.height, bitmap.width, -1)[:, :, 0]
     if crop is None:
         return gray
     x0, y0, x1, y1 = (number * scale for number in crop)
@@ -176,7 +177,7 @@ def _read_scan(found: PageContent, builder: ReportBuilder, budget: Budget) -> Pi
     scale = min(READ_PX / max(width, height, 1.0), _COARSEST_PT)
     bitmap = found.page.render(scale=scale, grayscale=True)  # type: ignore[arg-type]
     # Lines of a drawing are not turned, so its texts must not be.
-    gray = _cropped(_gray(bitmap), found.crop, scale)
+    gray = _gray(bitmap, found.crop, scale)
     scan = read_texts(gray, builder, budget, straighten=is_scan).scaled(1.0 / scale)
     if is_scan:
         return scan
@@ -200,7 +201,3 @@ def _remove_letters(found: PageContent) -> None:
     drawing = found.drawing
     drawing.areas = [area for area in drawing.areas if not len(tree.query(area.shape, predicate="within"))]
     drawing.strokes = [stroke for stroke in drawing.strokes if not len(tree.query(stroke.line, predicate="within"))]
-
-
-def _gray(bitmap: pypdfium2.PdfBitmap) -> UInt8[np.ndarray, "h w"]:
-    return np.asarray(bitmap.to_numpy()).reshape(bitmap.height, bitmap.width, -1)[:, :, 0]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +27,7 @@ from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
-from lalaloc_core.importers.picture.lettering import PictureTexts, read_texts
+from lalaloc_core.importers.picture.lettering import read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 _MIN_SIDE_PX = 64
@@ -42,32 +44,12 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     """Read the plan in a picture, as a draft."""
     builder = ReportBuilder("picture", is_draft=True)
     gray, warmth, paper_m_per_pixel = _open(content, builder, budget)
-    tones = Tones.of(gray)
-    if tones is not None and tones.is_photograph:
-        if not options.plan:
-            raise InvalidFloorPlanError(
-                "the picture looks like a photograph, not like a floor plan: send it to be localised; if it is a plan, "
-                "set plan=true (--is-plan on the command line)"
-            )
-        builder.notes.append("the picture looks like a photograph and was read as a plan, because plan=true is set")
+    _check_kind(gray, options, builder)
     if options.crop is not None:
         gray = blank_outside(gray, options.crop)
         warmth = None if warmth is None else blank_outside(warmth, options.crop)
     texts = read_texts(gray, builder, budget)
     budget.hints += text_hints(texts.drawing.letterings, "the picture")
-    return _read_plan(gray, warmth, texts, paper_m_per_pixel, options, builder, budget)
-
-
-def _read_plan(
-    gray: UInt8[np.ndarray, "h w"],
-    warmth: UInt8[np.ndarray, "h w"] | None,
-    texts: PictureTexts,
-    paper_m_per_pixel: float | None,
-    options: ImportOptions,
-    builder: ReportBuilder,
-    budget: Budget,
-) -> tuple[ImportedPlan, ...]:
-    """Read the plan, after its texts."""
     # Dimensions are preferred to "1:100": scans keep their resolution when they are made smaller.
     dimensions = written_dimensions(texts.drawing, budget.check_time)
     measured = scale_by_dimensions(dimensions, texts.drawing.extent) if texts.drawing.shapes else None
@@ -117,56 +99,72 @@ def _read_plan(
     return assemble_storeys(sketch, letterings, builder, options, budget, in_file)
 
 
+def _check_kind(gray: UInt8[np.ndarray, "h w"], options: ImportOptions, builder: ReportBuilder) -> None:
+    """Refuse photographs, unless the options say that the picture is a plan."""
+    tones = Tones.of(gray)
+    if tones is None or not tones.is_photograph:
+        return
+    if not options.plan:
+        raise InvalidFloorPlanError(
+            "the picture looks like a photograph, not like a floor plan: send it to be localised; if it is a plan, "
+            "set plan=true (--is-plan on the command line)"
+        )
+    builder.notes.append("the picture looks like a photograph and was read as a plan, because plan=true is set")
+
+
 def _open(
     content: bytes, builder: ReportBuilder, budget: Budget
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, float | None]:
     """Return the grey picture on white, its warmth, and the length of a pixel on paper if the file gives it."""
+    with open_picture(content, ("PNG", "JPEG"), "the picture", "save it again as PNG", budget) as picture:
+        if min(picture.size) < _MIN_SIDE_PX:
+            raise InvalidFloorPlanError(
+                f"the picture has {picture.width} x {picture.height} pixels; the minimum is {_MIN_SIDE_PX} x "
+                f"{_MIN_SIDE_PX}; use a larger picture"
+            )
+        dpi = picture.info.get("dpi")
+        # A PNG can have a text of this name, in which Pillow would look for an orientation.
+        if isinstance(picture.info.get("xmp"), str):
+            del picture.info["xmp"]
+        upright = in_bytes(ImageOps.exif_transpose(picture))
+        drawn = upright.convert("RGBA")
+        flat = Image.new("RGBA", upright.size, "black" if _is_light(drawn) else "white")
+        flat.alpha_composite(drawn)
+        gray = np.asarray(flat.convert("L"))
+        warmth = None if upright.mode in ("1", "L", "LA", "I", "I;16", "F") else _warmth(flat)
+        if (with_dark_walls := darken_pale_walls(np.asarray(flat.convert("RGB")))) is not None:
+            gray, warmth = with_dark_walls, None
+            builder.notes.append("walls are the areas of one colour between the floors, which are darker")
+        elif _has_dark_ground(gray):
+            # Red and blue lines are nearly as dark as the ground.
+            colours = np.asarray(flat.convert("RGB"))
+            ground = np.median(colours[::8, ::8].reshape(-1, 3), axis=0).astype(np.uint8)
+            apart = np.maximum(colours, ground) - np.minimum(colours, ground)
+            gray, warmth = 255 - apart.max(axis=2), None
+            builder.notes.append("the picture shows light lines on a dark ground and was inverted")
+    return gray, warmth, _paper(dpi)
+
+
+@contextmanager
+def open_picture(
+    content: bytes, formats: Sequence[str], name: str, remedy: str, budget: Budget
+) -> Iterator[Image.Image]:
+    """Open a picture within the limit of pixels; errors in the block are those of a damaged file."""
     limit = budget.limits.max_plan_pixels
+    many = f"the limit is {limit} in total (max_plan_pixels); reduce its resolution, or crop it"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as picture:
-                width, height = picture.size
-                if width * height > limit:
-                    raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels; the limit is {limit} in total (max_plan_pixels); "
-                        "reduce its resolution"
-                    )
-                if min(width, height) < _MIN_SIDE_PX:
-                    raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels; the minimum is {_MIN_SIDE_PX} x {_MIN_SIDE_PX}; "
-                        "use a larger picture"
-                    )
-                dpi = picture.info.get("dpi")
-                # A PNG can have a text of this name, in which Pillow would look for an orientation.
-                if isinstance(picture.info.get("xmp"), str):
-                    del picture.info["xmp"]
-                upright = in_bytes(ImageOps.exif_transpose(picture))
-                drawn = upright.convert("RGBA")
-                flat = Image.new("RGBA", upright.size, "black" if _is_light(drawn) else "white")
-                flat.alpha_composite(drawn)
-                gray = np.asarray(flat.convert("L"))
-                grey_modes = ("1", "L", "LA", "I", "I;16", "F")
-                warmth = None if upright.mode in grey_modes else _warmth(flat)
-                if (with_dark_walls := darken_pale_walls(np.asarray(flat.convert("RGB")))) is not None:
-                    gray, warmth = with_dark_walls, None
-                    builder.notes.append("walls are the areas of one colour between the floors, which are darker")
-                elif _has_dark_ground(gray):
-                    # Red and blue lines are nearly as dark as the ground.
-                    colours = np.asarray(flat.convert("RGB"))
-                    ground = np.median(colours[::8, ::8].reshape(-1, 3), axis=0).astype(np.uint8)
-                    apart = np.maximum(colours, ground) - np.minimum(colours, ground)
-                    gray, warmth = 255 - apart.max(axis=2), None
-                    builder.notes.append("the picture shows light lines on a dark ground and was inverted")
+            with Image.open(io.BytesIO(content), formats=formats) as picture:
+                if picture.width * picture.height > limit:
+                    raise InvalidFloorPlanError(f"{name} has {picture.width} x {picture.height} pixels; {many}")
+                yield picture
     except InvalidFloorPlanError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise InvalidFloorPlanError(
-            f"the picture has too many pixels; the limit is {limit} in total (max_plan_pixels); reduce its resolution"
-        ) from error
+        raise InvalidFloorPlanError(f"{name} has too many pixels and cannot be read; {many}") from error
     except (OSError, ValueError, SyntaxError, EOFError, TypeError, ZeroDivisionError) as error:
-        raise InvalidFloorPlanError("the picture is damaged and cannot be read; save it again as PNG") from error
-    return gray, warmth, _paper(dpi)
+        raise InvalidFloorPlanError(f"{name} is damaged and cannot be read; {remedy}") from error
 
 
 def in_bytes(picture: Image.Image) -> Image.Image:

@@ -5,9 +5,7 @@ The plan frame is the map frame. https://wiki.ros.org/map_server
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,29 +189,13 @@ def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> Oc
 def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
     from PIL import Image
 
-    from lalaloc_core.importers.formats.picture import in_bytes
+    from lalaloc_core.importers.formats.picture import in_bytes, open_picture
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=("PPM", "PNG")) as picture:
-                pixels, limit = picture.width * picture.height, budget.limits.max_plan_pixels
-                if pixels > limit:
-                    raise InvalidFloorPlanError(
-                        f"the map has {picture.width} x {picture.height} cells; the limit is {limit} in total "
-                        "(max_plan_pixels); crop it"
-                    )
-                # Transparent cells are unknown.
-                flat = Image.new("RGBA", picture.size, (_UNKNOWN, _UNKNOWN, _UNKNOWN, 255))
-                flat.alpha_composite(in_bytes(picture).convert("RGBA"))
-                return np.asarray(flat.convert("L"))
-    except InvalidFloorPlanError:
-        raise
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError,
-            Image.DecompressionBombWarning) as error:  # fmt: skip
-        raise InvalidFloorPlanError(
-            "the picture of the ROS map is damaged and cannot be read; save it again"
-        ) from error
+    with open_picture(content, ("PPM", "PNG"), "the picture of the ROS map", "save it again", budget) as picture:
+        # Transparent cells are unknown.
+        flat = Image.new("RGBA", picture.size, (_UNKNOWN, _UNKNOWN, _UNKNOWN, 255))
+        flat.alpha_composite(in_bytes(picture).convert("RGBA"))
+        return np.asarray(flat.convert("L"))
 
 
 def _frame_of(rooms: list[shapely.Polygon]) -> MapFrame:

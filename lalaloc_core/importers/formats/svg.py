@@ -121,8 +121,16 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         title = next((child.text for child in element if local_name(child) == "title"), None)
         if element is not root and title and title.strip():
             element.attrib.setdefault("data-name", title.strip())
-    warnings = [_picture_text(pictures)] * (pictures > 0) + [_html_text(texts)] * (texts > 0)
-    budget.hints += warnings[: pictures > 0]
+    warnings = []
+    if pictures:
+        subject = "an embedded picture" if pictures == 1 else f"{pictures} embedded pictures"
+        warnings = [f"the SVG has {subject}, not read: if the plan is a picture, send that PNG or JPEG itself"]
+        budget.hints += warnings
+    if texts:
+        warnings.append(
+            f"{texts} texts are HTML (foreignObject) and are not read, such as names of rooms: export them as plain "
+            "text"
+        )
     styles = "".join(element.text or "" for element in root.iter() if local_name(element) == "style")
     if found := _COMBINED.search(re.sub(r"\{[^}]*\}", ",", styles)):
         warnings.append(
@@ -147,15 +155,6 @@ def _join_parts(text: Element) -> None:
             line.text = f"{line.text or ''}{words}"
             text.remove(part)
         line.text = f"{line.text}{part.tail or ''}"
-
-
-def _picture_text(pictures: int) -> str:
-    subject = "an embedded picture" if pictures == 1 else f"{pictures} embedded pictures"
-    return f"the SVG has {subject}, not read: if the plan is a picture, send that PNG or JPEG itself"
-
-
-def _html_text(texts: int) -> str:
-    return f"{texts} texts are HTML (foreignObject) and are not read, such as names of rooms: export them as plain text"
 
 
 def _read_plan(root: Element, warnings: list[str], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -283,7 +282,7 @@ def _add_fixture(fixture: Any, context: _Context, drawing: Drawing, builder: Rep
     for part in parts:
         budget.spend()
         if isinstance(part, svgelements.Shape) and not _is_hidden(part):
-            points += [outline for outline, _, _ in _outlines(_path(part), budget) if len(outline)]
+            points += [outline for outline, _, _ in _outlines(part, budget) if len(outline)]
     box = shapely.minimum_rotated_rectangle(shapely.MultiPoint(np.concatenate(points))) if points else None
     if context.kind is not None and isinstance(box, shapely.Polygon):
         builder.use(context.layer, f"fixtures: {context.kind}")
@@ -311,7 +310,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
     is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
-    for points, closed, curves in _outlines(_path(element), budget):
+    for points, closed, curves in _outlines(element, budget):
         swings = [fit_swing(curve, context.layer) for curve in curves] if context.role in (None, "door") else []
         leaves = [swing for swing in swings if swing is not None] if len(swings) <= 2 else []
         if leaves:
@@ -334,17 +333,13 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
 
 
-def _path(shape: svgelements.Shape) -> svgelements.Path:
-    """Return a shape as a path; rectangles and ellipses still have the transform that turns them."""
-    return abs(svgelements.Path(shape))
-
-
-def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
+def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
     """Yield the points of every subpath, whether it is closed, and its curves (runs of curved segments).
 
     A subpath whose coordinates are out of range has no points.
     """
-    for subpath in path.as_subpaths():
+    # Rectangles and ellipses still have the transform that turns them.
+    for subpath in abs(svgelements.Path(shape)).as_subpaths():
         segments = [s for s in svgelements.Path(subpath) if not isinstance(s, svgelements.Move)]
         closed = any(isinstance(segment, svgelements.Close) for segment in segments)
         points: list[complex] = []
