@@ -16,7 +16,7 @@ from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError, Missin
 from lalaloc_core.file_kinds import STAND_INS, describe_file
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.json_values import read_json
+from lalaloc_core.floorplan.json_values import json_kind, read_json
 from lalaloc_core.importers.common.assemble import ImportedPlan, clean_name
 from lalaloc_core.importers.common.bounded_files import member_names, read_archive
 from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits, OnStep
@@ -188,7 +188,8 @@ def import_plans(
     except InvalidInputError:
         raise
     except Exception as error:
-        if _lacks_memory(error):
+        # Errors of C++ have no class.
+        if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
             raise InvalidFloorPlanError(
                 "the file needs more memory than is available (LALALOC_IMPORT_MEMORY_BYTES in the service); export a "
                 "single storey, or a smaller picture"
@@ -338,34 +339,27 @@ def _open(content: bytes, limits: ImportLimits) -> tuple[Format, Any]:
     return (FORMATS["ifc"], files[models[0]]) if len(models) == 1 else (format, files)
 
 
-def _lacks_memory(error: Exception) -> bool:
-    """Return whether an error of Python or of a library says that there is no memory; those of C++ have no class."""
-    return isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY)
-
-
 def _json_format(document: Any) -> Format:
-    if isinstance(document, dict):
-        known = (format for format in FORMATS.values() if format.keys and format.keys <= document.keys())
-        format = next(known, None)
-        if format is not None:
-            return format
-        kind = str(document.get("type"))
-        other = "CityJSON" if kind.startswith("CityJSON") else next((key for key in _OTHER_JSON if key in document), "")
-        if ("rooms" in document or PLANS in document) and not other:
-            return FORMATS["native"]
-        if document.get("type") in _GEOJSON_TYPES:
-            return FORMATS["geojson"]
-        if other:
-            raise InvalidFloorPlanError(f"the file is {_OTHER_JSON[other]}")
-        members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
+    if not isinstance(document, dict):
         raise InvalidFloorPlanError(
-            f"the JSON has the members {members}, of no known format; the native format has 'rooms' or 'plans', "
-            "GeoJSON 'type', OpenStreetMap 'elements', RoomPlan 'walls', 'doors' and 'windows', and Valetudo "
-            "'pixelSize' and 'layers'"
+            f"the JSON is {json_kind(document)}; it must be an object: a plan with 'rooms', or GeoJSON with 'type'"
         )
-    found = "a list" if isinstance(document, list) else "a single value"
+    for format in FORMATS.values():
+        if format.keys and format.keys <= document.keys():
+            return format
+    kind = str(document.get("type"))
+    other = next((key for key in _OTHER_JSON if key in document or kind.startswith(key)), "")
+    if ("rooms" in document or PLANS in document) and not other:
+        return FORMATS["native"]
+    if kind in _GEOJSON_TYPES:
+        return FORMATS["geojson"]
+    if other:
+        raise InvalidFloorPlanError(f"the file is {_OTHER_JSON[other]}")
+    members = ", ".join(f"'{key[:50]}'" for key in list(document)[:_MAX_MEMBERS]) or "none"
     raise InvalidFloorPlanError(
-        f"the JSON is {found}; it must be an object: a plan with 'rooms', or GeoJSON with 'type'"
+        f"the JSON has the members {members}, of no known format; the native format has 'rooms' or 'plans', "
+        "GeoJSON 'type', OpenStreetMap 'elements', RoomPlan 'walls', 'doors' and 'windows', and Valetudo "
+        "'pixelSize' and 'layers'"
     )
 
 

@@ -67,7 +67,7 @@ def _convert(content: bytes, budget: Budget) -> bytes:
 
 def _run(command: list[str], folder: str, budget: Budget) -> str:
     """Run a converter until it ends, and return what it complained about."""
-    limits = budget.limits
+    limits, most_bytes = budget.limits, budget.limits.max_unpacked_bytes
     left_s = limits.max_import_s - (budget.clock() - budget.started_s)
     environment = {"PATH": os.environ.get("PATH", os.defpath), "HOME": folder, "QT_QPA_PLATFORM": "offscreen"}
 
@@ -80,7 +80,7 @@ def _run(command: list[str], folder: str, budget: Budget) -> str:
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
-            preexec_fn=partial(resource.setrlimit, resource.RLIMIT_FSIZE, (limits.max_unpacked_bytes,) * 2),
+            preexec_fn=partial(resource.setrlimit, resource.RLIMIT_FSIZE, (most_bytes, most_bytes)),
         )
         try:
             process.wait(max(left_s, 0.1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -147,7 +147,7 @@ def _open(
 
 @contextmanager
 def open_picture(
-    content: bytes, formats: Sequence[str], name: str, remedy: str, budget: Budget
+    content: bytes, formats: tuple[str, ...], name: str, remedy: str, budget: Budget
 ) -> Iterator[Image.Image]:
     """Open a picture within the limit of pixels; errors in the block are those of a damaged file."""
     limit = budget.limits.max_plan_pixels
