@@ -28,8 +28,8 @@ from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, Level, Point, Sk
 
 # Kinds of cells: of the core, and of the module for navigation. Doors can be cells as well.
 _CELLS = {"CellSpace", "NavigableSpace", "GeneralSpace", "TransferSpace", "TransitionSpace"}
-_DOOR_CELLS = {"ConnectionSpace", "AnchorSpace"}
-_BOUNDARIES = {"CellSpaceBoundary", "NavigableBoundary", "TransferBoundary", "ConnectionBoundary", "AnchorBoundary"}
+_DOOR_CELLS, _DOOR_BOUNDARIES = {"ConnectionSpace", "AnchorSpace"}, {"ConnectionBoundary", "AnchorBoundary"}
+_BOUNDARIES = {"CellSpaceBoundary", "NavigableBoundary", "TransferBoundary"} | _DOOR_BOUNDARIES
 # Floors farther apart are levels (m), and solids are higher than this.
 _STOREY_M, _FLAT_M = 1.5, 0.1
 _USUAL_DOOR_M = 0.9
@@ -121,11 +121,7 @@ def _cell(element: Element, factor: float, budget: Budget) -> _Cell | None:
 def _doors(elements: list[Element], factor: float, budget: Budget) -> Iterator[_Door]:
     """Yield the doors: duals of transitions, connection boundaries, cells of doors, and lines of other transitions."""
     boundaries = {_key(element): element for element in elements if local_name(element) in _BOUNDARIES}
-    drawn = {
-        _key(element)
-        for element in boundaries.values()
-        if local_name(element) in ("ConnectionBoundary", "AnchorBoundary")
-    }
+    drawn = {key for key, element in boundaries.items() if local_name(element) in _DOOR_BOUNDARIES}
     plain = []
     for element in elements:
         if local_name(element) != "Transition":

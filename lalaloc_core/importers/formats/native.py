@@ -117,12 +117,17 @@ def _convert(document: dict[str, Any], factor: float, y_factor: float) -> dict[s
     for key, shapes in _SHAPES.items():
         if isinstance(parts := plan.get(key), list):
             plan[key] = [_part(part, shapes, factor, y_factor) if isinstance(part, Mapping) else part for part in parts]
-    if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _MAX_NUMBER:
-        # A flip of y mirrors angles and turns +y by half a turn.
-        plan["north_deg"] = (180.0 - plan["north_deg"]) % 360.0
-    anchor = plan.get("anchor")
-    if isinstance(anchor, Mapping):
-        plan["anchor"] = _anchor(anchor, factor, y_factor)
+    holders = [plan]
+    if isinstance(plan.get("anchor"), Mapping):
+        anchor = plan["anchor"] = dict(plan["anchor"])
+        holders.append(anchor)
+        if isinstance(points := anchor.get("control_points"), list):
+            anchor["control_points"] = [_control_point(point, factor, y_factor) for point in points]
+    for holder in holders if y_factor < 0.0 else ():
+        north_deg = holder.get("north_deg")
+        if is_number(north_deg) and abs(north_deg) < _MAX_NUMBER:
+            # A flip of y mirrors angles and turns +y by half a turn.
+            holder["north_deg"] = (180.0 - north_deg) % 360.0
     return plan
 
 
@@ -132,21 +137,12 @@ def _part(part: Mapping[str, Any], shapes: tuple[str, ...], factor: float, y_fac
     return lengths | {key: _scale(part[key], factor, y_factor) for key in shapes if key in part}
 
 
-def _anchor(anchor: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
-    """Convert an anchor: control points are in units of the drawing, the altitude is always in metres."""
-    converted = dict(anchor)
-    north_deg, points = converted.get("north_deg"), converted.get("control_points")
-    if y_factor < 0.0 and is_number(north_deg) and abs(north_deg) < _MAX_NUMBER:
-        converted["north_deg"] = (180.0 - north_deg) % 360.0
-    if isinstance(points, list):
-        scales = {"x": factor, "y": y_factor}
-        converted["control_points"] = [
-            {key: _to_metres(value, scales.get(key, 1.0)) for key, value in point.items()}
-            if isinstance(point, Mapping)
-            else point
-            for point in points
-        ]
-    return converted
+def _control_point(point: Any, factor: float, y_factor: float) -> Any:
+    """Convert a control point of an anchor from units of the drawing; its altitude is always in metres."""
+    if not isinstance(point, Mapping):
+        return point
+    scales = {"x": factor, "y": y_factor}
+    return {key: _to_metres(value, scales.get(key, 1.0)) for key, value in point.items()}
 
 
 def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:

@@ -102,10 +102,9 @@ def _position(element: Any) -> _Position | None:
 
 def _line(element: Mapping[str, Any], nodes: Mapping[Any, _Position], budget: Budget) -> list[_Position]:
     """Return the positions of a way: those of its nodes, else those that `out geom` adds."""
-    references, geometry = element.get("nodes"), element.get("geometry")
-    points = (
-        [nodes.get(key) for key in references if isinstance(key, str | int)] if isinstance(references, list) else []
-    )
+    nodes_of_way, geometry = element.get("nodes"), element.get("geometry")
+    references = nodes_of_way if isinstance(nodes_of_way, list) else []
+    points = [nodes.get(key) for key in references if isinstance(key, str | int)]
     if None in points or not points:
         points = [_position(point) for point in geometry] if isinstance(geometry, list) else []
     budget.spend(len(points))

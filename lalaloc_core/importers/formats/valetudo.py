@@ -68,13 +68,11 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
         elif shape is not None:
             facts = layer.get("metaData")
             name = facts.get("name") if isinstance(facts, Mapping) else None
-            floors = [
-                shapely.Polygon(part.exterior) for part in polygons_from_geometry(shape) if part.area >= _LEAST_M2
-            ]
+            parts = [part for part in polygons_from_geometry(shape) if part.area >= _LEAST_M2]
+            floors = [shapely.Polygon(part.exterior) for part in parts]
             outlines += floors
-            text = str(name)[:200] if name else None
             simple = [part for floor in floors for part in polygons_from_geometry(floor.simplify(cell_m))]
-            sketch.rooms += [SketchedRoom(part, text) for part in simple]
+            sketch.rooms += [SketchedRoom(part, str(name)[:200] if name else None) for part in simple]
     if not sketch.rooms:
         raise InvalidFloorPlanError("the map has no segments: let the robot divide it into rooms, and send it again")
     builder.notes.append("rooms are where the robot drives: their outlines leave out furniture that stands at walls")
