@@ -88,7 +88,7 @@ class _Context:
         own = element.values.get("attributes") or {}
         texts = [str(own[key])[:200] for key in (_LABEL, "id", "class") if own.get(key)]
         labels = (*self.labels, *texts)[-64:]
-        for text in (*texts[::-1],):
+        for text in texts[::-1]:
             role = role_from_name(text)
             if role is not None:
                 return _Context(labels, role, text, text)

@@ -79,9 +79,8 @@ def _storeys(root: Element) -> dict[str, tuple[Level, _Storey]]:
     usual_m = _CM * _number(root, "wallHeight", _DEFAULT_HEIGHT_CM)
     found = {"": _Storey(Level("0", 0.0), usual_m)}
     for number, element in enumerate(child for child in root if local_name(child) == "level"):
-        level = Level(
-            str(element.get("name") or f"level {number}")[:200], None, _CM * _number(element, "elevation", 0.0)
-        )
+        name = str(element.get("name") or f"level {number}")[:200]
+        level = Level(name, None, _CM * _number(element, "elevation", 0.0))
         found[str(element.get("id"))] = _Storey(level, _CM * _number(element, "height", 100.0 * usual_m))
     for element in root.iter():
         kind = local_name(element)
