@@ -220,14 +220,11 @@ def _clean(
         )
     if len(floors) > 1:
         builder.warnings.append(f"{label} has {len(floors)} separate parts; each became a room")
-    cleaned = []
-    for floor in floors:
-        holes = [ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2]
-        shape = shapely.Polygon(floor.exterior, holes)
-        name = clean_name(room.name)
-        types = room.types or room_types_from_name(name)
-        cleaned.append(SketchedRoom(shape, name, types, room.ceiling_height_m, room.id))
-    return cleaned
+    name = clean_name(room.name)
+    named = replace(room, name=name, types=room.types or room_types_from_name(name))
+    holes = [[ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2] for floor in floors]
+    shapes = (shapely.Polygon(floor.exterior, rings) for floor, rings in zip(floors, holes, strict=True))
+    return [replace(named, shape=shape) for shape in shapes]
 
 
 def without_areas(rooms: list[SketchedRoom], builder: ReportBuilder) -> list[SketchedRoom]:

@@ -45,7 +45,7 @@ _UNEVEN_M, _MIN_HIGHER = 0.1, 0.02
 
 def check_network(lines: Sequence[BaseGeometry]) -> None:
     """Check the crossings of lines that are about to be joined."""
-    segments = _segments(lines)
+    segments = segments_of(lines)
     limit = _PER_NETWORK + len(segments)
     if _has_more_crossings(segments, limit):
         raise InvalidFloorPlanError(
@@ -73,7 +73,7 @@ def check_overlaps(shapes: Sequence[BaseGeometry], what: str) -> None:
             )
 
 
-def _segments(shapes: Sequence[BaseGeometry]) -> Float[np.ndarray, "n 4"]:
+def segments_of(shapes: Sequence[BaseGeometry]) -> Float[np.ndarray, "n 4"]:
     """Return the straight pieces of lines and outlines, without those of no length."""
     rings = shapely.get_parts(shapely.boundary([s for s in shapes if shapely.get_dimensions(s) == 2]))
     lines = [s for s in shapes if shapely.get_dimensions(s) == 1]
@@ -82,11 +82,16 @@ def _segments(shapes: Sequence[BaseGeometry]) -> Float[np.ndarray, "n 4"]:
     return pieces[np.any(pieces[:, :2] != pieces[:, 2:], axis=1)]
 
 
+def lines_of(segments: Float[np.ndarray, "n 4"]) -> list[shapely.LineString]:
+    """Return segments as lines."""
+    return np.asarray(shapely.linestrings(segments.reshape(-1, 2, 2))).tolist()
+
+
 def _has_more_crossings(segments: Float[np.ndarray, "n 4"], limit: int) -> bool:
     """Return whether more pairs of segments meet, except at common ends, or too many pairs are near each other."""
     if len(segments) * (len(segments) - 1) // 2 <= limit:
         return False
-    lines = np.asarray(shapely.linestrings(segments.reshape(-1, 2, 2)))
+    lines = lines_of(segments)
     tree = shapely.STRtree(lines)
     crossings = pairs = begin = 0
     step = max(_PAIRS_AT_A_TIME // len(segments), 1)
@@ -112,10 +117,7 @@ def _meet_inside(
     a, b = segments[first, :2], segments[first, 2:]
     c, d = segments[second, :2], segments[second, 2:]
     is_apart = (_side(a, b, c) * _side(a, b, d) > 0.0) | (_side(c, d, a) * _side(c, d, b) > 0.0)
-    has_common_end = np.zeros(len(first), bool)
-    for p in (a, b):
-        for q in (c, d):
-            has_common_end |= (p == q).all(axis=1)
+    has_common_end = np.any([(p == q).all(axis=1) for p in (a, b) for q in (c, d)], axis=0)
     return ~is_apart & ~has_common_end
 
 
@@ -149,7 +151,7 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     valid = geometry
     if not geometry.is_valid:
         check_coordinates(shapely.get_coordinates(geometry), "an outline")
-        segments = _segments([geometry])
+        segments = segments_of([geometry])
         limit = min(_PER_OUTLINE + len(segments), _MAX_PER_OUTLINE)
         if _has_more_crossings(segments, limit):
             x, y = segments[0][:2]
@@ -158,12 +160,10 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
                 f"{limit} times, the limit for as many points; draw the outline once around its area"
             )
         valid = shapely.make_valid(geometry)
-    parts: Iterable[BaseGeometry] = shapely.get_parts(valid)
     found: list[shapely.Polygon] = []
-    for part in parts:
+    for part in shapely.get_parts(valid):
         if isinstance(part, shapely.Polygon):
-            if part.area > 0.0:
-                found.append(part)
+            found += [part] if part.area > 0.0 else []
         elif isinstance(part, shapely.MultiPolygon | shapely.GeometryCollection):
             found.extend(polygons_from_geometry(part))
     return found
@@ -266,10 +266,7 @@ class WallAreas:
         self.parts = parts
         self._areas = shapely.STRtree(parts)
         shapely.prepare(self._areas.geometries)
-        rings = shapely.get_parts(shapely.boundary(np.array(parts, dtype=object)))
-        points, ring = shapely.get_coordinates(rings, return_index=True)
-        pairs = np.stack([points[:-1], points[1:]], axis=1)[ring[:-1] == ring[1:]]
-        self._edges = shapely.STRtree(np.asarray(shapely.linestrings(pairs)))
+        self._edges = shapely.STRtree(lines_of(segments_of(parts)))
 
     def distances_along(self, rays: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n"]:
         """Return the distance from the start of each ray to the first wall on it, infinite if there is none."""

@@ -144,11 +144,8 @@ def _parse(name: str, text: str) -> object:
         numbers, (count, meaning) = [_number(name, part) for part in re.split(r"[,;\s]+", text)], _NUMBERS[name]
         if len(numbers) != count:
             raise InvalidFloorPlanError(f"{name} has {len(numbers)} numbers; give {meaning}")
-        return (
-            tuple(numbers)
-            if name == "crop"
-            else KnownDistance((numbers[0], numbers[1]), (numbers[2], numbers[3]), numbers[4])
-        )
+        x0, y0, x1, y1, *distance_m = numbers
+        return KnownDistance((x0, y0), (x1, y1), *distance_m) if distance_m else (x0, y0, x1, y1)
     if name == "layers":
         return tuple(part.strip() for part in text.split(",") if part.strip())
     if name == "page":

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.importers.common.geometry import cross, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import cross, lines_of, point_xy, polygons_from_geometry, segments_of
 from lalaloc_core.importers.common.sketch import Point, SketchedOpening
 
 # Limits of wall thickness (m), of the sine between opening and wall, and of the length of an opening (m).
@@ -35,7 +35,7 @@ def place_openings(
     is kept before a window and a window before a passage.
     """
     edges = _edges(rooms)
-    tree = shapely.STRtree([_segment(edge) for edge in edges])
+    tree = shapely.STRtree(lines_of(edges))
     kept: list[SketchedOpening] = []
     off_wall, overlapping = [], 0
     for opening in sorted(openings, key=lambda opening: (_KIND_RANK[opening.kind], -opening.line.length)):
@@ -59,13 +59,13 @@ class WallLines:
     """
 
     def __init__(self, rooms: Sequence[shapely.Polygon]) -> None:
-        self._edges = _edges([part for room in rooms for part in polygons_from_geometry(room.simplify(_ON_WALL_M))])
-        self._tree = shapely.STRtree([_segment(edge) for edge in self._edges])
+        walls = [part for room in rooms for part in polygons_from_geometry(room.simplify(_ON_WALL_M))]
+        self._tree = shapely.STRtree(lines_of(_edges(walls)))
 
     def line_at(self, point: shapely.Point, width_m: float) -> tuple[Point, Point] | None:
         """Return the ends of an opening of a width on the longest of the walls nearest to a point, None if none is."""
         near = self._tree.query(point, predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
-        segments = [_segment(self._edges[index]) for index in near]
+        segments = self._tree.geometries[near]
         apart = [segment.distance(point) for segment in segments]
         nearest = min(apart, default=0.0) + _ON_WALL_M
         wall = max(
@@ -82,14 +82,7 @@ class WallLines:
 
 
 def _edges(rooms: Sequence[shapely.Polygon]) -> Float[np.ndarray, "n 4"]:
-    turned = [shapely.geometry.polygon.orient(room) for room in rooms]
-    rings = [np.asarray(ring.coords) for room in turned for ring in (room.exterior, *room.interiors)]
-    pieces = [np.concatenate([ring[:-1], ring[1:]], axis=1) for ring in rings]
-    return np.concatenate(pieces) if pieces else np.empty((0, 4))
-
-
-def _segment(edge: Float[np.ndarray, "4"]) -> shapely.LineString:
-    return shapely.LineString(edge.reshape(2, 2))
+    return segments_of([shapely.geometry.polygon.orient(room) for room in rooms])
 
 
 def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shapely.STRtree) -> SketchedOpening | None:

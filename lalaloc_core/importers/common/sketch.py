@@ -134,6 +134,4 @@ def _order(name: str) -> tuple[bool, list[int]]:
 
 
 def _height(level: Level) -> float:
-    if level.elevation_m is not None:
-        return level.elevation_m
-    return level.number if level.number is not None else 0.0
+    return next((height for height in (level.elevation_m, level.number) if height is not None), 0.0)

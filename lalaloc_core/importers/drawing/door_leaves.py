@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import shapely
 
-from lalaloc_core.importers.common.geometry import point_xy, side_lengths
+from lalaloc_core.importers.common.geometry import point_xy, segments_of, side_lengths
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, fit_swing
 
 # Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
@@ -96,10 +95,8 @@ def _arc(stroke: Stroke) -> Swing | None:
 
 def _axis(lines: Sequence[shapely.LineString]) -> float:
     """Return the direction (radians, modulo a quarter turn) of most lines."""
-    steps = [np.subtract(b, a) for line in lines for a, b in pairwise(shapely.get_coordinates(line))]
-    if not steps:
-        return 0.0
-    x, y = np.array(steps).T
+    segments = segments_of(lines)
+    x, y = (segments[:, 2:] - segments[:, :2]).T
     total = np.sum(np.hypot(x, y) * np.exp(4j * np.arctan2(y, x)))
     return float(np.angle(total)) / 4.0
 

@@ -9,13 +9,12 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 
 import numpy as np
 import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import side_lengths
+from lalaloc_core.importers.common.geometry import lines_of, segments_of, side_lengths
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
@@ -358,11 +357,10 @@ def _areas_m2(text: str) -> tuple[float, ...]:
 def written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
     """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
     texts = [lettering for lettering in drawing.letterings if values_m(lettering.text)][:_MAX_TEXTS]
-    points = [shapely.get_coordinates(stroke.line) for stroke in drawing.strokes]
-    ends = [pair for line in points for pair in pairwise(line) if (pair[0] != pair[1]).any()]
-    if not texts or not ends or len(ends) > _MAX_PIECES:
+    segments = segments_of([stroke.line for stroke in drawing.strokes])
+    if not texts or not 0 < len(segments) <= _MAX_PIECES:
         return []
-    pieces = [shapely.LineString(pair) for pair in ends]
+    pieces = lines_of(segments)
     tree = shapely.STRtree(pieces)
     x0, y0, x1, y1 = shapely.total_bounds(pieces)
     reach = _NEAR * max(x1 - x0, y1 - y0)

@@ -205,12 +205,10 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / np.maximum(lengths, 1e-12)[:, None]
     turns = _cross(directions, np.roll(directions, -1, axis=0))
+    is_end = (lengths >= config.thinnest) & (lengths <= max(config.thickest, config.widest_pier))
     found = []
-    for i in range(len(points)):
+    for i in np.flatnonzero(is_end & (np.minimum(np.roll(turns, 1), turns) >= _CORNER)).tolist():
         following = (i + 1) % len(points)
-        widest = max(config.thickest, config.widest_pier)
-        if not config.thinnest <= lengths[i] <= widest or min(turns[i - 1], turns[i]) < _CORNER:
-            continue
         nib = max(lengths[i - 1], lengths[following])
         outward = directions[i - 1] if lengths[i - 1] >= lengths[following] else -directions[following]
         found.append(_End(points[i], points[following], outward, float(nib)))
@@ -304,18 +302,13 @@ def _near(tree: shapely.STRtree, point: shapely.Point, distance_m: float) -> Int
 
 def _loose_ends(segments: Sequence[shapely.LineString]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
     """Return the ends that no other segment shares, and the outward unit vectors of their lines."""
-    tips, outward = [], []
-    for segment in segments:
-        points = np.asarray(segment.coords)
-        for tip, inner in ((points[0], points[1]), (points[-1], points[-2])):
-            tips.append(tip)
-            outward.append((tip - inner) / max(float(np.linalg.norm(tip - inner)), 1e-12))
-    if not tips:
-        return np.empty((0, 2)), np.empty((0, 2))
-    array = np.array(tips)
-    _, inverse, counts = np.unique(np.round(array, 4), axis=0, return_inverse=True, return_counts=True)
+    # Both ends of each line, with the next point.
+    ends = np.array([np.asarray(segment.coords)[[0, 1, -1, -2]] for segment in segments]).reshape(-1, 2, 2)
+    tips, steps = ends[:, 0], ends[:, 0] - ends[:, 1]
+    outward = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
+    _, inverse, counts = np.unique(np.round(tips, 4), axis=0, return_inverse=True, return_counts=True)
     loose = counts[inverse.reshape(-1)] == 1
-    return array[loose], np.array(outward)[loose]
+    return tips[loose], outward[loose]
 
 
 def _from_single_lines(
@@ -343,13 +336,10 @@ def _from_single_lines(
         ray = shapely.LineString([end + 1e-4 * direction, end + config.widest_gap * direction])
         hits = [segments[k].intersection(ray) for k in tree.query(ray, predicate="intersects")]
         reached = [shapely.distance(shapely.Point(end), hit) for hit in hits if not hit.is_empty]
-        facing = [
-            float(np.linalg.norm(opposite - end))
-            for opposite in ends[_near(ends_tree, shapely.Point(end), config.widest_gap)]
-            if 1e-6 < np.linalg.norm(opposite - end) <= config.widest_gap
-            and float((opposite - end) @ direction) > 0.99 * float(np.linalg.norm(opposite - end))
-        ]
-        width = min([*reached, *facing], default=0.0)
+        steps = ends[_near(ends_tree, shapely.Point(end), config.widest_gap)] - end
+        apart = np.linalg.norm(steps, axis=1)
+        is_facing = (apart > 1e-6) & (apart <= config.widest_gap) & (steps @ direction > 0.99 * apart)
+        width = min([*reached, *apart[is_facing].tolist()], default=0.0)
         if width <= 0.0:
             continue
         far = end + width * direction

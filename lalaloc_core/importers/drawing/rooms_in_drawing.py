@@ -215,7 +215,7 @@ def _by_named_walls(drawing: Drawing, budget: Budget) -> Enclosed | None:
         return None
     outlines = [ring for area in areas if _is_outline(area, bounds) for ring in _rings(area.shape)]
     bodies = [*thick, *(area.shape for area in areas if not _is_outline(area, bounds))]
-    return _enclose(bodies, split_lines([*lines, *outlines]), _closers(drawing, bounds), budget)
+    return enclose(bodies, split_lines([*lines, *outlines]), _closers(drawing, bounds), bounds.walls, budget.check_time)
 
 
 def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
@@ -230,7 +230,7 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
         return None
     gaps = [*painted, *_panes(drawing, shapely.unary_union(bodies), 2, budget)]
     painted_over = [gap.shape.buffer(bounds.seam_m, join_style="mitre") for gap in gaps]
-    found = _enclose(bodies, [], [*_closers(drawing, bounds), *painted_over], budget)
+    found = enclose(bodies, [], [*_closers(drawing, bounds), *painted_over], bounds.walls, budget.check_time)
     return replace(found, gaps=[*gaps, *found.gaps])
 
 
@@ -259,18 +259,10 @@ def _by_all_lines(drawing: Drawing, budget: Budget) -> Enclosed | None:
     lines += [ring for area in drawing.areas if area.role is None for ring in _rings(area.shape)]
     if not lines:
         return None
-    found = _enclose([], split_lines(lines), _closers(drawing, budget.limits.rooms), budget)
+    bounds = budget.limits.rooms
+    found = enclose([], split_lines(lines), _closers(drawing, bounds), bounds.walls, budget.check_time)
     # A wall has two lines, too.
     return replace(found, gaps=[*_panes(drawing, found.walls, 3, budget), *found.gaps])
-
-
-def _enclose(
-    bodies: Sequence[shapely.Polygon],
-    lines: Sequence[shapely.LineString],
-    closers: Sequence[BaseGeometry],
-    budget: Budget,
-) -> Enclosed:
-    return enclose(bodies, lines, closers, budget.limits.rooms.walls, budget.check_time)
 
 
 def _panes(drawing: Drawing, walls: BaseGeometry, least: int, budget: Budget) -> list[Gap]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -17,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import check_network, point_xy
+from lalaloc_core.importers.common.geometry import check_network, lines_of, point_xy, segments_of
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
@@ -151,23 +150,14 @@ class Drawing:
     def cropped(self, box: tuple[float, float, float, float]) -> Drawing:
         """Return the part of the drawing in a box; lines are cut, other shapes belong to it by their middles."""
         frame = shapely.box(*box)
-
-        def is_inside(shape: BaseGeometry) -> bool:
-            return bool(frame.covers(shape.centroid))
-
-        cut = [(stroke, shapely.intersection(stroke.line, frame)) for stroke in self.strokes]
+        cut = [(s, part) for s in self.strokes for part in shapely.get_parts(shapely.intersection(s.line, frame))]
         return Drawing(
-            [area for area in self.areas if is_inside(area.shape)],
-            [
-                replace(stroke, line=part)
-                for stroke, inside in cut
-                for part in shapely.get_parts(inside)
-                if isinstance(part, shapely.LineString) and part.length > 0.0
-            ],
+            [area for area in self.areas if frame.covers(area.shape.centroid)],
+            [replace(s, line=part) for s, part in cut if isinstance(part, shapely.LineString) and part.length > 0.0],
             [swing for swing in self.swings if frame.covers(shapely.Point(swing.hinge))],
             [lettering for lettering in self.letterings if frame.covers(shapely.Point(lettering.position))],
-            [patch for patch in self.patches if is_inside(patch.shape)],
-            [fixture for fixture in self.fixtures if is_inside(fixture.shape)],
+            [patch for patch in self.patches if frame.covers(patch.shape.centroid)],
+            [fixture for fixture in self.fixtures if frame.covers(fixture.shape.centroid)],
         )
 
     def scaled(self, factor: float, *, flip_y: bool) -> Drawing:
@@ -217,15 +207,12 @@ def fit_swing(
 
 def split_lines(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
     """Return the straight pieces of lines."""
-    pieces = []
-    for line in lines:
-        points = shapely.get_coordinates(line)
-        pieces += [shapely.LineString(pair) for pair in pairwise(points) if (pair[0] != pair[1]).any()]
+    pieces = segments_of(list(lines))
     if len(pieces) > _MAX_SEGMENTS:
         raise InvalidFloorPlanError(
             f"{len(pieces)} lines could be walls; the limit is {_MAX_SEGMENTS}; set layers to the layers of the walls"
         )
-    return pieces
+    return lines_of(pieces)
 
 
 def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:

@@ -60,7 +60,7 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     if places and budget.elapsed_s < _SHARE_OF_TIME * budget.limits.max_import_s:
         cleared, cleared_report = _read_walls(cells & ~furniture, grid, budget)
         # A piece of a wall between two doors can look like furniture.
-        if _explained(cleared) >= _explained(sketch):
+        if explained_size([r.shape for r in cleared.rooms]) >= explained_size([r.shape for r in sketch.rooms]):
             cells, sketch, report = cells & ~furniture, cleared, cleared_report
             area_m2 = float(furniture.sum()) * grid.frame.resolution_m**2
             named = ", ".join(f"({x:.1f}, {y:.1f})" for x, y in places[:_MAX_NAMED])
@@ -142,10 +142,6 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
         start, end = to_map(np.array([opening.start, opening.end]))
         openings.append(SketchedOpening(opening.kind, point_xy(start), point_xy(end)))
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
-
-
-def _explained(sketch: Sketch) -> float:
-    return explained_size([room.shape for room in sketch.rooms])
 
 
 def _furniture(
