@@ -208,6 +208,12 @@ def side_lengths(shape: BaseGeometry) -> tuple[float, float]:
     return float(min(first, second)), float(max(first, second))
 
 
+def extent_of(shapes: Sequence[BaseGeometry]) -> float:
+    """Return the longer side of the box around shapes, whose sides are along the axes; NaN without any."""
+    x0, y0, x1, y1 = shapely.total_bounds(shapes)
+    return float(max(x1 - x0, y1 - y0))
+
+
 def label_position(room: shapely.Polygon) -> tuple[float, float]:
     """Return the centre of the largest circle in a room."""
     return point_xy(shapely.maximum_inscribed_circle(room, 0.01).coords[0])
@@ -331,12 +337,8 @@ def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: Callable[[
                 heapq.heappush(queue, (float(lows[other]), int(other)))
     floor = join_faces([shape for shape, is_floor in zip(shapes, found, strict=True) if is_floor])
     whole = join_faces(shapes)
-    return Floor(
-        floor,
-        float(lows.min()),
-        float(highs[found].max() - lows.min()),
-        sum(part.area for part in whole) - sum(part.area for part in floor),
-    )
+    higher_m2 = sum(part.area for part in whole) - sum(part.area for part in floor)
+    return Floor(floor, float(lows.min()), float(highs[found].max() - lows.min()), higher_m2)
 
 
 def report_floor(name: str, floor: Floor, builder: ReportBuilder) -> None:

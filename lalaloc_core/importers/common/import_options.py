@@ -13,7 +13,10 @@ from lalaloc_core.errors import InvalidFloorPlanError
 METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 _SCALE = re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)")
 _MAX_LENGTH, _MAX_LAYERS = 200, 100
-_CEILING_M = (1.0, 20.0)
+_RANGES: Mapping[str, tuple[float, float]] = {
+    "scale": (1.0, 10_000.0), "metres_per_pixel": (1e-6, 10.0), "multiply": (1e-3, 1e3), "page": (1.0, 10_000.0),
+    "ceiling_height_m": (1.0, 20.0),
+}  # fmt: skip
 _NUMBERS = {"known_distance": (5, "x0, y0, x1, y1, metres"), "crop": (4, "x0, y0, x1, y1 of two opposite corners")}
 # Numbers of a known distance, and the lengths of a unit of a drawing that follow (m).
 _MAX_NUMBER, _METRES_PER_UNIT = 1e10, (1e-9, 1e4)
@@ -82,11 +85,10 @@ class ImportOptions:
     def __post_init__(self) -> None:
         if self.units is not None:
             check_units(self.units)
-        _check_range("scale", self.scale, 1.0, 10_000.0)
-        _check_range("metres_per_pixel", self.metres_per_pixel, 1e-6, 10.0)
-        _check_range("multiply", self.multiply, 1e-3, 1e3)
-        _check_range("page", self.page, 1.0, 10_000.0)
-        _check_range("ceiling_height_m", self.ceiling_height_m, *_CEILING_M)
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InvalidFloorPlanError(f"{name} is {value:g}; it must be between {low:g} and {high:g}")
         if self.crop is not None:
             object.__setattr__(self, "crop", _ordered_crop(self.crop))
         if self.y_axis is not None:
@@ -181,11 +183,6 @@ def _number(name: str, text: str) -> float:
     if not math.isfinite(value):
         raise InvalidFloorPlanError(f"{name} is '{text[:50]}'; it must be a number")
     return value
-
-
-def _check_range(name: str, value: float | int | None, low: float, high: float) -> None:
-    if value is not None and not low <= value <= high:
-        raise InvalidFloorPlanError(f"{name} is {value:g}; it must be between {low:g} and {high:g}")
 
 
 def _check_text(text: str) -> None:

@@ -140,12 +140,8 @@ def _size_warnings(rooms: Sequence[shapely.Polygon], metres_per_unit: float) -> 
 
 def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:
     """Find rooms farther from all others than a wall is thick."""
-    tree = shapely.STRtree(rooms)
-    isolated = [
-        name
-        for name, room in zip(names, rooms, strict=True)
-        if len(tree.query(room, predicate="dwithin", distance=_WALL_M)) < 2
-    ]
+    near, _ = shapely.STRtree(rooms).query(rooms, predicate="dwithin", distance=_WALL_M)
+    isolated = [name for name, count in zip(names, np.bincount(near, minlength=len(rooms)), strict=True) if count < 2]
     if len(rooms) < 2 or not isolated:
         return []
     return [
@@ -204,16 +200,12 @@ def estimate_trust(
     elif has_passages and not has_doors:
         passages, by_passages = _LEAFLESS * entries, f"{by_entries}; without doors, passages can be doors"
     found = (
-        OpeningTrust("door", _rounded(entries if has_doors else 0.0), by_entries if has_doors else "no door is drawn"),
-        OpeningTrust("window", _rounded(windows), f"{with_window} of {len(lit)} rooms on outer walls have a window"),
-        OpeningTrust("passage", _rounded(passages if has_doors or has_passages else 0.0), by_passages),
+        ("door", entries if has_doors else 0.0, by_entries if has_doors else "no door is drawn"),
+        ("window", windows, f"{with_window} of {len(lit)} rooms on outer walls have a window"),
+        ("passage", passages if has_doors or has_passages else 0.0, by_passages),
     )
-    return tuple(entry for entry in found if entry.kind in kinds)
-
-
-def _rounded(trust: float) -> float:
     # A certain kind would count as proven.
-    return round(min(trust, 0.99), 2)
+    return tuple(OpeningTrust(kind, round(min(trust, 0.99), 2), why) for kind, trust, why in found if kind in kinds)
 
 
 def _share_drawn(reached: int, rooms: int, having: tuple[float, float], recall: float) -> float:

@@ -11,13 +11,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.room_types import room_types_from_name
+from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
@@ -37,18 +37,12 @@ from lalaloc_core.importers.common.sketch import (
 )
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 
-_FEATURE_TYPES: Mapping[str, Role] = {
-    "unit": "room", "room": "room", "corridor": "room", "area": "room", "opening": "door", "door": "door",
-    "window": "window", "passage": "passage", "wall": "wall", "fixture": "obstacle", "kiosk": "obstacle",
-    "column": "obstacle",
-}  # fmt: skip
-# Feature types of IMDF that are not part of a plan, and categories of units without a floor.
-_IGNORED_TYPES = {"venue", "building", "footprint", "level", "address", "section", "geofence", "anchor", "occupant",
-                  "amenity"}  # fmt: skip
-_NO_FLOOR = {"opentobelow", "structure", "column", "elevator", "escalator", "movingwalkway", "shaft"}
-# Values of `indoor` in Simple Indoor Tagging. Its files also have features that belong to no plan, such as paths.
-_INDOOR: Mapping[str, Role] = {"room": "room", "corridor": "room", "area": "room", "yes": "room", "wall": "wall",
-                               "door": "door", "column": "obstacle", "pillar": "obstacle"}  # fmt: skip
+# Roles by the feature types of IMDF, and by `indoor` in Simple Indoor Tagging.
+_FEATURE_TYPES, _INDOOR = (cast("dict[str, Role]", keys_by_word(table)) for table in ("feature_types", "indoor"))
+# Categories of units without a floor, properties of outdoor features in OpenStreetMap, and those inside buildings.
+_NO_FLOOR, _OUTDOOR, _INSIDE = (
+    frozenset(PLAN_WORDS["features"][key].split()) for key in ("no_floor", "outdoor", "inside")
+)
 # Roles of features with a tag, and of those where it is "no".
 _OPENING_TAGS: Mapping[str, tuple[Role, Role]] = {
     "window": ("window", "ignored"), "door": ("door", "passage"), "entrance": ("door", "ignored"),
@@ -62,10 +56,6 @@ _MAX_LEVELS = 200
 _MAX_TYPES, _MAX_TEXT = 10, 200
 # Further levels of all features together: shafts and stairs are on all levels.
 _REPEATS, _REPEATS_PER_FEATURE = 1000, 5
-# Properties of outdoor features in OpenStreetMap, and properties of features inside buildings.
-_OUTDOOR = {"highway", "landuse", "waterway", "natural", "railway", "boundary", "leisure"}
-_INSIDE = {"indoor", "feature_type", "room", "door", "window", "level", "level_id", "ordinal", "floor", "storey",
-           "kind", "layer", "opening"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -182,8 +172,6 @@ def _role(feature: Feature) -> Role:
     properties = feature.properties
     kind = str(properties.get("feature_type") or properties.get("indoor") or "").casefold()
     category = str(properties.get("category") or "").casefold()
-    if kind in _IGNORED_TYPES:
-        return "ignored"
     is_area = shapely.get_dimensions(feature.shape) == 2
     if kind in ("unit", "area", "room") and category in _NO_FLOOR:
         return "obstacle"

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import lines_of, segments_of, side_lengths
+from lalaloc_core.importers.common.geometry import extent_of, lines_of, segments_of, side_lengths
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
@@ -362,8 +362,7 @@ def written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list
         return []
     pieces = lines_of(segments)
     tree = shapely.STRtree(pieces)
-    x0, y0, x1, y1 = shapely.total_bounds(pieces)
-    reach = _NEAR * max(x1 - x0, y1 - y0)
+    reach = _NEAR * extent_of(pieces)
     found: list[Dimension] = []
     for lettering in texts:
         check_time()

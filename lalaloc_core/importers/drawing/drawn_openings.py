@@ -15,7 +15,13 @@ from jaxtyping import Bool, Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import check_network, opening_line, polygons_from_geometry, side_lengths
+from lalaloc_core.importers.common.geometry import (
+    check_network,
+    opening_line,
+    point_xy,
+    polygons_from_geometry,
+    side_lengths,
+)
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.drawing.vector_drawing import Patch
 
@@ -42,8 +48,8 @@ _PAIRS, _PAIRS_PER_AREA = 1000, 4
 
 def drawn_panes(
     lines: Iterable[shapely.LineString], walls: BaseGeometry, least: int, check_time: Callable[[], None]
-) -> list[tuple[shapely.Polygon, shapely.LineString]]:
-    """Return the windows among the thin lines of a drawing (m), as areas and as lines along their middle.
+) -> list[Gap]:
+    """Return the windows among the thin lines of a drawing (m).
 
     The walls include the areas between the lines of windows, if walls are drawn with two lines. At least `least` lines
     make a window: two do in a gap; a wall with two faces is such a pair itself. `check_time` is called between steps
@@ -72,7 +78,8 @@ def drawn_panes(
         if area is not None and _is_in_wall(area, walls):
             is_used[beside] = True
             a, b, c, d = np.asarray(area.exterior.coords)[:4]
-            found.append((area, shapely.LineString([0.5 * (a + d), 0.5 * (b + c)])))
+            start, end = point_xy(0.5 * (a + d)), point_xy(0.5 * (b + c))
+            found.append(Gap(area, start, end, is_between_ends=True, is_pane=True))
     return found
 
 
@@ -153,10 +160,8 @@ def cut_painted(
     gaps: list[Gap] = []
     for k, parts in hidden.items():
         check_time()
-        for piece in polygons_from_geometry(shapely.union_all(parts)):
-            gap = _gap(piece, walls, patches[k], thickest_m)
-            if gap is not None:
-                gaps.append(gap)
+        pieces = polygons_from_geometry(shapely.union_all(parts))
+        gaps += filter(None, [_gap(piece, walls, patches[k], thickest_m) for piece in pieces])
     return visible, gaps
 
 
@@ -164,9 +169,8 @@ def _gap(piece: shapely.Polygon, walls: shapely.STRtree, patch: Patch, thickest_
     """Return the gap that a hidden piece of a wall is, None if the wall does not go on at both ends of it."""
     thickness, length = side_lengths(piece)
     ends = opening_line(piece)
-    if ends is None or not (
-        _THINNEST_M <= thickness <= thickest_m + _AT_END_M and _OPENING_M[0] <= length <= _OPENING_M[1]
-    ):
+    has_size = _THINNEST_M <= thickness <= thickest_m + _AT_END_M and _OPENING_M[0] <= length <= _OPENING_M[1]
+    if ends is None or not has_size:
         return None
     near = walls.geometries[np.sort(walls.query(piece, predicate="dwithin", distance=_AT_END_M))]
     around = shapely.union_all(near) if len(near) else shapely.Polygon()

@@ -166,12 +166,9 @@ def report_unused(drawing: Drawing, rooms: Sequence[Area], builder: ReportBuilde
     union = shapely.union_all([room.shape for room in rooms])
     shapely.prepare(union)
     unused: dict[str, list[float]] = {}
-    for area in drawing.areas:
-        if (
-            area.role is None
-            and _is_room_like(area, bounds)
-            and union.disjoint(area.shape.buffer(-0.5 * bounds.walls.thickest))
-        ):
+    outlines = [area for area in drawing.areas if area.role is None and _is_room_like(area, bounds)]
+    for area in outlines:
+        if union.disjoint(area.shape.buffer(-0.5 * bounds.walls.thickest)):
             unused.setdefault(area.layer or area.name or "(none)", []).append(area.shape.area)
     if unused:
         left_m2 = sum(map(sum, unused.values()))
@@ -270,9 +267,7 @@ def _panes(drawing: Drawing, walls: BaseGeometry, least: int, budget: Budget) ->
     thick_m, _ = budget.limits.rooms.thick_m
     lines = [stroke.line for stroke in drawing.strokes if stroke.role is None and stroke.width < thick_m]
     lines += [area.shape.exterior for area in drawing.areas if area.role is None and not area.is_dark]
-    found = drawn_panes(split_lines(lines), walls, least, budget.check_time)
-    ends = [(area, shapely.get_coordinates(line).ravel().tolist()) for area, line in found]
-    return [Gap(area, (x0, y0), (x1, y1), is_between_ends=True, is_pane=True) for area, (x0, y0, x1, y1) in ends]
+    return drawn_panes(split_lines(lines), walls, least, budget.check_time)
 
 
 def _rings(shape: shapely.Polygon) -> list[shapely.LinearRing]:

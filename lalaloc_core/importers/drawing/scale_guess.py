@@ -15,9 +15,10 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.geometry import extent_of
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, ScaleClue
-from lalaloc_core.importers.common.sketch import Sketch, SketchedFixture
+from lalaloc_core.importers.common.sketch import Sketch
 from lalaloc_core.importers.drawing.drawing_scale import Dimension, areas_of_rooms, values_m
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
@@ -185,8 +186,7 @@ def measures_of(
     `letterings` are placed in the metres of the sketch, `drawing` has the lines in its own units.
     """
     areas = areas_of_rooms([room.shape for room in sketch.rooms], letterings)
-    fixtures = [(fixture.kind, _long_side(fixture) / scale) for fixture in sketch.fixtures if fixture.kind in _FIXTURE]
-    bounds = shapely.total_bounds([room.shape for room in sketch.rooms]) if sketch.rooms else np.zeros(4)
+    fixtures = [(item.kind, extent_of([item.shape]) / scale) for item in sketch.fixtures if item.kind in _FIXTURE]
     return Measures(
         [leaf_m / scale for leaf_m in sketch.leaves_m],
         sketch.wall_m / scale,
@@ -194,7 +194,7 @@ def measures_of(
         fixtures,
         [(written_m2, area_m2 / scale**2) for written_m2, area_m2 in areas.values()],
         dimensions,
-        float(max(bounds[2] - bounds[0], bounds[3] - bounds[1])) / scale,
+        extent_of([room.shape for room in sketch.rooms]) / scale if sketch.rooms else 0.0,
     )
 
 
@@ -207,15 +207,12 @@ def _agreeing(measures: Measures, scale: float) -> dict[str, int]:
     """Return the number of written areas and dimensions that are true at a scale."""
     lengths = [scale * math.sqrt(units2 / m2) for m2, units2 in measures.areas]
     ratios = [
-        min(
-            (abs(math.log(scale * length / m)) for m in values_m(text) for length in lengths if length > 0.0),
-            default=9.0,
-        )
+        [abs(math.log(scale * length / m)) for m in values_m(text) for length in lengths if length > 0.0]
         for text, lengths in measures.dimensions
     ]
     return {
         "area": sum(abs(math.log(length)) <= _AGREE_STDS * _AREA_STD for length in lengths),
-        "dimension": sum(ratio <= _AGREE_STDS * _DIMENSION_STD for ratio in ratios),
+        "dimension": sum(min(own, default=math.inf) <= _AGREE_STDS * _DIMENSION_STD for own in ratios),
     }
 
 
@@ -290,11 +287,6 @@ def _middle(log_density: Likelihood, grid: Likelihood) -> tuple[float, float]:
     total = np.cumsum(np.exp(log_density - log_density.max()))
     low, middle, high = np.interp(_QUANTILES, total / total[-1], grid)
     return float(middle), float(0.5 * (high - low))
-
-
-def _long_side(fixture: SketchedFixture) -> float:
-    x0, y0, x1, y1 = fixture.shape.bounds
-    return max(x1 - x0, y1 - y0)
 
 
 def _in_words(clue: ScaleClue) -> str:

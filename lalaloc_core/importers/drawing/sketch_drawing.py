@@ -21,7 +21,7 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
-from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
@@ -197,11 +197,17 @@ def _kind_without_symbol(gap: Gap, rooms: shapely.STRtree) -> OpeningKind:
     """Return the kind of an opening that is painted over a wall: a window if it is blue or leads outside."""
     if gap.is_bluish:
         return "window"
-    start, end = np.array(gap.start), np.array(gap.end)
-    along = (end - start) / max(gap.width, 1e-9)
-    step = (0.5 * side_lengths(gap.shape)[0] + _BESIDE_M) * np.array([-along[1], along[0]])
-    places = [shapely.Point(0.5 * (start + end) + side * step) for side in (1.0, -1.0)]
-    return "passage" if all(len(rooms.query(place, predicate="within")) for place in places) else "window"
+    reach_m = 0.5 * side_lengths(gap.shape)[0] + _BESIDE_M
+    return "passage" if is_between_rooms(gap.start, gap.end, reach_m, rooms) else "window"
+
+
+def is_between_rooms(start: Point, end: Point, reach_m: float, rooms: shapely.STRtree) -> bool:
+    """Return whether a room lies at this distance to both sides of an opening; it can be the same room."""
+    a, b = np.array(start), np.array(end)
+    along = (b - a) / max(math.dist(start, end), 1e-9)
+    step = reach_m * np.array([-along[1], along[0]])
+    places = [shapely.Point(0.5 * (a + b) + side * step) for side in (1.0, -1.0)]
+    return all(len(rooms.query(place, predicate="within")) for place in places)
 
 
 def _trace_drawing(drawing: Drawing, trace: Trace | None) -> None:

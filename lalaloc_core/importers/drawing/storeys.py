@@ -22,7 +22,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.geometry import extent_of, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
@@ -145,8 +145,7 @@ def _levels(storeys: Sequence[BaseGeometry], letterings: Sequence[Lettering]) ->
     level_of: dict[int, Level] = {}
     taken = set[int]()
     for distance_m, index, number in near:
-        x0, y0, x1, y1 = storeys[index].bounds
-        if index not in level_of and number not in taken and distance_m <= max(x1 - x0, y1 - y0):
+        if index not in level_of and number not in taken and distance_m <= extent_of([storeys[index]]):
             level_of[index] = titles[number][0]
             taken.add(number)
     drawn = _reading_order(storeys)

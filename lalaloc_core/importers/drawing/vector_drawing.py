@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import check_network, lines_of, point_xy, segments_of
+from lalaloc_core.importers.common.geometry import check_network, extent_of, lines_of, point_xy, segments_of
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
@@ -133,8 +133,7 @@ class Drawing:
     @property
     def extent(self) -> float:
         """Longer side of the box around areas and lines; NaN without any."""
-        x0, y0, x1, y1 = shapely.total_bounds(self.shapes)
-        return float(max(x1 - x0, y1 - y0))
+        return extent_of(self.shapes)
 
     def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
         """Return what is on some layers; patches, which have none, stay."""

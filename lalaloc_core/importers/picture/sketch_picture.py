@@ -18,7 +18,7 @@ from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.room_bounds import WallConfig
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
-from lalaloc_core.importers.drawing.sketch_drawing import split_named_rooms
+from lalaloc_core.importers.drawing.sketch_drawing import is_between_rooms, split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
@@ -154,9 +154,10 @@ def sketch_picture(
     budget.begin("finding doors and windows")
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
     rooms += [SketchedRoom(align_edges(area)) for area in _terraces(best, ink, letterings)]
-    openings = _openings(best, ink, builder, budget)
     outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
-    swings = [best.contents[id(gap)] for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
+    # A gap away from all rooms lies between other strokes.
+    gaps = [gap for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
+    openings = _openings(best, gaps, ink, builder, budget)
     fixtures = _fixtures(symbols, shapes, best, builder) if has_symbols else []
     # Faces of walls are the middles of their lines.
     pen_m = 0.0 if best.is_dark else _PEN_PX * ink.metres_per_pixel
@@ -167,7 +168,7 @@ def sketch_picture(
         recall=_RECALL,
         drawn=best.enclosed.walls.envelope,
         walls=best.enclosed.walls,
-        leaves_m=[swing.leaf_m + pen_m for swing in swings if swing.leaf_m > 0.0],
+        leaves_m=[leaf_m + pen_m for gap in gaps if (leaf_m := best.contents[id(gap)].leaf_m) > 0.0],
         wall_m=best.walls.thickness_m,
     )
 
@@ -219,10 +220,9 @@ def _terraces(reading: _Reading, ink: Ink, letterings: Sequence[Lettering]) -> l
 
 def _without_islands(room: shapely.Polygon, builder: ReportBuilder) -> shapely.Polygon:
     """Fill small holes: letters and furniture look like walls. Columns are lost with them."""
-    small = [ring for ring in room.interiors if shapely.Polygon(ring).area <= _MAX_ISLAND_M2]
-    if small:
-        builder.unsure.append(f"{len(small)} dark shapes inside a room are taken for furniture, not for columns")
     large = [ring for ring in room.interiors if shapely.Polygon(ring).area > _MAX_ISLAND_M2]
+    if small := len(room.interiors) - len(large):
+        builder.unsure.append(f"{small} dark shapes inside a room are taken for furniture, not for columns")
     return shapely.Polygon(room.exterior, large)
 
 
@@ -253,18 +253,17 @@ def _fixtures(
     return found
 
 
-def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder, budget: Budget) -> list[SketchedOpening]:
+def _openings(
+    reading: _Reading, gaps: Sequence[Gap], ink: Ink, builder: ReportBuilder, budget: Budget
+) -> list[SketchedOpening]:
     """Return the openings: gaps by their content and the rooms beside them, and windows drawn into walls."""
-    rooms = reading.enclosed.rooms
-    outside = shapely.unary_union([room.buffer(0.05) for room in rooms])
-    # A gap away from all rooms lies between other strokes.
-    gaps = [gap for gap in reading.enclosed.gaps if outside.intersects(gap.shape)]
     candidates = [(gap.start, gap.end, reading.contents[id(gap)]) for gap in gaps]
     if not reading.is_dark:
         panes = windows_in_walls(reading.walls, ink, budget.check_time)
         candidates += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
+    rooms, reach_m = shapely.STRtree(reading.enclosed.rooms), 0.5 * reading.walls.thickness_m + _BESIDE_M
     placed = [
-        (content, math.dist(start, end), _is_between_rooms(start, end, reading.walls.thickness_m, rooms))
+        (content, math.dist(start, end), is_between_rooms(start, end, reach_m, rooms))
         for start, end, content in candidates
     ]
     found, lines_of_doors = [], _lines_of_doors(placed)
@@ -301,17 +300,6 @@ def _kind(content: GapContent, width: float, lines_of_doors: float, *, is_inner:
     if content.kind == "pane" and 0 < content.lines <= lines_of_doors:
         return "door"
     return "door" if is_inner and width <= _WIDEST_DOOR_M else "window"
-
-
-def _is_between_rooms(
-    start: tuple[float, float], end: tuple[float, float], thickness_m: float, rooms: Sequence[shapely.Polygon]
-) -> bool:
-    """Return whether a room lies at both sides of a gap; it can be the same room."""
-    a, b = np.array(start), np.array(end)
-    along = (b - a) / max(math.dist(start, end), 1e-9)
-    across = (0.5 * thickness_m + _BESIDE_M) * np.array([-along[1], along[0]])
-    sides = [shapely.Point(0.5 * (a + b) + side * across) for side in (1.0, -1.0)]
-    return all(any(room.covers(side) for room in rooms) for side in sides)
 
 
 def _doubt(content: GapContent, kind: OpeningKind) -> str | None:
