@@ -119,9 +119,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if openings:
         document["openings"] = [_opening(opening) for opening in openings]
     if fixtures:
-        document["fixtures"] = [
-            {"kind": fixture.kind, "outline": _ring(fixture.shape.exterior)} for _, fixture in fixtures
-        ]
+        document["fixtures"] = [{"kind": item.kind, "outline": _ring(item.shape.exterior)} for _, item in fixtures]
     _add_trust(document, sketch, builder)
     # Coordinates on Earth have no unit that could be mistaken.
     is_certain, metres_per_unit = sketch.anchor is not None, builder.metres_per_unit

@@ -15,14 +15,10 @@ from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke,
 
 # Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
 LEAF_M = (0.45, 1.6)
-# Angles of the arc of a leaf that is drawn half open.
-_ARC_DEG = (8.0, 125.0)
-# Smallest angle between a slanted leaf and the walls.
-_SLANTED_DEG = 8.0
-# Thickest leaf that is drawn as a rectangle.
-_THICK_LEAF_M = 0.08
-# Ends of lines nearer than this touch (m).
-_TOUCH_M = 0.03
+# Angles of the arc of a leaf that is drawn half open, and the smallest angle between a slanted leaf and the walls.
+_ARC_DEG, _SLANTED_DEG = (8.0, 125.0), 8.0
+# Thickest leaf that is drawn as a rectangle, and distance within which ends of lines touch.
+_THICK_LEAF_M, _TOUCH_M = 0.08, 0.03
 # Hinges within this distance are of one door.
 _NEAR: dict[str, Any] = {"predicate": "dwithin", "distance": 5 * _TOUCH_M}
 

@@ -44,13 +44,10 @@ _NUMBERED = re.compile(
     r"(?<![^\W_])(?:([12]\d(?=\.|[^\W\d_])|[1-9])[. _-]{0,2})?((?:[^\W\d_]|\+)+)"
     r"(?:(?=([ ._-]?)((?:(?<=[ ._])-)?[0-2]?\d)(?![^\W_]))|(?![^\W_]))"
 )
-# A number of a storey with a word of another script, parts of names of layers, and share of a smaller storey's box that
-# one covers.
-_OTHER_SCRIPTS, _PARTS, _OVER = (
-    re.compile(r"(\d{1,2}) ?(?:[階层層]|этаж)", re.IGNORECASE),
-    re.compile(r"[^\w+]+|_"),
-    0.5,
-)
+# A number of a storey with a word of another script.
+_OTHER_SCRIPTS = re.compile(r"(\d{1,2}) ?(?:[階层層]|этаж)", re.IGNORECASE)
+# Parts of names of layers, and share of a smaller storey's box that one covers.
+_PARTS, _OVER = re.compile(r"[^\w+]+|_"), 0.5
 
 
 def assemble_storeys(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -247,25 +248,21 @@ def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> 
             f"the dark areas as thick as walls in the picture have {len(contours)} outlines; the limit is "
             f"{_MAX_OUTLINES}; check the scale, and remove noise, hatches and patterns"
         )
-    holes: dict[int, list[np.ndarray]] = {}
-    for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
-        if parent >= 0:
-            holes.setdefault(int(parent), []).append(contours[index])
+    rings = [ink.to_plan(contour.reshape(-1, 2) + 0.5) for contour in contours]
+    parents = hierarchy.reshape(-1, 4)[:, 3].tolist()
+    holes: defaultdict[int, list[np.ndarray]] = defaultdict(list)
+    for ring, parent in zip(rings, parents, strict=True):
+        holes[parent] += [ring] if len(ring) >= 3 else []
     found: list[shapely.Polygon] = []
-    for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
+    for index, (ring, parent) in enumerate(zip(rings, parents, strict=True)):
         check_time()
-        if parent >= 0 or len(contours[index]) < 3:
+        if parent >= 0 or len(ring) < 3:
             continue
-        inner = [ring for hole in holes.get(index, []) if len(ring := _ring(hole, ink)) >= 3]
-        shell = shapely.Polygon(_ring(contours[index], ink), inner)
+        shell = shapely.Polygon(ring, holes[index])
         # Contours run through pixel centres, so the wall reaches half a pixel farther.
         grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_from_geometry(shell)]
         found += [align_edges(part) for shape in grown for part in polygons_from_geometry(shape.simplify(straight))]
     return found
-
-
-def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
-    return ink.to_plan(contour.reshape(-1, 2) + 0.5)
 
 
 def align_edges(shape: shapely.Polygon) -> shapely.Polygon:

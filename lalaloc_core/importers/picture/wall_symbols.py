@@ -167,7 +167,7 @@ class GapReader:
         for index, level in _dips(values.mean(axis=1)):
             depth = level - float(values[index].mean())
             inked = values[index] < level - min(_FAINT, _OF_DEPTH * depth)
-            quarters = [part.mean() for part in np.array_split(inked, 4)]
+            quarters = [float(part.mean()) for part in np.array_split(inked, 4)]
             halves += max(quarters[0], quarters[3]) >= _LEAF and min(quarters[0], quarters[3]) <= 1.0 - _LEAF
             is_broken = bow == 0.0 and inked.mean() >= _BROKEN and min(quarters) >= _BROKEN_QUARTER
             if is_broken or inked.mean() >= _LINE:
