@@ -293,7 +293,9 @@ def _add_fixture(fixture: Any, context: _Context, drawing: Drawing, builder: Rep
 
 def _is_hidden(element: Any) -> bool:
     values = element.values
-    return str(values.get("display")) == "none" or str(values.get("visibility")) == "hidden"
+    # As "0", "0.0" or "0%".
+    is_transparent = not str(values.get("opacity", 1)).strip("0.%")
+    return is_transparent or str(values.get("display")) == "none" or str(values.get("visibility")) == "hidden"
 
 
 def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
