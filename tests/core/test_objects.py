@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import re
 import struct
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -66,7 +67,7 @@ def test_photographs_that_do_not_lie_upright_are_named(
 ) -> None:
     upright = [view(heading_deg) for heading_deg in headings_deg]
     lying = [replace(each, thumbnail=np.rot90(present(each.thumbnail), turns).copy()) for each in upright]
-    warnings = query(*((replace(each, is_upright=False), 0.0) for each in lying)).warnings
+    warnings = pickle.loads(pickle.dumps(query(*((replace(each, is_upright=False), 0.0) for each in lying)))).warnings
     assert [re.sub(".* may lie (.*), the objects.*", r"\1", text) for text in warnings] == expected
     assert query(*((each, 0.0) for each in lying)).warnings == ()
 

@@ -23,7 +23,7 @@ from lalaloc_core.localise.answers.documents import (
 )
 from lalaloc_core.localise.answers.views import AssumedAngle, SeenObjectAnswer, ViewAnswer
 from lalaloc_core.localise.belief import Confidence, photograph_heading, pose_uncertainty
-from lalaloc_core.localise.belief.confidence import advice_for, information_bits, is_outside, reason_for
+from lalaloc_core.localise.belief.confidence import CONFIDENT, advice_for, information_bits, is_outside, reason_for
 from lalaloc_core.localise.localisability.reports import known_of, step_after
 from lalaloc_core.localise.query import Query
 from lalaloc_core.localise.query.query import KnownHeading
@@ -57,7 +57,8 @@ def compose_answer(
     candidates = [_possible(place, found.query, share) for place, share in zip(placed, shares, strict=True)]
     covariance_m2, heading_std_deg = _uncertainty(placed[0], model)
     best, reason = candidates[0], None
-    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings, *found.query.warnings]
+    warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
+    warnings += found.query.warnings if confidence is not None and confidence.position < CONFIDENT else ()
     if confidence is not None:
         reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
     return Answer(
@@ -161,7 +162,12 @@ def compose_tracked(
             for candidate, probability in zip(found.candidates, found.probability, strict=True)
         ],
         motion_contradicted=list(found.contradicted),
-        warnings=[*about_motion, *warnings, *spot.photograph.warnings, *query.warnings],
+        warnings=[
+            *about_motion,
+            *warnings,
+            *spot.photograph.warnings,
+            *(query.warnings if pose.probability < CONFIDENT else ()),
+        ],
         view=spot.view,
         model=ModelAnswer.of(bundle),
     )

@@ -12,6 +12,7 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.answers.compose import compose_answer
 from lalaloc_core.localise.answers.documents import DroppedFrames, FilmAnswer, Ground, Spot, TurnAnswer
 from lalaloc_core.localise.answers.views import AssumedAngle
+from lalaloc_core.localise.belief.confidence import CONFIDENT
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.query.query import KnownHeading
@@ -247,9 +248,8 @@ def compose_turn(
         for index in found.contradicted
     ]
     film = turn.film
-    fields: dict[str, Any] = vars(poses[0]) | {
-        "warnings": [*turn.warnings, *contradicted, *named, *warnings, *found.pictures[0].query.warnings]
-    }
+    lying = found.pictures[0].query.warnings if (poses[0].confidence or 0.0) < CONFIDENT else ()
+    fields: dict[str, Any] = vars(poses[0]) | {"warnings": [*turn.warnings, *contradicted, *named, *warnings, *lying]}
     return TurnAnswer(
         **fields,
         poses=poses,

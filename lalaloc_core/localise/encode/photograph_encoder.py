@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -21,14 +22,11 @@ from lalaloc_core.localise.encode.view_encoder import (
     ObjectEncoder,
     ViewEncoder,
     objects_of_views,
-    upright_warnings,
 )
 from lalaloc_core.localise.query import CameraHeight, Query, SeenObjects, WallDirection
+from lalaloc_core.localise.query.query import Later
 from lalaloc_core.photograph import Patch, PatchSize, Photograph, PhotographFeatures
 from lalaloc_core.photograph.patches import joined_patches
-
-# Views of a spot that are checked for lying on the side, which takes three times as long as recognising their objects.
-_CHECKED = 4
 
 
 class PhotographEncoder:
@@ -77,11 +75,8 @@ class PhotographEncoder:
         self.check(photograph)
         assert self._views is not None
         turned = [(photograph, 0.0), *others]
-        every = -(-len(turned) // _CHECKED)
-        checked = [
-            replace(view, is_upright=view.is_upright or number % every > 0) for number, (view, _) in enumerate(turned)
-        ]
-        objects = self._objects_beside(checked)
+        views = [view for view, _ in turned]
+        objects = self._objects_beside(views)
         if photograph.features is None:
             patches = self._patches(turned)
             outputs = self._views.outputs([patch.rgba for patch, _ in patches], height_m)
@@ -99,6 +94,8 @@ class PhotographEncoder:
             if view.wall_direction is not None
         )
         seen = self.seen_objects(turned, objects())
+        if seen is not None and self._objects is not None:
+            seen = replace(seen, lying=Later(partial(self._objects.lying, views)))
         several = {"objects": seen, "wall_directions": directions, "is_turn": bool(others)}
         searched = None if query.searched is None else replace(query.searched, **several)
         return replace(query, **several, searched=searched)
@@ -119,7 +116,7 @@ class PhotographEncoder:
         assert self._views is not None
         objects = self._objects_beside([photograph], detects=True)
         outputs = self._views.outputs([patch.rgba for patch in photograph.patches], 1.0) | objects()[0]
-        warnings = (*photograph.warnings, *upright_warnings([outputs.pop("upright")] if "upright" in outputs else []))
+        warnings = (*photograph.warnings, *(() if self._objects is None else self._objects.lying([photograph])))
         features = PhotographFeatures(outputs, photograph.patch_azimuths)
         return replace(photograph, features=features, warnings=warnings)
 
@@ -173,8 +170,7 @@ class PhotographEncoder:
             (each["object_probability"], each["object_azimuth"] + turn)
             for each, (_, turn) in zip(outputs, turned, strict=True)
         ]
-        upright = [each["upright"] for each in outputs if "upright" in each]
-        return replace(objects_of_views(self.manifest.objects, views), warnings=upright_warnings(upright))
+        return objects_of_views(self.manifest.objects, views)
 
     def check(self, photograph: Photograph) -> None:
         """Refuse a photograph that the model cannot encode.

@@ -10,10 +10,10 @@ pose.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal
+from functools import cached_property, partial
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -278,6 +278,21 @@ class WallDirection:
     sd: float
 
 
+@dataclass(eq=False)
+class Later:
+    """Warnings that are computed when they are read, or sent to another process: only answers that are not sure do."""
+
+    compute: Callable[[], tuple[str, ...]]
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """The warnings."""
+        return self.compute()
+
+    def __reduce__(self) -> tuple[type[Later], tuple[Any]]:
+        return Later, (partial(tuple, self.warnings),)
+
+
 @dataclass(frozen=True, eq=False)
 class SeenObjects:
     """Objects that a photograph, or several of one spot, show, and the type of room that they suggest.
@@ -286,13 +301,13 @@ class SeenObjects:
         room_type: its probabilities presume that all types are equally frequent.
         objects: the most probable first.
         outside: log likelihood ratio of a photograph taken outside to one of a room.
-        warnings: that photographs seem not to lie upright.
+        lying: warnings that photographs lie on their side or upside down; None for features.
     """
 
     room_type: PredictedRoomType
     objects: tuple[SeenObject, ...]
     outside: float = 0.0
-    warnings: tuple[str, ...] = ()
+    lying: Later | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +360,7 @@ class Query:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings by what the photograph shows."""
-        return () if self.objects is None else self.objects.warnings
+        return () if self.objects is None or self.objects.lying is None else self.objects.lying.warnings
 
     @property
     def sector(self) -> float:
