@@ -82,7 +82,9 @@ class SessionSearch:
         except InvalidStateError as error:
             raise SessionOutdatedError(query.session_id, str(error)) from error
         timings_ms = self._parts.executor.observe(context, tracked.stage)
-        return TrackOutcome(tracked.state.to_bytes(), self._stored(ground, tracked, Spot(photograph), form, timings_ms))
+        # An answer that is not sure looks at its photograph again.
+        stored = partial(self._stored, ground, tracked, Spot(photograph), form, timings_ms)
+        return TrackOutcome(tracked.state.to_bytes(), await self._parts.executor.compute(context, stored))
 
     def _track_ground(self, ground: Ground, levels: Sequence[float]) -> TrackedPlans:
         """Return a ground with the ways through its plans; `levels` are those of all plans of the venue."""
