@@ -13,7 +13,7 @@ import os
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from time import process_time
@@ -250,9 +250,10 @@ def _warnings(samples: _Samples, tracker: FlowTracker) -> list[str]:
 
 def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits: FilmLimits, begin: float) -> None:
     """Decode a film, and add its sharpest frames by angle; its CPU time counts from `begin`."""
-    with _opened(content, limits) as (capture, samples.claimed_s):
+    with _opened(content, limits) as (capture, samples.claimed_s), ThreadPoolExecutor(1) as follower:
         interval_s = max(1.0 / _RATE, samples.claimed_s / _SAMPLES)
         next_s = 0.0
+        followed: Future[None] | None = None
         while capture.grab():
             samples.frames += 1
             time_s = max(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), samples.last_s)
@@ -273,37 +274,45 @@ def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits
             if not seen or frame is None:
                 samples.dropped["damaged"] += 1
                 continue
-            _sample(frame, time_s, samples, tracker)
+            if samples.stored_size == (0, 0):
+                samples.stored_size = frame.shape[1::-1]
+            if samples.stored_size != frame.shape[1::-1]:
+                samples.dropped["of another size"] += 1
+                continue
+            picture = _shrunk(frame[samples.inside], _LONG_SIDE)
+            # A sample is followed while the next one is decoded, where there is a core for it.
+            if followed is not None:
+                followed.result()
             if samples.is_barred:
                 break
+            followed = follower.submit(_sample, picture, time_s, samples, tracker)
+            if limits.threads == 1:
+                followed.result()
+        if followed is not None:
+            followed.result()
     if not samples.frames:
         raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
 
 
-def _sample(frame: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
-    height, width = frame.shape[:2]
-    if samples.stored_size == (0, 0):
-        samples.stored_size = width, height
-    if samples.stored_size != (width, height):
-        samples.dropped["of another size"] += 1
-        return
-    frame = frame[samples.inside]
-    share = min(_LONG_SIDE / max(frame.shape), 1.0)
-    picture = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else frame
+def _sample(picture: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     if cv2.mean(grey)[0] < _DARK:
         samples.dropped["dark"] += 1
         return
     if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
-        share = min(THUMBNAIL_SIDE / max(frame.shape), 1.0)
-        samples.looks.append(cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA))
+        samples.looks.append(_shrunk(picture, THUMBNAIL_SIDE))
         # A film with bars is read once more, within them.
         samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
-    sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
+    sharpness = float(cv2.meanStdDev(cv2.Laplacian(grey, cv2.CV_32F))[1].item()) ** 2
     samples.add(
         _Sample(time_s, tracker.number, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
     )
+
+
+def _shrunk(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    share = min(long_side / max(picture.shape), 1.0)
+    return cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else picture
 
 
 def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
