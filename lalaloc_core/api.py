@@ -286,7 +286,7 @@ class LaLaLoc:
             id = hashlib.sha256(content).hexdigest()
             if id not in entries:
                 view = self._model.encoder.with_features(self._model.open(content, stated, purpose="album"))
-                entries[id] = photograph_entry(id, view)
+                entries[id] = photograph_entry(id, view, name=name)
         except InvalidPhotographError as error:
             return PinnedPhotograph(number, name, None, reason=str(error))
         at = entries[id].taken.at

@@ -58,13 +58,13 @@ def pictures_in(folder: Path, *, require: bool = True) -> list[Path]:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise InvalidInputError(f"'{folder}' cannot be read as a folder: {error.strerror}") from error
-    entries.sort(key=lambda entry: _with_numbers(entry.name))
+    entries.sort(key=lambda entry: with_numbers(entry.name))
     found = [entry for entry in entries if entry.suffix.lower() in PICTURES and entry.is_file()]
     if require and not found:
         raise InvalidInputError(f"'{folder}' has no photographs ({', '.join(sorted(PICTURES))})")
     return found
 
 
-def _with_numbers(name: str) -> list[str]:
+def with_numbers(name: str) -> list[str]:
     """Return a key by which "2.jpg" is before "10.jpg"."""
     return [part.zfill(20) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]

@@ -99,7 +99,7 @@ class AlbumSearch:
         return await self._threads.run(context.client, work)
 
     def _read(self, parts: Sequence[AlbumPart]) -> list[AlbumPhotograph]:
-        return [replace(read_entry(part.entry, self._parts.bundle), id=part.id) for part in parts]
+        return [replace(read_entry(part.entry, self._parts.bundle), id=part.id, name=part.name or "") for part in parts]
 
     def _solve(self, query: AlbumQuery, ground: Ground, photographs: Sequence[AlbumPhotograph]) -> AlbumOutcome:
         places = _album_ground(ground, query.document)

@@ -28,6 +28,7 @@ class AlbumPart:
     """
 
     id: str
+    name: str | None
     entry: bytes
     correction: str | None
     pin: str | None

@@ -160,11 +160,29 @@ def test_photographs_without_walls_and_objects_are_set_aside(
 ) -> None:
     blank = [_without(photographs[-1], name, "seen", "object_probability") for name in ("façade", "garden")]
     outside = [replace(each, colours=np.roll(each.colours, 32)) for each in blank]
-    pins = solve_album(ground, encoder(), [*photographs, *outside], by_time=False).pins
+    untimed = [replace(each, taken=replace(each.taken, at=None)) for each in (*photographs, *outside)]
+    pins = solve_album(ground, encoder(), untimed).pins
     assert [each.pose.room_id for each in pins[:-2] if each.pose] == list(ROOMS)
     for pin in pins[-2:]:
         assert (pin.state, pin.pose) == ("set_aside", None)
         assert "façades and gardens" in pin.reason
+
+
+def test_names_of_files_tell_types_of_rooms_but_not_those_of_the_folder(
+    ground: AlbumGround, photographs: list[AlbumPhotograph]
+) -> None:
+    blank = replace(
+        _without(photographs[-1], "blank", "seen", "object_probability"), colours=np.zeros_like(photographs[-1].colours)
+    )
+
+    def share(name: str, others: str) -> float:
+        album = [*(replace(each, name=others) for each in photographs), replace(blank, name=name)]
+        pin = solve_album(ground, encoder(), album).pins[-1]
+        return sum(row.probability for row in pin.rooms if row.room_id == "kitchen")
+
+    plain = share("", "")
+    assert share("Küche_03.jpg", "") > 2.0 * plain
+    assert share("Kitchen Row 03.jpg", "Kitchen Row 01.jpg") == pytest.approx(plain, abs=0.03)
 
 
 def test_photograph_that_shows_no_wall_is_not_sure(ground: AlbumGround, photographs: list[AlbumPhotograph]) -> None:

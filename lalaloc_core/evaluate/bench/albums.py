@@ -53,7 +53,7 @@ def bench_albums(setting: Setting) -> dict[str, Any]:
         solve_s, walk = timed(_solved, model, case, memory)
         seconds.append(solve_s)
         scores["walk"] += walk
-        scores["without_order"] += _solved(model, case, memory, by_time=False)
+        scores["without_order"] += _solved(model, case.without_order, memory)
         scores["each_alone"] += _alone(model, case)
         clicks_s, count = timed(case.clicks, model, memory)
         clicks.append(count)
@@ -128,8 +128,8 @@ def _entry(
     return album_entry(model, f"{number:03d}", encode_jpeg(pixels), StatedCamera(projection=projection), taken)
 
 
-def _solved(model: LocalModel, case: AlbumCase, memory: AlbumMemory, *, by_time: bool = True) -> list[Found]:
-    pins = case.solve(model, memory, by_time=by_time)
+def _solved(model: LocalModel, case: AlbumCase, memory: AlbumMemory) -> list[Found]:
+    pins = case.solve(model, memory)
     poses = (None if pin.pose is None else case.pose(pin.pose) for pin in pins)
     return [Found.of(pose, truth, pin.confidence) for pose, truth, pin in zip(poses, case.truth, pins, strict=True)]
 

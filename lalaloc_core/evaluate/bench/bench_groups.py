@@ -19,7 +19,6 @@ from lalaloc_core.evaluate.bench.accuracy import (
 )
 from lalaloc_core.evaluate.bench.album_weights import bench_album_weights
 from lalaloc_core.evaluate.bench.albums import bench_albums
-from lalaloc_core.evaluate.bench.bounds import bench_bounds
 from lalaloc_core.evaluate.bench.house import bench_house
 from lalaloc_core.evaluate.bench.measured import Setting
 from lalaloc_core.evaluate.bench.service_latency import bench_service
@@ -31,7 +30,6 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
     "service": bench_service,
     "turns": bench_turns,
     "films": bench_films,
-    "bounds": bench_bounds,
     "steps": bench_steps,
     "albums": bench_albums,
     "house": bench_house,

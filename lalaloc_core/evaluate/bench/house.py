@@ -10,6 +10,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,9 @@ _ELSEWHERE, _ELSEWHERE_DEG = 5, 67.0
 def bench_house(setting: Setting) -> dict[str, Any]:
     """Measure the house; nothing without its folder.
 
-    Rows: spheres, and views by field of view, heading and what is stated; turns of three views and films; albums
-    without and with the order of a walk and focal lengths, with photographs of elsewhere, and in a foreign plan.
+    Rows: spheres, and views by field of view, heading and what is stated; turns of three views and films; albums in the
+    order of their names, without one, with the times of a walk and focal lengths, with photographs of elsewhere, and in
+    a foreign plan.
     """
     if setting.house is None:
         return {}
@@ -92,8 +94,10 @@ def house_albums(setting: Setting) -> dict[str, RoomAlbum]:
         (pixels, _), _ = two_views(other.photograph.image(512, 1024), _ELSEWHERE_DEG, rng)
         outside.append(album_entry(model, f"elsewhere {other.name}", encode_jpeg(pixels), StatedCamera()))
     rooms: list[RoomKey] = [*plain.values(), *[None] * len(outside)]
+    unnamed = [replace(each, name="") for each in plain]
     albums = {
         "album": RoomAlbum(own, list(plain), list(plain.values())),
+        "album_without_order": RoomAlbum(own, unnamed, list(plain.values())),
         "album_walk": RoomAlbum(own, list(walk), list(walk.values())),
         "foreign_house": RoomAlbum(foreign, list(plain), [None] * len(plain)),
     }
@@ -118,6 +122,9 @@ def _photographs(model: LocalModel, folder: Path, *options: str) -> dict[AlbumPh
         subprocess.run([sys.executable, str(folder / "cut_album.py"), out, *options], check=True)
         truth = json.loads(Path(out, "truth.json").read_bytes())
         return {
-            album_entry(model, name, Path(out, name).read_bytes(), StatedCamera()): (plans[row["plan"]], row["room"])
+            album_entry(model, name, Path(out, name).read_bytes(), StatedCamera(), name=name): (
+                plans[row["plan"]],
+                row["room"],
+            )
             for name, row in truth.items()
         }

@@ -63,9 +63,15 @@ class AlbumCase:
         rooms: list[RoomKey] = [(PLAN_ID, self.ground.plan.rooms[pose.room_index].id) for pose in self.truth]
         return RoomAlbum(self.ground, self.photographs, rooms)
 
-    def solve(self, model: LocalModel, memory: AlbumMemory, *, by_time: bool = True) -> Sequence[Pin]:
+    @property
+    def without_order(self) -> AlbumCase:
+        """The album without times."""
+        untimed = [replace(each, taken=replace(each.taken, at=None)) for each in self.photographs]
+        return replace(self, photographs=untimed)
+
+    def solve(self, model: LocalModel, memory: AlbumMemory) -> Sequence[Pin]:
         """Return a pin for every photograph."""
-        return solve_album(self.ground, model.encoder, self.photographs, memory=memory, by_time=by_time).pins
+        return solve_album(self.ground, model.encoder, self.photographs, memory=memory).pins
 
     def pose(self, pin: PinPose) -> Pose:
         """Return the pose of a pin; an unknown heading is 0."""
@@ -137,14 +143,14 @@ def pin_figures(pins: Sequence[Pin], truth: Sequence[RoomKey]) -> dict[str, floa
 
 
 def album_entry(
-    model: LocalModel, id: str, content: bytes, stated: StatedCamera, taken: Taken | None = None
+    model: LocalModel, id: str, content: bytes, stated: StatedCamera, taken: Taken | None = None, name: str = ""
 ) -> AlbumPhotograph:
     """Return the entry of a photograph's file, with the given time and camera or those of its metadata."""
     manifest = model.bundle.manifest
     view = open_photograph(
         content, sphere_size=sphere_size(manifest), stated=stated, patch_size=patch_size(manifest), purpose="album"
     )
-    return photograph_entry(id, model.encoder.with_features(view), taken)
+    return photograph_entry(id, model.encoder.with_features(view), taken, name)
 
 
 def predict_album(

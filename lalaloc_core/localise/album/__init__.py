@@ -12,6 +12,6 @@ returns an `Album` of pins (`pins.py`). The contract:
   links between photographs that overlap. Pass the same object again and only new photographs are compared. It belongs
   to one ground and model; another's is dropped. `to_bytes` gives the evidence of a photograph to store (`stored`).
 * Every photograph gets a pin, in the order given. The result does not depend on the order in which photographs were
-  added: they are ordered by the time they were taken.
+  added: they are ordered by the time they were taken, or by the numbers in their names.
 * `moved_pins` lists what changed between two solves, such as after a new revision of a plan.
 """

@@ -143,6 +143,7 @@ class AlbumPhotograph:
         taken: time, maker, model and size in pixels; each None or empty where unknown.
         descriptors: what tells overlap with others; none for spheres, and for features that a client computed.
         colours: (64,) square roots of the shares of hues, times 255; zeros for features that a client computed.
+        name: name of the file, whose numbers can tell the order; empty if unknown.
         correction: what a person stated; None without.
     """
 
@@ -151,6 +152,7 @@ class AlbumPhotograph:
     taken: Taken = field(default=Taken())
     descriptors: Descriptors = field(default=_NO_DESCRIPTORS)
     colours: UInt8[np.ndarray, "64"] = field(default_factory=lambda: _NO_COLOURS)
+    name: str = ""
     correction: Correction | None = None
 
     @property
@@ -160,7 +162,7 @@ class AlbumPhotograph:
         return self.taken.make, self.taken.model, long, short
 
     def to_bytes(self, bundle: Bundle) -> bytes:
-        """Return the entry as a file, without the correction."""
+        """Return the entry as a file, without the name and the correction."""
         assert self.photograph.features is not None
         features = zlib.compress(
             write_features(self.photograph, self.photograph.features.outputs, bundle), _COMPRESSION
@@ -199,7 +201,7 @@ class _Header:
     features: int
 
 
-def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None) -> AlbumPhotograph:
+def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None, name: str = "") -> AlbumPhotograph:
     """Return the entry of a photograph with features (`PhotographEncoder.with_features`, or those that a client sent).
 
     Its `overview` gives the descriptors; `taken` replaces the time and camera that its file states.
@@ -220,7 +222,7 @@ def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None
     pixels = photograph.thumbnail if photograph.sphere is None else photograph.sphere
     colours = _NO_COLOURS if pixels is None else _colours(pixels)
     taken = taken or photograph.taken or Taken()
-    return AlbumPhotograph(id=id, photograph=light, taken=taken, descriptors=descriptors, colours=colours)
+    return AlbumPhotograph(id=id, photograph=light, taken=taken, descriptors=descriptors, colours=colours, name=name)
 
 
 def _colours(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "64"]:

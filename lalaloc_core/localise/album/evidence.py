@@ -13,6 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import Manifest, MatchingWeights
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.localise.album.comparison import BinnedGround, Comparison
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.ground import AlbumGround
@@ -49,6 +51,9 @@ _DAMAGE = (ValueError, KeyError, NotImplementedError, OSError, EOFError, zipfile
 # Standard deviation of the scale of a plan; of the log height from one photograph to the next; and of a median over
 # that of a mean. Errors of fields of view by lines are alike, so the error of many is not less than `_LINES_SD`.
 _SCALE_SD, _HAND_SD, _MEDIAN, _LINES_SD = 0.05, 0.05, 1.25, 0.03
+# Log likelihoods of rooms of another type than a file's name tells, and of no type; share of names that tell a type of
+# the folder.
+_MISNAMED, _UNTYPED, _COMMON = math.log(0.05), math.log(0.3), 0.6
 # Fields of view (radians) from which on pictures are not in perspective.
 _WIDEST = 3.0
 
@@ -240,6 +245,22 @@ def room_types(
     """
     objects = encoder.seen_objects([(photograph, 0.0)])
     return evidence["room_types"] if objects is None else _by_type(plan, objects.room_type, 1.0)
+
+
+def types_by_names(plan: FloorPlan, photographs: Sequence[AlbumPhotograph]) -> Float[np.ndarray, "n r"]:
+    """Return the log likelihood of every room by the type that each file's name tells, as "Kitchen_01.jpg" does.
+
+    A type that most names tell is of the folder, such as that of a street, and tells nothing.
+    """
+    kinds = [set(room_types_from_name(PurePath(each.name).stem)) for each in photographs]
+    often = {kind for kind in set[str]().union(*kinds) if sum(kind in each for each in kinds) > _COMMON * len(kinds)}
+    log = np.zeros((len(kinds), len(plan.rooms)))
+    for row, named in zip(log, kinds, strict=True):
+        if own := named - often:
+            row[:] = [
+                0.0 if own.intersection(room.types) else _MISNAMED if room.types else _UNTYPED for room in plan.rooms
+            ]
+    return log
 
 
 def _by_type(plan: FloorPlan, predicted: PredictedRoomType | None, weight: float) -> Float[np.ndarray, "r"]:

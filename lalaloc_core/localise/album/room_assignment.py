@@ -43,7 +43,7 @@ _LONGEST = 6
 _MOST_STOREYS, _STOREY_ROOMS = 4, 2
 # Probability that the next photograph is of the same room, that it is of any room at all, and the weight of rooms that
 # are a further door away over that of nearer ones; walks are followed through so many doors.
-_STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.05, 0.5, 4
+_STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.3, 0.5, 4
 # Rooms nearer than this (m) are joined if the plan draws no doors.
 _JOINED_M = 0.4
 # Beta distribution of the share of photographs of none of the rooms: in most folders it is one in ten.

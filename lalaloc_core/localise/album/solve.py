@@ -26,6 +26,7 @@ from lalaloc_core.localise.album.evidence import (
     room_types,
     shared_cameras,
     single_evidence,
+    types_by_names,
 )
 from lalaloc_core.localise.album.ground import AlbumGround, Constraint, constraint_of
 from lalaloc_core.localise.album.links import Found, find_links, pair_odds
@@ -34,6 +35,7 @@ from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_roo
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
 from lalaloc_core.localise.album.walk_order import WalkOrder, walk_order
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
+from lalaloc_core.photograph.picture_folders import with_numbers
 
 MAX_PHOTOGRAPHS = 500
 # The comparison with poses takes memory by their number, the walk from room to room time by the cube of theirs.
@@ -58,7 +60,6 @@ def solve_album(
     photographs: Sequence[AlbumPhotograph],
     *,
     memory: AlbumMemory | None = None,
-    by_time: bool = True,
     progress: Callable[[int], object] = lambda _: None,
     pause: Callable[[], object] = lambda: None,
 ) -> Album:
@@ -69,7 +70,6 @@ def solve_album(
         encoder: encoder of the model that the entries were made with.
         photographs: at most 500, with different ids; their order does not matter.
         memory: what earlier solves found, filled in place; None for nothing.
-        by_time: use the times at which the photographs were taken.
         progress: called with the number of photographs that were compared with the plan.
         pause: called often, after at most a photograph's comparison; what it raises ends the solve.
     """
@@ -80,7 +80,7 @@ def solve_album(
     memory.keep({each.id for each in photographs})
     if not photographs:
         return Album(pins=())
-    ordered = sorted(photographs, key=lambda each: ((each.taken.at or datetime.max).replace(tzinfo=None), each.id))
+    ordered = sorted(photographs, key=_place_in_order)
     if new := [each for each in ordered if each.id not in memory.evidence]:
         searched = SearchedPlan.of(ground.plan, ground.grid, encoder.manifest.profile_columns)
         for each in new:
@@ -89,8 +89,9 @@ def solve_album(
             pause()
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
-    walk = walk_order(ordered, links) if by_time else None
     weights = encoder.manifest.album
+    alike = pair_odds(ordered, links, len(ground.plan.rooms), weights.pairs)
+    walk = walk_order(ordered, links, alike)
     seen = (encoder.seen_objects([(each.photograph, 0.0)]) for each in ordered)
     # Log likelihood ratios of a photograph taken outside to one of a room; 0 if no objects are known.
     outside = [0.0 if objects is None else objects.outside for objects in seen]
@@ -101,7 +102,10 @@ def solve_album(
         if each.id not in constraints and odds <= 0.0
     ]
     misread = misread_share(telling, weights.misread)
-    share = _room_shares(ground, encoder, ordered, memory, states, links, constraints, walk, misread, outside, pause)
+    named = types_by_names(ground.plan, ordered)
+    share = _room_shares(
+        ground, encoder, ordered, memory, states, alike, constraints, walk, misread, outside, named, pause
+    )
     misfit = () if misread <= weights.misfit else (_MISFIT_WARNING.format(100.0 * misread),)
     share = calibrated(share, misread, weights)
     pins = {
@@ -117,8 +121,22 @@ def solve_album(
         scale=scale,
         compass_bias=bias if bias is None or north is None else math.remainder(bias - north, math.tau),
         misread=misread,
-        warnings=(*misfit, *(() if walk is None else walk.warnings)),
+        warnings=(*misfit, *walk.warnings, *_on_names(ordered, named)),
     )
+
+
+def _on_names(photographs: Sequence[AlbumPhotograph], named: Float[np.ndarray, "n r"]) -> tuple[str, ...]:
+    told = [each.name for each, row in zip(photographs, named, strict=True) if row.any()]
+    if not told:
+        return ()
+    return (
+        f"{len(told)} of {len(named)} names tell the type of the room, as '{told[0]}': rename files if they do not",
+    )
+
+
+def _place_in_order(photograph: AlbumPhotograph) -> tuple[datetime, list[str], str]:
+    """Return what orders photographs before their clocks are compared."""
+    return (photograph.taken.at or datetime.max).replace(tzinfo=None), with_numbers(photograph.name), photograph.id
 
 
 def misread_share(rooms: Sequence[Float[np.ndarray, "r"]], usual: float) -> float:
@@ -200,11 +218,12 @@ def _room_shares(
     photographs: Sequence[AlbumPhotograph],
     memory: AlbumMemory,
     states: Sequence[States],
-    links: dict[tuple[int, int], Found],
+    alike: Float[np.ndarray, "n n"],
     constraints: dict[str, Constraint],
-    walk: WalkOrder | None,
+    walk: WalkOrder,
     misread: float,
     outside: Sequence[float],
+    named: Float[np.ndarray, "n r"],
     pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
     """Return the probability of every room for every photograph; the last is none of the rooms."""
@@ -212,7 +231,7 @@ def _room_shares(
     alone = np.empty((len(photographs), rooms + 1))
     for number, (each, state) in enumerate(zip(photographs, states, strict=True)):
         types = room_types(ground.plan, encoder, each.photograph, memory.evidence[each.id])
-        alone[number, :rooms] = state.evidence(misread) + types
+        alone[number, :rooms] = state.evidence(misread) + types + named[number]
         # Half of the photographs of none of the rooms are taken outside.
         alone[number, rooms] = float(np.logaddexp(0.0, outside[number])) - math.log(2.0)
         if each.id in constraints:
@@ -220,8 +239,7 @@ def _room_shares(
             alone[number] -= _CERTAIN
             alone[number, rooms if wanted is None else wanted] += _CERTAIN
     alone = np.maximum(alone, -2.0 * _CERTAIN)
-    order = np.arange(len(photographs)) if walk is None else walk.order
-    follows = np.zeros(len(photographs), bool) if walk is None else walk.follows
+    order, follows = walk.order, walk.follows
     alone = alone[order]
     # Large rooms are photographed more often than closets; it counts by half, as numbers of photographs tell it too.
     expected = expected_shares(ground)
@@ -232,7 +250,7 @@ def _room_shares(
         alone=alone,
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
-        pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],
+        pairs=alike[np.ix_(order, order)],
         # Albums of fewer photographs than rooms have no expectation.
         expected=expected if len(photographs) >= rooms else None,
         crowding=weights.crowding,

@@ -1,16 +1,20 @@
-"""Order of an album's photographs: the walk by the clocks of its cameras.
+"""Order of an album's photographs: the walk by the clocks of its cameras, else by the numbers in their names.
 
 Photographs whose file states a time zone have instants. The clocks of other cameras can be set to any time: pairs of
 photographs of one place, one by each of two cameras, tell the difference of the two, if enough of them agree. Where it
-stays unknown, the order counts within each camera only.
+stays unknown, the order counts within each camera only. Numbers in names count for photographs without a time, if
+neighbours look more alike than others do: most folders, and listings, have the pictures of a room beside each other.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, timedelta, tzinfo
+from pathlib import PurePath
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,9 +22,13 @@ from jaxtyping import Bool, Float, Int
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.links import Found, is_one_place
 from lalaloc_core.photograph.exif import Taken
+from lalaloc_core.photograph.picture_folders import with_numbers
 
-# Share of the photographs by a clock that must have a time for its order to count.
-_TIMED = 0.8
+# Share of the photographs by a clock that must have a time for its order to count, and of those without a time whose
+# names must be alike but for numbers; fewest of these.
+_TIMED, _FEWEST = 0.8, 4
+# Standard errors by which neighbours by name are more alike than all pairs; of shuffled albums one in ten passes.
+_ALIKE = 1.2
 # People go from one photograph to the next within this time (s); later ones are of another visit.
 _VISIT_S = 3.0 * 3600.0
 # Photographs of one place by two cameras are taken within this time (s); pairs that must agree on a difference.
@@ -45,8 +53,13 @@ class WalkOrder:
     warnings: tuple[str, ...]
 
 
-def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found]) -> WalkOrder:
-    """Return the order in which photographs were taken, as far as their clocks tell it; `links` are by their number."""
+def walk_order(
+    photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found], alike: Float[np.ndarray, "n n"]
+) -> WalkOrder:
+    """Return the order in which photographs were taken, as far as their clocks or names tell it.
+
+    `links` are by their number; `alike` are log odds that two are of one room (`links.pair_odds`).
+    """
     zones = {_name(each.taken): each.taken.at.tzinfo for each in photographs if each.taken.at and each.taken.at.tzinfo}
     seconds, rows_of = _seconds(photographs, zones), _clocks(photographs, zones)
     names = [name for name, rows in rows_of.items() if np.isfinite(seconds[rows]).mean() >= _TIMED]
@@ -57,7 +70,9 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
         clock[rows_of[name]] = number
     untimed = np.isnan(seconds)
     clock[untimed] = -1
-    warnings = _on_missing(len(clock), int(untimed.sum()), int(((clock < 0) & ~untimed).sum()))
+    numbered = _numbered(photographs, untimed)
+    is_walk = len(numbered) > 0 and _are_alike(alike, numbered)
+    warnings = _on_missing(photographs, untimed, int(((clock < 0) & ~untimed).sum()), numbered, is_walk=is_walk)
     walk, ahead_s = _joined(len(names), _differences(seconds, clock, links))
     for number, (first, difference_s) in enumerate(zip(walk, ahead_s, strict=True)):
         if abs(difference_s) > _SAME_S:
@@ -76,6 +91,8 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
     is_timed = clock >= 0
     of_walk = np.where(is_timed, np.array([*walk, -1])[clock], -1)
     seconds = seconds - np.where(is_timed, np.array([*ahead_s, 0.0])[clock], 0.0)
+    if is_walk:
+        of_walk[numbered], seconds[numbered] = len(names), np.arange(len(numbered))
     order = np.lexsort((np.nan_to_num(seconds), of_walk))
     follows = np.zeros(len(order), bool)
     before, after = order[:-1], order[1:]
@@ -84,13 +101,47 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
     return WalkOrder(order, follows, tuple(warnings))
 
 
-def _on_missing(count: int, untimed: int, dropped: int) -> list[str]:
+def _numbered(photographs: Sequence[AlbumPhotograph], untimed: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
+    """Return the photographs without a time in the order of the numbers in their names; none if names differ more."""
+    alike: defaultdict[str, list[int]] = defaultdict(list)
+    for row in np.flatnonzero(untimed).tolist():
+        alike[re.sub(r"\d+", "#", PurePath(photographs[row].name).stem.lower())].append(row)
+    fewest = max(_FEWEST, _TIMED * untimed.sum())
+    rows = next((rows for text, rows in alike.items() if "#" in text and len(rows) >= fewest), [])
+    # Different files with one name have no order.
+    of_name = {photographs[row].name: row for row in rows}
+    is_order = len(of_name) == len(rows)
+    return np.array([of_name[name] for name in sorted(of_name, key=with_numbers)] if is_order else [], int)
+
+
+def _are_alike(alike: Float[np.ndarray, "n n"], order: Int[np.ndarray, "m"]) -> bool:
+    """Return whether neighbours in an order look more alike than all pairs; true if nothing tells their looks."""
+    every = alike[np.ix_(order, order)][np.triu_indices(len(order), 1)]
+    neighbours = alike[order[:-1], order[1:]]
+    error = float(every.std()) / math.sqrt(len(neighbours))
+    return float(neighbours.mean() - every.mean()) >= _ALIKE * error
+
+
+def _on_missing(
+    photographs: Sequence[AlbumPhotograph],
+    untimed: Bool[np.ndarray, "n"],
+    dropped: int,
+    numbered: Int[np.ndarray, "m"],
+    *,
+    is_walk: bool,
+) -> list[str]:
     """Return warnings on photographs without a time, and on those whose time is not used."""
-    found = []
-    if untimed:
-        found.append(
-            f"{untimed} of {count} photographs have no time, so no place in the order; send the original files"
-        )
+    found, count = [], len(photographs)
+    if untimed.any():
+        text = f"{untimed.sum()} of {count} photographs have no time, so no place in the order"
+        if len(numbered):
+            first, last = (photographs[row].name for row in (numbered[0], numbered[-1]))
+            text = f"{untimed.sum()} of {count} photographs have no time: " + (
+                f"{len(numbered)} are in the order of the numbers in their names, from '{first}' to '{last}'"
+                if is_walk
+                else "the numbers in their names tell no order, as neighbours look no more alike than others"
+            )
+        found.append(f"{text}; send the original files")
     if dropped:
         found.append(
             f"the times of {dropped} of {count} photographs were not used, because fewer than {_TIMED:.0%} of their "
