@@ -385,12 +385,13 @@ def test_limits_of_albums(start_app: StartApp, tmp_path: Path, pictures: list[by
 @pytest.mark.slow
 def test_features_take_the_place_of_photographs(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
     bundle = Bundle.open(default_bundle())
-    photograph = open_photograph(pictures[0], sphere_size=sphere_size(bundle.manifest))
-    features = FeatureEncoder(bundle, threads=1).features(photograph)
-    album_id = create(client, plan_id)
-    (line,) = add(client, album_id, [features], "features")
+    opened = [open_photograph(picture, sphere_size=sphere_size(bundle.manifest)) for picture in pictures]
+    encoder, album_id = FeatureEncoder(bundle, threads=1), create(client, plan_id)
+    line, *_ = add(client, album_id, [encoder.features(photograph) for photograph in opened], "features")
     assert (line["status"], line["photograph"]["view"]["width"]) == (201, None)
-    wait_until_solved(client, album_id)
+    # Features have no time.
+    warnings = wait_until_solved(client, album_id)["solution"]["warnings"]
+    assert any("4 are in the order of the numbers in their names, from '0.jpg' to '3.jpg'" in text for text in warnings)
     assert photographs(client, album_id)[0]["pin"]["place"] is not None
     (damaged,) = add(client, album_id, [b"LLFT"], "features")
     assert damaged["problem"]["type"] == "urn:lalaloc:problem:invalid-features"
