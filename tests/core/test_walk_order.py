@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lalaloc_core.localise.album.entry import AlbumPhotograph
-from lalaloc_core.localise.album.links import Found
-from lalaloc_core.localise.album.walk_order import WalkOrder, walk_order
+from lalaloc_core.localise.album.entry import COLOURS, AlbumPhotograph
+from lalaloc_core.localise.album.walk_order import walk_order
 from lalaloc_core.photograph.exif import Taken, read_time
 from lalaloc_core.photograph.picture_folders import pictures_in, turn_files
 
@@ -30,10 +29,6 @@ def _album(*taken: tuple[str, datetime | None]) -> list[AlbumPhotograph]:
     ]
 
 
-def _walk(album: list[AlbumPhotograph], links: dict[tuple[int, int], Found] | None = None) -> WalkOrder:
-    return walk_order(album, links or {}, np.zeros((len(album), len(album))))
-
-
 def _minutes(*minutes: float, zone_h: int | None = None) -> list[datetime]:
     zone = None if zone_h is None else timezone(timedelta(hours=zone_h))
     return [(_TEN + timedelta(minutes=minute)).replace(tzinfo=zone) for minute in minutes]
@@ -41,20 +36,20 @@ def _minutes(*minutes: float, zone_h: int | None = None) -> list[datetime]:
 
 def test_instants_of_different_zones_are_one_order() -> None:
     first, second = _minutes(120, 122, 124, zone_h=2), _minutes(1, 3, zone_h=0)
-    found = _walk(_album(*(("A", at) for at in first), *(("B", at) for at in second)))
+    found = walk_order(_album(*(("A", at) for at in first), *(("B", at) for at in second)), {})
     assert found.order.tolist() == [0, 3, 1, 4, 2]
     assert found.follows.tolist() == [False, True, True, True, True]
     assert found.warnings == ()
     # A photograph without a zone has that of its camera.
     at = [*_minutes(0, 2, zone_h=2), *_minutes(1)]
-    assert _walk(_album(*(("A", time) for time in at))).order.tolist() == [0, 2, 1]
+    assert walk_order(_album(*(("A", time) for time in at)), {}).order.tolist() == [0, 2, 1]
 
 
 def test_clock_difference_is_found_by_common_places() -> None:
     own, other = _minutes(0, 2, 4, 6), _minutes(61, 63, 65, 67)
     album = _album(*(("A", at) for at in own), *(("B", at) for at in other))
     links = {(0, 4): _CERTAIN, (1, 5): _CERTAIN, (3, 7): _CERTAIN, (0, 7): _WEAK}
-    found = _walk(album, links)
+    found = walk_order(album, links)
     assert sorted(found.order[[0, 1]].tolist()) == [0, 4]
     assert found.follows[1:].all()
     assert found.warnings == (
@@ -65,7 +60,7 @@ def test_clock_difference_is_found_by_common_places() -> None:
 
 def test_clocks_that_cannot_be_compared_order_each_camera() -> None:
     own, other = _minutes(4, 0, 2), _minutes(1, 5)
-    found = _walk(_album(*(("A", at) for at in own), *(("B", at) for at in other)), {(0, 3): _CERTAIN})
+    found = walk_order(_album(*(("A", at) for at in own), *(("B", at) for at in other)), {(0, 3): _CERTAIN})
     assert found.order.tolist() == [1, 2, 0, 3, 4]
     assert found.follows.tolist() == [False, True, True, False, True]
     assert "the clocks of A, B could not all be compared" in found.warnings[0]
@@ -74,7 +69,7 @@ def test_clocks_that_cannot_be_compared_order_each_camera() -> None:
 def test_local_clock_is_compared_with_cameras_that_state_zones() -> None:
     local, zoned = _minutes(121, 123, 125), _minutes(120, 122, 124, zone_h=2)
     album = _album(*(("A", at) for at in local), *(("B", at) for at in zoned))
-    found = _walk(album, {(0, 3): _CERTAIN, (1, 4): _CERTAIN, (2, 5): _CERTAIN})
+    found = walk_order(album, {(0, 3): _CERTAIN, (1, 4): _CERTAIN, (2, 5): _CERTAIN})
     assert found.follows[1:].all()
     assert found.warnings == (
         "the clock of A is 2:01:00 ahead of universal time, by photographs of the same places, which the order takes "
@@ -86,14 +81,14 @@ def test_two_clocks_are_compared_through_a_third() -> None:
     names = [name for name in "ABC" for _ in range(3)]
     at = [*_minutes(0, 2, 4), *_minutes(60, 62, 64), *_minutes(30, 32, 34)]
     links = {(k, k + 6): _CERTAIN for k in range(3)} | {(k + 3, k + 6): _CERTAIN for k in range(3)}
-    found = _walk(_album(*zip(names, at, strict=True)), links)
+    found = walk_order(_album(*zip(names, at, strict=True)), links)
     assert found.follows[1:].all()
     assert len(found.warnings) == 2
 
 
 def test_photographs_without_time_and_later_visits_follow_nothing() -> None:
     at: list[datetime | None] = [*_minutes(0, 1, 2, 600), None]
-    found = _walk(_album(*(("A", time) for time in at)))
+    found = walk_order(_album(*(("A", time) for time in at)), {})
     follows = dict(zip(found.order.tolist(), found.follows.tolist(), strict=True))
     assert follows == {0: False, 1: True, 2: True, 3: False, 4: False}
     assert found.warnings[0].startswith("1 of 5 photographs have no time")
@@ -113,9 +108,12 @@ def test_photographs_without_time_and_later_visits_follow_nothing() -> None:
 def test_numbers_in_names_order_photographs_whose_neighbours_are_alike(
     names: list[str], rooms: str, order: list[int], text: str
 ) -> None:
-    album = [replace(each, name=name) for each, name in zip(_album(*[("", None)] * len(names)), names, strict=True)]
-    alike = np.array([[float(one == other) for one in rooms] for other in rooms])
-    found = walk_order(album, {}, alike)
+    hues = dict(zip("ab", np.eye(2, COLOURS, dtype=np.uint8), strict=True))
+    album = [
+        replace(each, name=name, colours=hues[room])
+        for each, name, room in zip(_album(*[("", None)] * len(names)), names, rooms, strict=True)
+    ]
+    found = walk_order(album, {})
     assert found.order[len(names) - len(order) :].tolist() == order
     assert found.follows.sum() == max(len(order) - 1, 0)
     assert text in found.warnings[0]

@@ -95,7 +95,7 @@ def _pairs(photographs: Sequence[AlbumPhotograph]) -> list[tuple[int, int]]:
         for place, first in enumerate(numbers)
         for second in numbers[place + 1 : place + 1 + _NEIGHBOURS]
     }
-    alike = _similarity(photographs)[np.ix_(numbers, numbers)]
+    alike = similarity(photographs)[np.ix_(numbers, numbers)]
     first, second = np.triu_indices(len(numbers), 1)
     for place in np.argsort(-alike[first, second], kind="stable")[: _MOST_PAIRS - len(near)]:
         near.add((numbers[first[place]], numbers[second[place]]))
@@ -133,7 +133,7 @@ def _compared(
     return len(kept), math.nan if found is None else found[0]
 
 
-def _similarity(photographs: Sequence[AlbumPhotograph]) -> Float[np.ndarray, "n n"]:
+def similarity(photographs: Sequence[AlbumPhotograph]) -> Float[np.ndarray, "n n"]:
     """Return how alike colours are, from 0 to 1 (Bhattacharyya)."""
     colours = np.stack([photograph.colours for photograph in photographs]).astype(float)
     length = np.linalg.norm(colours, axis=1, keepdims=True)
@@ -147,7 +147,7 @@ def _colour_odds(photographs: Sequence[AlbumPhotograph]) -> Float[np.ndarray, "n
     known = np.array([bool(photograph.colours.any()) for photograph in photographs])
     odds = np.zeros((count, count))
     both = known[:, None] & known
-    alike = _similarity(photographs)
+    alike = similarity(photographs)
     upper = np.sort(alike[np.triu(both, 1)])
     if not len(upper):
         return odds

@@ -90,8 +90,7 @@ def solve_album(
     links = find_links(ordered, memory, pause)
     states, bias = _states(ground, encoder, ordered, memory, links)
     weights = encoder.manifest.album
-    alike = pair_odds(ordered, links, len(ground.plan.rooms), weights.pairs)
-    walk = walk_order(ordered, links, alike)
+    walk = walk_order(ordered, links)
     seen = (encoder.seen_objects([(each.photograph, 0.0)]) for each in ordered)
     # Log likelihood ratios of a photograph taken outside to one of a room; 0 if no objects are known.
     outside = [0.0 if objects is None else objects.outside for objects in seen]
@@ -104,7 +103,7 @@ def solve_album(
     misread = misread_share(telling, weights.misread)
     named = types_by_names(ground.plan, ordered)
     share = _room_shares(
-        ground, encoder, ordered, memory, states, alike, constraints, walk, misread, outside, named, pause
+        ground, encoder, ordered, memory, states, links, constraints, walk, misread, outside, named, pause
     )
     misfit = () if misread <= weights.misfit else (_MISFIT_WARNING.format(100.0 * misread),)
     share = calibrated(share, misread, weights)
@@ -218,7 +217,7 @@ def _room_shares(
     photographs: Sequence[AlbumPhotograph],
     memory: AlbumMemory,
     states: Sequence[States],
-    alike: Float[np.ndarray, "n n"],
+    links: dict[tuple[int, int], Found],
     constraints: dict[str, Constraint],
     walk: WalkOrder,
     misread: float,
@@ -250,7 +249,7 @@ def _room_shares(
         alone=alone,
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
-        pairs=alike[np.ix_(order, order)],
+        pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],
         # Albums of fewer photographs than rooms have no expectation.
         expected=expected if len(photographs) >= rooms else None,
         crowding=weights.crowding,

@@ -20,14 +20,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.localise.album.entry import AlbumPhotograph
-from lalaloc_core.localise.album.links import Found, is_one_place
+from lalaloc_core.localise.album.links import Found, is_one_place, similarity
 from lalaloc_core.photograph.exif import Taken
 from lalaloc_core.photograph.picture_folders import with_numbers
 
 # Share of the photographs by a clock that must have a time for its order to count, and of those without a time whose
 # names must be alike but for numbers; fewest of these.
 _TIMED, _FEWEST = 0.8, 4
-# Standard errors by which neighbours by name are more alike than all pairs; of shuffled albums one in ten passes.
+# Standard errors by which neighbours by name have more similar colours than all pairs; few shuffled albums pass.
 _ALIKE = 1.2
 # People go from one photograph to the next within this time (s); later ones are of another visit.
 _VISIT_S = 3.0 * 3600.0
@@ -53,13 +53,8 @@ class WalkOrder:
     warnings: tuple[str, ...]
 
 
-def walk_order(
-    photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found], alike: Float[np.ndarray, "n n"]
-) -> WalkOrder:
-    """Return the order in which photographs were taken, as far as their clocks or names tell it.
-
-    `links` are by their number; `alike` are log odds that two are of one room (`links.pair_odds`).
-    """
+def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found]) -> WalkOrder:
+    """Return the order in which photographs were taken, as far as clocks or names tell; `links` are by their number."""
     zones = {_name(each.taken): each.taken.at.tzinfo for each in photographs if each.taken.at and each.taken.at.tzinfo}
     seconds, rows_of = _seconds(photographs, zones), _clocks(photographs, zones)
     names = [name for name, rows in rows_of.items() if np.isfinite(seconds[rows]).mean() >= _TIMED]
@@ -71,7 +66,7 @@ def walk_order(
     untimed = np.isnan(seconds)
     clock[untimed] = -1
     numbered = _numbered(photographs, untimed)
-    is_walk = len(numbered) > 0 and _are_alike(alike, numbered)
+    is_walk = len(numbered) > 0 and _are_alike([photographs[row] for row in numbered])
     warnings = _on_missing(photographs, untimed, int(((clock < 0) & ~untimed).sum()), numbered, is_walk=is_walk)
     walk, ahead_s = _joined(len(names), _differences(seconds, clock, links))
     for number, (first, difference_s) in enumerate(zip(walk, ahead_s, strict=True)):
@@ -114,10 +109,13 @@ def _numbered(photographs: Sequence[AlbumPhotograph], untimed: Bool[np.ndarray, 
     return np.array([of_name[name] for name in sorted(of_name, key=with_numbers)] if is_order else [], int)
 
 
-def _are_alike(alike: Float[np.ndarray, "n n"], order: Int[np.ndarray, "m"]) -> bool:
-    """Return whether neighbours in an order look more alike than all pairs; true if nothing tells their looks."""
-    every = alike[np.ix_(order, order)][np.triu_indices(len(order), 1)]
-    neighbours = alike[order[:-1], order[1:]]
+def _are_alike(photographs: Sequence[AlbumPhotograph]) -> bool:
+    """Return whether neighbours have more similar colours than all pairs; true if colours of too few are known."""
+    known = [photograph for photograph in photographs if photograph.colours.any()]
+    if len(known) < _FEWEST:
+        return True
+    similar = similarity(known)
+    every, neighbours = similar[np.triu_indices(len(known), 1)], np.diag(similar, 1)
     error = float(every.std()) / math.sqrt(len(neighbours))
     return float(neighbours.mean() - every.mean()) >= _ALIKE * error
 
