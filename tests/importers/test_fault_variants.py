@@ -146,6 +146,27 @@ def test_floors_painted_over_the_edges_of_walls_are_no_openings():
     assert "openings" not in plan.document
 
 
+_FRAME = '<path fill="none" stroke="#000" stroke-width="1" d="{}"/>'
+_SIDES = "M-800,-900 H2000 M-800,-900 V1200 M2000,-900 V1200 M-800,1200 H2000"
+_TITLE_BLOCK = _FRAME.format("M1200,1200 V1000 H2000 M1600,1000 V1200") + '<text x="1220" y="1100">{}</text>'
+
+
+@pytest.mark.parametrize(
+    ("drawn", "frames"),
+    [
+        ((_FRAME.format("M-800,-900 h2970 v2100 h-2970 z"),), 1), ((_FRAME.format(_SIDES),), 0),
+        ((_FRAME.format(_SIDES), _TITLE_BLOCK.format("M 1:100")), 1),
+        ((_FRAME.format("M-900,-1000 H2100 V1300 H-900 Z"), _FRAME.format(_SIDES), _TITLE_BLOCK.format("Projekt")), 2),
+        # Offices around a core are as far from it as sheets.
+        ((_FRAME.format("M-800,-900 h2970 v2100 h-2970 z"), '<text x="-500" y="0">Office</text>'), 0),
+    ],
+)  # fmt: skip
+def test_frames_of_sheets_are_no_walls(drawn: tuple[str, ...], frames: int):
+    plan = _svg(_WALLS, *drawn)
+    assert sum("is taken for the sheet's frame" in line for line in plan.report.unsure) == frames
+    assert (_areas(plan) == [26.3, 26.3]) == (frames > 0)
+
+
 @pytest.mark.parametrize("x", [30, 250, 505])
 def test_dark_pillars_beside_single_lines_are_no_walls(x: int):
     plan = _svg(

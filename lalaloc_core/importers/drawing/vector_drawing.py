@@ -6,6 +6,7 @@ The readers of SVG, PDF and DXF produce a `Drawing`; `sketch_drawing` finds room
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,8 +16,16 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import check_network, extent_of, lines_of, point_xy, segments_of
+from lalaloc_core.floorplan.room_types import PLAN_WORDS, room_types_from_name, split_words
+from lalaloc_core.importers.common.geometry import (
+    check_network,
+    distinct,
+    extent_of,
+    lines_of,
+    point_xy,
+    segments_of,
+    side_lengths,
+)
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
@@ -30,6 +39,11 @@ CURVE_STEPS = 12
 _SWING_DEG = (55.0, 125.0)
 _ROUND = 0.03
 _MAX_SEGMENTS = 60_000
+# Texts of title blocks. Frames are drawn along this share of a box, which is so much of the drawing; lines nearer than
+# this (m) to a frame belong to it. Sides of sheets relative to each other, also within margins, and their accuracy.
+_TITLES, _WRITTEN_SCALE = frozenset(PLAN_WORDS["sheets"]["title"].split()), re.compile(r"\b1 ?: ?\d{2,3}\b")
+_DRAWN, _MOST, _BESIDE_FRAME_M, _ON_BOX_M = 0.98, 0.5, 0.6, 0.05
+_SHEETS, _SAME_SIDES = np.array([math.sqrt(2.0), 400 / 277, 277 / 180, 17 / 11, 11 / 8.5]), 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +116,11 @@ class Lettering:
     layer: str = ""
     height: float = 0.0
     is_ocr: bool = False
+
+    @property
+    def is_title(self) -> bool:
+        """Whether title blocks have such a text: a scale, or a word such as "project"."""
+        return bool(_WRITTEN_SCALE.search(self.text)) or not _TITLES.isdisjoint(split_words(self.text))
 
     @property
     def room_types(self) -> tuple[str, ...]:
@@ -177,6 +196,51 @@ class Drawing:
             [replace(patch, shape=shape(patch.shape)) for patch in self.patches],
             [replace(fixture, shape=shape(fixture.shape)) for fixture in self.fixtures],
         )
+
+
+def without_frames(drawing: Drawing, most: int = 4) -> tuple[Drawing, list[BaseGeometry]]:
+    """Return a drawing in metres without the frames of its sheet and what they touch, such as a title block; and these.
+
+    A frame is a rectangle around most lines, which are away from it, of a sheet's proportions or with a title. Up to
+    `most` frames around each other are found.
+    """
+    items = [*drawing.areas, *drawing.strokes]
+    lines = [item.line if isinstance(item, Stroke) else item.shape.boundary for item in items]
+    if not items or not most:
+        return drawing, []
+    tree, whole = shapely.STRtree(lines), shapely.box(*shapely.total_bounds(lines))
+    outlines = [area.shape for area in drawing.areas if not area.is_dark]
+    large = [box for box in shapely.envelope(outlines) if box.area >= _MOST * whole.area]
+    for box in distinct([whole, *sorted(large, key=lambda box: -box.area)])[:most]:
+        edge = box.boundary.buffer(_ON_BOX_M)
+        along = shapely.intersection(tree.geometries[tree.query(edge, predicate="intersects")], edge)
+        if shapely.union_all(along).length < _DRAWN * box.length:
+            continue
+        own = _beside(tree, box.boundary)
+        rest = [line for index, line in enumerate(lines) if index not in own and box.covers(line)]
+        inner = shapely.box(*shapely.total_bounds(rest)) if rest else shapely.Polygon()
+        inside = [text for text in drawing.letterings if box.covers(shapely.Point(text.position))]
+        names = [inner.covers(shapely.Point(text.position)) for text in inside if text.room_types]
+        short, long = side_lengths(box)
+        is_sheet = bool(np.any(np.abs(long / short / _SHEETS - 1.0) < _SAME_SIDES))
+        titles = sum(text.is_title for text in inside)
+        is_frame = (is_sheet or titles) and (any(names) or not names) if rest else titles > bool(names)
+        if is_frame and all(items[index].role is None for index in own):
+            left = [item for index, item in enumerate(items) if index not in own]
+            areas, strokes = ([item for item in left if isinstance(item, kind)] for kind in (Area, Stroke))
+            found, frames = without_frames(replace(drawing, areas=areas, strokes=strokes), most - 1)
+            return found, [box, *frames]
+    return drawing, []
+
+
+def _beside(tree: shapely.STRtree, frame: BaseGeometry) -> set[int]:
+    """Return the numbers of the lines that are connected with a frame, or are beside it."""
+    found, new = set[int](), np.array([frame])
+    while len(new):
+        near = set(tree.query(new, predicate="dwithin", distance=_BESIDE_FRAME_M)[1].tolist()) - found
+        found |= near
+        new = tree.geometries[list(near)]
+    return found
 
 
 def fit_swing(
