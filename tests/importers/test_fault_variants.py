@@ -224,17 +224,16 @@ def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple
     assert any("never seen" in line for line in plan.report.unsure)
 
 
-def _storeys(*layers: str) -> dict[str, list[float]]:
-    """Return the areas of the storeys of a drawing with a wall of 8 x 6 m, and a partition, on each layer."""
+def _storeys(*layers: str, offset: float = 0.0) -> tuple[ImportedPlan, ...]:
+    """Return the storeys of a drawing with a wall of 8 x 6 m, and a partition, on each layer, each inside the last."""
     document: Any = new_dxf("R2010", units=6)
     for number, layer in enumerate(layers):
-        for inner in (0.0, 0.3):
+        for inner in (offset * number, offset * number + 0.3):
             ring = [(inner, inner), (8.0 - inner, inner), (8.0 - inner, 6.0 - inner), (inner, 6.0 - inner)]
             document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
         for x in (3.0 + number, 3.2 + number):
             document.modelspace().add_line((x, 0.3), (x, 5.7), dxfattribs={"layer": layer})
-    plans = import_plans(dxf_file(document))
-    return {plan.level.name if plan.level else "": _areas(plan) for plan in plans}
+    return import_plans(dxf_file(document))
 
 
 @pytest.mark.parametrize(
@@ -248,12 +247,42 @@ def _storeys(*layers: str) -> dict[str, list[float]]:
         (("1NP-ZDI", "2NP-ZDI"), ("1NP", "2NP")), (("壁1階", "壁2階"), ("1F", "2F")), (("SEINAT_1KRS",) * 2, ("",)),
         (("VEGG 2.etg", "VEGG 1.etg"), ("1.etg", "2.etg")), (("MURI_P1", "MURI_PT"), ("PT", "P1")),
         (("WALL_0", "EG-Wand", "OG-Wand"), ("EG", "OG")), (("EG-Wand", "WALL_0", "OG-Wand"), ("EG", "OG")),
+        (("2_WALL", "1_WALL"), ("1", "2")), (("Walls 01", "Walls 02"), ("01", "02")), (("WALL1", "WALL2"), ("",)),
+        (("WAND-0", "WAND-1"), ("0", "1")), (("Muro +3.00", "Muro -0.20"), ("-0.20", "+3.00")),
+        (("EG_Raum", "OG_Raum"), ("EG", "OG")),
     ],
 )  # fmt: skip
 def test_words_for_storeys_count_before_numbers_of_layers(layers: tuple[str, ...], names: tuple[str, ...]):
-    found = _storeys(*layers)
-    assert tuple(found) == names
-    assert len(names) != len(layers) or sorted(found.values()) == [[20.0, 18.9], [24.3, 14.6]]
+    plans = _storeys(*layers)
+    assert tuple(plan.level.name if plan.level else "" for plan in plans) == names
+    if len(names) == len(layers) and "Raum" not in layers[0]:
+        assert sorted(map(_areas, plans)) == [[20.0, 18.9], [24.3, 14.6]]
+    merged = [line for line in plans[0].report.warnings if "run around the same outline" in line]
+    assert len(merged) == (layers[0] in ("Wand_EI30", "WALL1"))
+
+
+def test_leaves_of_walls_that_layers_count_are_of_one_storey():
+    (plan,) = _storeys("WALL-1", "WALL-2", offset=0.15)
+    assert "run around the same outline" not in "".join(plan.report.warnings)
+
+
+@pytest.mark.parametrize("hidden", ["frozen", "invisible", "unplotted"])
+def test_hidden_parts_of_a_drawing_are_not_read(hidden: str):
+    document = _drawn_rooms("Rooms", "Rooms")
+    layer = document.layers.add("Old")
+    block = document.blocks.new("part")
+    block.add_lwpolyline([(0, 4), (4, 4), (4, 7), (0, 7)], close=True, dxfattribs={"layer": "Rooms"})
+    part = document.modelspace().add_blockref("part", (0, 0), dxfattribs={"layer": "Old"})
+    if hidden == "unplotted":
+        layer.dxf.plot = 0
+        document.modelspace().add_line((2.0, 0.0), (2.0, 3.0), dxfattribs={"layer": "Old"})
+    elif hidden == "frozen":
+        layer.freeze()
+    else:
+        part.dxf.invisible = 1
+    plan = import_plan(dxf_file(document))
+    assert _areas(plan) == [12.0] * (3 if hidden == "unplotted" else 2)
+    assert ("layer 'Old' is not plotted, and was left out" in "".join(plan.report.warnings)) == (hidden == "unplotted")
 
 
 def _robot_map(*segments: list[list[int]], walls: list[list[int]]) -> bytes:

@@ -46,8 +46,13 @@ _NUMBERED = re.compile(
 )
 # A number of a storey with a word of another script.
 _OTHER_SCRIPTS = re.compile(r"(\d{1,2}) ?(?:[階层層]|этаж)", re.IGNORECASE)
+# Height of a storey: "Muro +3.00".
+_HEIGHT = re.compile(r"(?:[+±]|(?<![^\s_])-)\d{1,3}[.,]\d{2}(?!\d)")
 # Parts of names of layers, and share of a smaller storey's box that one covers.
 _PARTS, _OVER = re.compile(r"[^\w+]+|_"), 0.5
+# Lines nearer than this (m) are the same. Share of an outline that storeys over each other both run along, and of the
+# lines of each that the other lacks; layers that are compared.
+_SAME_LINE_M, _MOSTLY_ALONG, _OWN, _MOST_COMPARED = 0.05, 0.5, 0.02, 8
 
 
 def assemble_storeys(
@@ -221,35 +226,72 @@ def by_storey(
         report.notes.append(f"storey '{level.name}' by the names of layers; layers without a storey belong to all")
         return make(part, report, level)
 
-    storeys = storeys_of(drawing)
+    storeys = storeys_of(drawing, builder)
     return assemble_levels(storeys, options, budget, make_level) if storeys else (make(drawing, builder, None),)
 
 
-def storeys_of(drawing: Drawing) -> dict[str, tuple[Level, Drawing]]:
-    """Return the parts of a drawing by storey; empty if its walls are of one."""
-    walls: defaultdict[float, list[BaseGeometry]] = defaultdict(list)
-    others: set[float] = set()
-    names: dict[float, str] = {}
-    for item in (*drawing.strokes, *drawing.areas):
-        storey = _storey(item.layer)
-        if storey is not None and item.role == "wall":
-            if names.get(storey[1], "0").isdecimal():
-                names[storey[1]] = storey[0]
-            walls[storey[1]].append(item.line if isinstance(item, Stroke) else item.shape)
-        elif storey is not None:
-            others.add(storey[1])
-    others |= {storey[1] for text in drawing.letterings if (storey := _storey(text.layer)) is not None}
-    # Numbers count walls as well as storeys, unless other layers have the same ones.
-    named = {number for number in walls if not names[number].isdecimal() or number in others}
-    boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in named}
+def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Level, Drawing]]:
+    """Return the parts of a drawing by storey; empty if its walls are of one.
+
+    Layers of walls named by words for storeys are over each other. Numbers can count walls as well: they are storeys if
+    other layers have the same ones, or if their walls run around the same outline. Other layers give a warning then.
+    """
+    drawn = [(item.layer, item.role, item) for item in (*drawing.strokes, *drawing.areas)]
+    main = next((role for role in ("wall", "room") if any(role == found for _, found, _ in drawn)), None)
+    walls: defaultdict[float | str, list[BaseGeometry]] = defaultdict(list)
+    names: dict[float | str, str] = {}
+    for layer, role, item in drawn:
+        name, number = _storey(layer) or (layer, layer)
+        if role == main:
+            if names.get(number, "0").isdecimal():
+                names[number] = name
+            walls[number].append(item.line if isinstance(item, Stroke) else item.shape.boundary)
+    others = {_storey(layer) for layer in {layer for layer, role, _ in drawn if role != main}}
+    others |= {_storey(layer) for layer in {text.layer for text in drawing.letterings}}
+    numbered = {found[1] for found in others if found is not None}
+    largest = sorted(walls, key=lambda key: -shapely.length(walls[key]).sum())[:_MOST_COMPARED]
+    around = {key for a, b in combinations(largest, 2) if _are_over_each_other(walls[a], walls[b]) for key in (a, b)}
+    storeys = [
+        key
+        for key in walls
+        if isinstance(key, float) and (key in around or (main and (key in numbered or not names[key].isdecimal())))
+    ]
+    boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in storeys}
     pairs = combinations(boxes.values(), 2)
     if len(boxes) < 2 or not all(a.intersection(b).area >= _OVER * min(a.area, b.area) for a, b in pairs):
+        if around:
+            layers = " and ".join(f"'{names[key]}'" for key in walls if key in around)
+            builder.warnings.append(
+                f"lines on the layers {layers} run around the same outline, and were read as one storey; if they are "
+                "of several, set layers to those of one"
+            )
         return {}
 
     def part(number: float) -> Drawing:
-        return drawing.on_layers(lambda layer: (storey := _storey(layer)) is None or storey[1] == number)
+        return drawing.on_layers(
+            lambda layer: (
+                (found := _storey(layer)) is None
+                or found[1] == number
+                or (found[0].isdecimal() and found[1] not in boxes)
+            )
+        )
 
     return {names[number]: (Level(names[number], number), part(number)) for number in boxes}
+
+
+def _are_over_each_other(first: Sequence[BaseGeometry], second: Sequence[BaseGeometry]) -> bool:
+    """Return whether the lines of both run around most of the same outline, and both have others as well."""
+    small, large = sorted(
+        (shapely.convex_hull(shapely.GeometryCollection(g)) for g in (first, second)), key=lambda hull: hull.area
+    )
+    along = small.boundary.intersection(large.boundary.buffer(_SAME_LINE_M))
+    least = _MOSTLY_ALONG * small.length
+    if not small.area or along.length < least:
+        return False
+    a, b = shapely.union_all(first), shapely.union_all(second)
+    near_a, near_b = a.buffer(_SAME_LINE_M), b.buffer(_SAME_LINE_M)
+    own = (a.difference(near_b).length / a.length, b.difference(near_a).length / b.length)
+    return along.intersection(near_a).intersection(near_b).length >= least and min(own) > _OWN
 
 
 @lru_cache(maxsize=1024)
@@ -268,5 +310,7 @@ def _storey(layer: str) -> tuple[str, float] | None:
                 return whole if digit or key != word else letters, _counted(float(_STOREYS[key]), abs(digit))
         if (after or before) and (word in _BESIDE or (is_joined and word in _JOINED)):
             return layer[found.start() : max(found.end(), found.end(4))], float(after or before)
+    if (height := _HEIGHT.search(layer)) is not None:
+        return height[0], float(height[0].replace(",", ".").replace("±", ""))
     numbers = (part for part in _PARTS.split(layer) if part.isdecimal() and len(part) <= 2 and part != layer)
     return next(((part, float(part)) for part in numbers), None)
