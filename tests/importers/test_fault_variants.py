@@ -103,6 +103,28 @@ def test_copies_titles_and_parts_of_texts_of_an_svg_are_read():
         assert any(said in line for line in plan.report.warnings)
 
 
+_ROOM = '<rect class="room" width="50" height="40"/>'
+
+
+@pytest.mark.parametrize(
+    ("drawn", "first"),
+    [
+        ('<symbol id="a" viewBox="0 0 50 40">{}</symbol><use href="#a" x="90" width="500" height="400"/>', (20.0, 0.9)),
+        ('<symbol id="a" viewBox="50 0 50 40">{}</symbol><use href="#a" width="500" height="400"/>', (20.0, -5.0)),
+        ('<symbol id="a" viewBox="0 0 50 40">{}</symbol><use href="#a" width="500" height="300"/>', (11.2, 0.62)),
+        ('<svg viewBox="0 0 50 40" width="500" height="300" preserveAspectRatio="xMaxYMid">{}</svg>', (11.2, 1.25)),
+        ('<svg viewBox="0 0 50 40" width="500" height="300" preserveAspectRatio="none">{}</svg>', (15.0, 0.0)),
+        ('<svg x="50%" width="50%" height="50%" viewBox="0 0 60 45">{}</svg>', (20.0, 6.0)),
+        ('<svg x="1in" y="0">{}</svg>', (0.2, 0.96)),
+        ('<svg viewBox="0 0 1e-300 1e-300" width="1e300" height="1">{0}</svg><g>{0}</g>', (0.2, 0.0)),
+    ],
+)  # fmt: skip
+def test_nested_drawings_and_symbols_have_the_place_and_size_of_their_views(drawn: str, first: tuple[float, float]):
+    plan = _svg('<rect class="room" x="5150" width="300" height="400"/>', drawn.format(_ROOM))
+    ((area, x),) = ((shape.area, shape.bounds[0]) for shape in shapes(plan.document) if shape.bounds[0] < 50.0)
+    assert (area, x) == pytest.approx(first, abs=0.06)
+
+
 def test_unused_outlines_are_reported_with_layer_and_share():
     rooms = [f'<rect id="room-{x}" x="{x}" y="0" width="500" height="400"/>' for x in (0, 515)]
     plan = _svg(*rooms, '<rect id="Spielecke" x="0" y="415" width="500" height="400"/>')

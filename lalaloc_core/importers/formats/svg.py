@@ -41,7 +41,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     is_bluish,
     is_dark,
 )
-from lalaloc_core.importers.formats.svg_limits import check_work
+from lalaloc_core.importers.formats.svg_limits import HREF, check_work
 
 # Attribute of the root element with the scale of exported drawings.
 _SCALE_ATTRIBUTE = "data-metres-per-unit"
@@ -56,11 +56,15 @@ _AUTOMATIC = re.compile(
 )
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_ANY_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc|px|%|)")
+# Attributes of the view of a drawing or symbol, and shares of the free space before it.
+_OF_VIEW = ("x", "y", "width", "height", "viewBox", "preserveAspectRatio", "transform")
+_ALIGNED = {"Min": 0.0, "Mid": 0.5, "Max": 1.0}
 _LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc)\s*")
 # Fills that are less opaque do not hide what is below them.
 _OPAQUE = 0.9
 # Elements without a shape, and elements that are drawn only where they are used.
-_IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker")
+_IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker", "mask", "clipPath")
 # Export at 1:100: user units per metre, millimetres on paper per metre, and margin.
 _UNITS_PER_M, _MM_PER_M, _MARGIN_M = 100.0, 10.0, 0.5
 _STYLE = (
@@ -106,15 +110,10 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     texts = sum(any(text.strip() for text in element.itertext()) for element in hypertexts)
     for parent in list(root.iter()):
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
-        # Symbols are drawn where they are used, as the library draws all but definitions.
-        if local_name(parent) == "symbol":
-            inner = Element(f"{_SVG}g", parent.attrib)
-            inner[:] = list(parent)
-            parent.clear()
-            parent.tag = f"{_SVG}defs"
-            parent.append(inner)
-        elif local_name(parent) == "text":
+        if local_name(parent) == "text":
             _join_parts(parent)
+    views = {e.get("id"): dict(e.attrib) for e in root.iter() if local_name(e) in ("symbol", "svg") and e is not root}
+    _place_views(root, views, _view(root.attrib, (0.0, 0.0))[0])
     check_work(root, budget)
     # The title of a shape is its name, unless it has one; the title of the drawing names nothing.
     for element in root.iter():
@@ -138,6 +137,53 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "save the styles as attributes"
         )
     return _read_plan(root, warnings, options, budget)
+
+
+def _place_views(parent: Element, views: Mapping[str | None, Mapping[str, str]], size: tuple[float, float]) -> None:
+    """Make groups of nested drawings and symbols, with the transforms of their views, which the library reads wrong.
+
+    `views` are their attributes by id, and `size` is that of the view around. Symbols are drawn where they are used.
+    """
+    for element in parent:
+        name, inside, own = local_name(element), size, element.attrib
+        if name == "use" and (target := views.get(own.get("href", own.get(HREF, ""))[1:])) is not None:
+            moved = {key: value for key, value in own.items() if key in ("x", "y", "width", "height")}
+            _, view = _view({**target, "x": "0", "y": "0", **moved}, size)
+            own["transform"] = f"{own.get('transform', '')} {view}"
+            for key in moved:
+                del own[key]
+        elif name in ("svg", "symbol"):
+            inside, view = _view(own, size)
+            inner = Element(f"{_SVG}g", {key: value for key, value in own.items() if key not in _OF_VIEW})
+            inner[:] = list(element)
+            element.clear()
+            element.tag = f"{_SVG}{'defs' if name == 'symbol' else 'g'}"
+            element.set("transform", view)
+            element.append(inner)
+        _place_views(element, views, inside)
+
+
+def _view(attributes: Mapping[str, str], around: tuple[float, float]) -> tuple[tuple[float, float], str]:
+    """Return the size of the view of a drawing or symbol in its own units, and the transform that places it."""
+
+    def length(key: str, usual: str, whole: float) -> float:
+        found = _ANY_LENGTH.match(attributes.get(key, usual)) or _ANY_LENGTH.match(usual)
+        number, unit = (float(found[1]), found[2]) if found is not None else (0.0, "")
+        return number * (0.01 * whole if unit == "%" else _METRES.get(unit, _METRES["px"]) / _METRES["px"])
+
+    x, y = length("x", "0", around[0]), length("y", "0", around[1])
+    width, height = length("width", "100%", around[0]), length("height", "100%", around[1])
+    box = [float(number) for number in _NUMBER.findall(attributes.get("viewBox", ""))]
+    left, top, wide, high = box if len(box) == 4 and min(box[2:]) > 0.0 else (0.0, 0.0, width, height)
+    scales = width / (wide or 1.0), height / (high or 1.0)
+    fit = attributes.get("preserveAspectRatio", "xMidYMid")
+    if "none" not in fit:
+        scales = (max(scales) if "slice" in fit else min(scales),) * 2
+    free = (width - scales[0] * wide, height - scales[1] * high)
+    shares = (next((share for word, share in _ALIGNED.items() if axis + word in fit), 0.5) for axis in "xY")
+    across, down = (rest * share for rest, share in zip(free, shares, strict=True))
+    place = f"translate({x + across - scales[0] * left!r} {y + down - scales[1] * top!r})"
+    return (wide, high), f"{attributes.get('transform', '')} {place} scale({scales[0]!r} {scales[1]!r})"
 
 
 def _join_parts(text: Element) -> None:
@@ -226,8 +272,10 @@ def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
     sides = [_LENGTH.fullmatch(root.get(key, "")) for key in ("width", "height")]
     width_m, height_m = (0.0 if side is None else float(side[1]) * _METRES[side[2]] for side in sides)
     numbers = [float(number) for number in _NUMBER.findall(root.get("viewBox", ""))]
-    units = numbers[2] if len(numbers) == 4 else width_m / _METRES["px"]
-    return (width_m / units, max(width_m, height_m)) if width_m > 0.0 and units > 0.0 else (None, None)
+    units = numbers[2:] if len(numbers) == 4 else [width_m / _METRES["px"], height_m / _METRES["px"]]
+    scales = [size / unit for size, unit in zip((width_m, height_m), units, strict=True) if min(size, unit) > 0.0]
+    # A drawing is not stretched by default, and leaves a margin on a sheet of other proportions.
+    return (min(scales), max(width_m, height_m)) if scales else (None, None)
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
@@ -295,7 +343,8 @@ def _is_hidden(element: Any) -> bool:
     values = element.values
     # As "0", "0.0" or "0%".
     is_transparent = not str(values.get("opacity", 1)).strip("0.%")
-    return is_transparent or str(values.get("display")) == "none" or str(values.get("visibility")) == "hidden"
+    is_invisible = str(values.get("visibility")).startswith(("hidden", "collapse"))
+    return is_transparent or is_invisible or str(values.get("display")).startswith("none")
 
 
 def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
