@@ -47,6 +47,8 @@ _NO_FLOOR, _OUTDOOR, _INSIDE = (
 _OPENING_TAGS: Mapping[str, tuple[Role, Role]] = {
     "window": ("window", "ignored"), "door": ("door", "passage"), "entrance": ("door", "ignored"),
 }  # fmt: skip
+# Properties with the name of a level, and of a room.
+_LEVEL_KEYS, _NAME_KEYS = (tuple(PLAN_WORDS["features"][key].split()) for key in ("level_keys", "name_keys"))
 # Points of a line that can be the outline of a room.
 _CORNERS = 3
 # Width (m) of an opening drawn as a point without a width.
@@ -144,7 +146,7 @@ def _refuse_map(features: Sequence[Feature], format: str) -> None:
 def _levels_of(feature: Feature) -> list[str]:
     """Return the ids of a feature's levels, none if it gives none; OpenStreetMap writes "0;1" and "0-2"."""
     found: dict[str, None] = {}
-    for key in ("level_id", "level", "ordinal", "floor", "storey", "repeat_on"):
+    for key in (*_LEVEL_KEYS, "repeat_on"):
         value = feature.properties.get(key)
         if found and key != "repeat_on":
             continue
@@ -325,7 +327,7 @@ def _layer(properties: Mapping[str, Any]) -> str:
 
 
 def _name(properties: Mapping[str, Any]) -> str | None:
-    for key in ("name", "alt_name", "label", "ref", "title"):
+    for key in _NAME_KEYS:
         value = in_english(properties.get(key))
         if isinstance(value, str) and value.strip():
             return value

@@ -123,7 +123,9 @@ def text_hints(letterings: Sequence[Lettering], subject: str) -> list[str]:
 def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:
     """Find the rooms and openings of a drawing in metres, y up."""
     sketch = Sketch(fixtures=drawing.fixtures)
-    drawing, frames = without_frames(drawing)
+    if hidden := len(drawing.strokes) - len(drawing.on_paper().strokes):
+        builder.notes.append(f"{hidden} white lines were left out: they cannot be seen on paper")
+    drawing, frames = without_frames(drawing.on_paper())
     for frame in frames:
         short, long = side_lengths(frame)
         builder.unsure.append(

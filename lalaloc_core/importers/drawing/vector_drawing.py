@@ -31,6 +31,8 @@ from lalaloc_core.importers.common.vocabulary import Role, room_types_from_readi
 
 # Fills of lower luminance (of 255) can be walls.
 _DARK = 110.0
+# Channels of white from here on.
+_WHITE = 250.0
 # Glass is bluer than red by this.
 _BLUER = 20.0
 # Straight pieces per curve.
@@ -71,13 +73,14 @@ class Area:
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """Polyline with the width of its pen, 0 if unknown, and its place in the order of painting."""
+    """Polyline with the width of its pen, 0 if unknown, its place in the order of painting, and whether it is white."""
 
     line: shapely.LineString
     layer: str
     role: Role | None = None
     width: float = 0.0
     order: int = 0
+    is_white: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +156,11 @@ class Drawing:
     def extent(self) -> float:
         """Longer side of the box around areas and lines; NaN without any."""
         return extent_of(self.shapes)
+
+    def on_paper(self) -> Drawing:
+        """Return the drawing without white lines, which hide others, unless most is white, as on a dark ground."""
+        seen = [stroke for stroke in self.strokes if not stroke.is_white or stroke.role is not None]
+        return replace(self, strokes=seen) if 2 * len(seen) + len(self.areas) > len(self.strokes) else self
 
     def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
         """Return what is on some layers; patches, which have none, stay."""
@@ -297,6 +305,11 @@ def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometr
 def is_dark(red: float, green: float, blue: float) -> bool:
     """Return whether a fill can be a wall, by the luminance (ITU-R BT.601) of its channels, 0 to 255."""
     return 0.299 * red + 0.587 * green + 0.114 * blue < _DARK
+
+
+def is_white_pen(red: float, green: float, blue: float) -> bool:
+    """Return whether a line of a colour cannot be seen on paper, by its channels, 0 to 255."""
+    return min(red, green, blue) >= _WHITE
 
 
 def is_bluish(red: float, green: float, blue: float) -> bool:

@@ -338,7 +338,7 @@ def _add(
     kind, role = entity.dxftype(), context.role
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
-        position = _anchor(entity)
+        text, position = text.replace("\\~", " "), _anchor(entity)
         if position is not None and text.strip() and in_range(np.array(position)):
             drawing.letterings += [Lettering(line[:200], position, context.layer) for line in text.splitlines()[:20]]
             builder.use(context.layer, "texts")

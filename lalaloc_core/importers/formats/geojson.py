@@ -92,6 +92,8 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     check_coordinates(shapely.get_coordinates(shape), f"the geometry of {where}")
     given = raw.get("properties")
     properties = dict(given) if isinstance(given, Mapping) else {}
+    # Shapefiles have names of ten capitals.
+    properties = {str(key).casefold(): value for key, value in properties.items()} | properties
     # Some converters of OpenStreetMap data nest its tags.
     if isinstance(properties.get("tags"), Mapping):
         properties = properties["tags"] | {"id": properties.get("id", raw.get("id"))}

@@ -58,8 +58,11 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             budget.hints.append(
                 f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan"
             )
-        if options.crop is not None:
-            found.crop, found.drawing = options.crop, found.drawing.cropped(options.crop)
+        found.crop, paper = options.crop, page.get_cropbox()
+        if options.crop is not None or not shapely.box(*paper).covers(
+            shapely.box(*shapely.total_bounds(found.drawing.shapes))
+        ):
+            found.drawing = found.drawing.cropped(options.crop or paper)
         notes = list(budget.hints)
         budget.hints += text_hints(found.drawing.letterings, f"page {options.page} of the PDF")
         return _read_plan(found, notes, options, budget)

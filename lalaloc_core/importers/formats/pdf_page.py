@@ -31,6 +31,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     fit_swing,
     is_bluish,
     is_dark,
+    is_white_pen,
 )
 
 # Functions that count and return the objects of a page, and those of a form in it.
@@ -39,7 +40,7 @@ _OF_FORM: Any = pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject
 _MAX_FORM_DEPTH = 8
 # Pages' worth of areas that are painted; each takes some milliseconds.
 _MAX_PAINTED = 1000
-# Opacity (of 255) of fills that can be walls, and of fills that hide what is below them.
+# Opacity (of 255) of what can be walls, and of fills that hide what is below them.
 _OPAQUE, _HIDING = 60, 230
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
 # Smallest packed size of a line or area.
@@ -248,8 +249,10 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
     fill, stroke = ctypes.c_int(), ctypes.c_int()
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return 0
-    is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
-    fill_colour = _fill(item) if is_filled else None
+    is_filled = fill.value != pdfium.FPDF_FILLMODE_NONE
+    fill_colour = _colour(item, pdfium.FPDFPageObj_GetFillColor) if is_filled else None
+    pen_colour = _colour(item, pdfium.FPDFPageObj_GetStrokeColor) if stroke.value else None
+    is_stroked, is_white = pen_colour is not None, pen_colour is not None and is_white_pen(*pen_colour[:3])
     is_wall = fill_colour is not None and is_dark(*fill_colour[:3])
     width = ctypes.c_float()
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
@@ -267,15 +270,16 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
             found.painted += float(share)
         swings = [fit_swing(_apply(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
         leaves = [swing for swing in swings if swing is not None]
-        if leaves and not is_filled:
+        if leaves and is_stroked and not is_filled:
             drawing.swings += leaves
-        elif len(points) >= 3 and (subpath.is_closed or is_filled):
+        elif len(points) >= 3 and (subpath.is_closed or is_filled) and (is_stroked or is_filled):
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and is_stroked and (line := shapely.LineString(points)).length > 0.0:
-            drawing.strokes.append(Stroke(line, "", None, pen, drawing.next_order))
+            drawing.strokes.append(Stroke(line, "", None, pen, drawing.next_order, is_white))
     if not shells:
         return out_of_range
-    parts, order = even_odd_polygons(shells), drawing.next_order
+    is_nonzero = fill.value == pdfium.FPDF_FILLMODE_WINDING
+    parts, order = even_odd_polygons(shells, is_nonzero=is_nonzero), drawing.next_order
     if fill_colour is not None and not is_wall and fill_colour[3] >= _HIDING:
         drawing.patches += [Patch(part, order, is_bluish(*fill_colour[:3])) for part in parts]
     # A coloured floor or a white background has no drawn outline.
@@ -329,10 +333,9 @@ def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarra
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _fill(item: Any) -> tuple[float, float, float, float] | None:
-    """Return the channels and the opacity of a fill, 0 to 255; None for one that shows most of what is below it."""
+def _colour(item: Any, get: Any) -> tuple[float, float, float, float] | None:
+    """Return the channels and the opacity of a colour, 0 to 255; None for one that shows most of what is below it."""
     red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
-    is_opaque = pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) and alpha.value >= _OPAQUE
-    if not is_opaque:
+    if not get(item, red, green, blue, alpha) or alpha.value < _OPAQUE:
         return None
     return float(red.value), float(green.value), float(blue.value), float(alpha.value)

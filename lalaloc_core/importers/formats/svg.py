@@ -40,6 +40,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     fit_swing,
     is_bluish,
     is_dark,
+    is_white_pen,
 )
 from lalaloc_core.importers.formats.svg_limits import HREF, check_work
 
@@ -54,6 +55,8 @@ _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _AUTOMATIC = re.compile(
     r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I
 )
+# A character in an id of Illustrator.
+_ESCAPED = re.compile(r"_x([0-9A-F]{2,4})_")
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _ANY_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc|px|%|)")
@@ -61,8 +64,8 @@ _ANY_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc|px|%|)")
 _OF_VIEW = ("x", "y", "width", "height", "viewBox", "preserveAspectRatio", "transform")
 _ALIGNED = {"Min": 0.0, "Mid": 0.5, "Max": 1.0}
 _LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc)\s*")
-# Fills that are less opaque do not hide what is below them.
-_OPAQUE = 0.9
+# Fills that are less opaque do not hide what is below them, and lines are invisible.
+_OPAQUE, _INVISIBLE = 0.9, 0.2
 # Elements without a shape, and elements that are drawn only where they are used.
 _IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker", "mask", "clipPath")
 # Export at 1:100: user units per metre, millimetres on paper per metre, and margin.
@@ -357,9 +360,12 @@ def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
 def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
     name = _name_of(element, context)
     fill: Any = element.fill
-    is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
+    is_filled = fill is not None and fill.value is not None and fill.opacity > _INVISIBLE
     is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
-    width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
+    pen: Any = element.stroke
+    is_stroked = pen is not None and pen.value is not None
+    is_white = is_stroked and is_white_pen(float(pen.red), float(pen.green), float(pen.blue))
+    width = element.stroke_width if is_stroked else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(element, budget):
         swings = [fit_swing(curve, context.layer) for curve in curves] if context.role in (None, "door") else []
@@ -367,20 +373,23 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         if leaves:
             drawing.swings += leaves
             builder.use(context.layer, "door swings", len(leaves))
+        elif is_stroked and pen.opacity <= _INVISIBLE and not closed and context.role is None:
+            builder.use(context.layer, "ignored (invisible)")
         elif len(points) >= 4 and (closed or (context.role in ("room", "wall", "obstacle") and is_filled)):
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
             line, order = shapely.LineString(points), drawing.next_order
-            drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order))
+            drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order, is_white))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
         elif not len(points):
             builder.use(context.layer, "ignored (coordinates out of range)")
     order = drawing.next_order
-    for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
+    is_nonzero = is_filled and str(element.values.get("fill-rule", "nonzero")) == "nonzero"
+    for shape in even_odd_polygons(shells, is_nonzero=is_nonzero) if len(shells) > 1 else shells:
         if fill is not None and is_filled and not is_wall and context.role is None and fill.opacity > _OPAQUE:
             drawing.patches.append(Patch(shape, order, is_bluish(float(fill.red), float(fill.green), float(fill.blue))))
-        pen = float(width or 0.0)
-        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, pen, order))
+        width = float(width or 0.0)
+        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, width, order))
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
 
 
@@ -426,7 +435,7 @@ def _name_of(element: Any, context: _Context) -> str | None:
     """Return the label or id of a room's shape, else the words of its class besides "room"."""
     own = element.values.get("attributes") or {}
     for key in (_LABEL, "data-name", "id"):
-        text = str(own.get(key) or "").strip()
+        text = _ESCAPED.sub(lambda found: chr(int(found[1], 16)), str(own.get(key) or "")).strip()
         if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_from_name(text) is None):
             return text.replace("_", " ")
     if context.role != "room" or context.kind is None:
