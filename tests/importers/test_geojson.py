@@ -150,39 +150,6 @@ def test_order_of_coordinates_is_found_or_said(longitude: float, latitude: float
         assert shapes(plan.document)[0].area == pytest.approx(12.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("stated", "properties", "doors", "exchanged"),
-    [
-        (False, {}, ([[2, 4.1], [2.9, 4.1]], [[6.1, 1], [6.1, 1.9]]), True), (False, {"area": 24.0}, (), True),
-        (True, {"area": "24.0"}, (), False), (True, {}, (), False), (False, {}, (), False),
-        # A double and a single door, as they are stated.
-        (True, {}, ([[2, 4.1], [3.33, 4.1]], [[6.1, 1], [6.1, 1.9]]), False),
-    ],
-)  # fmt: skip
-def test_order_of_coordinates_is_found_by_widths_and_areas(
-    stated: bool, properties: dict, doors: tuple[list, ...], exchanged: bool
-):
-    boxes = ((0, 0, 6, 4), (6.2, 0, 12.2, 4), (0, 4.2, 6, 8.2))
-    rooms = [_feature([[a, b], [c, b], [c, d], [a, d]], feature_type="unit", **properties) for a, b, c, d in boxes]
-    features = [*rooms, *(_feature(list(door), "LineString", feature_type="opening") for door in doors)]
-    for feature in features:
-        geometry = feature["geometry"]
-        points = np.array(geometry["coordinates"])
-        points = points if stated else points[..., ::-1]
-        # The first position of a ring can be missing at its end.
-        geometry["coordinates"] = points[:, :-1].tolist() if geometry["type"] == "Polygon" else points.tolist()
-    plan = import_plan(_collection(*features))
-    assert any("latitude and longitude, and were read so" in line for line in plan.report.warnings) == exchanged
-    assert (sum(room.area for room in shapes(plan.document)) == pytest.approx(72.0, abs=0.01)) == (stated or exchanged)
-
-
-def test_open_outlines_of_rooms_are_closed():
-    outline = [[0, 0], [4, 0], [4, 3], [0, 3]]
-    plan = import_plan(_collection(_feature(outline, "LineString", feature_type="unit", name="A")))
-    assert shapes(plan.document)[0].area == pytest.approx(12.0, abs=1e-3)
-    assert "the open outline of 'A' was closed" in plan.report.notes
-
-
 def test_imdf_kiosks_are_holes_and_windows_are_kept():
     shaft = _feature([[1, 1], [1.5, 1], [1.5, 1.5], [1, 1.5]], feature_type="kiosk", level_id="L")
     unit = _feature([[0, 0], [4, 0], [4, 3], [0, 3]], feature_type="unit", category="restroom",

@@ -71,25 +71,6 @@ def _box(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
 
 
-@pytest.mark.parametrize("kind", ["Curve2D", "GeometricCurveSet"])
-def test_spaces_with_an_outline_alone_are_rooms(kind: str):
-    model = ifc_flat()
-    for space in model.file.by_type("IfcSpace"):
-        (shape,) = space.Representation.Representations
-        outlines = [shape.Items[0].SweptArea.OuterCurve]
-        if space.LongName == "Wohnen":
-            points = [
-                model.file.create_entity("IfcCartesianPoint", [float(v) for v in p]) for p in _box(5e3, 1e3, 6e3, 2e3)
-            ]
-            outlines.append(model.file.create_entity("IfcPolyline", [*points, points[0]]))
-        shape.RepresentationIdentifier, shape.RepresentationType = "FootPrint", kind
-        as_set = kind == "GeometricCurveSet"
-        shape.Items = [model.file.create_entity(f"Ifc{kind}", outlines)] if as_set else outlines
-    plan = import_plan(model.content())
-    assert sorted(round(room.area, 1) for room in shapes(plan.document)) == [11.8, 13.6]
-    assert "space 'Küche' is 0.00 m high, outside" in plan.report.warnings[0]
-
-
 def ifc_flat() -> _Model:
     model = _Model()
     model.spaces(

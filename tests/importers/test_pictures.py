@@ -375,11 +375,8 @@ def test_skew_is_found(degrees: float):
     assert find_skew(turned) == pytest.approx(-degrees, abs=0.15)
 
 
-def vector_pdf(more: str = "", catalog: str = "", resources: str = "", page: str = "", *others: str) -> bytes:
-    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres.
-
-    The next three are more members of dictionaries, and `others` are more objects, from number 6.
-    """
+def vector_pdf(more: str = "") -> bytes:
+    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres."""
     centimetre = 72 / 2.54
     content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n{more}\n"
     for x, y, w, h in [
@@ -393,13 +390,12 @@ def vector_pdf(more: str = "", catalog: str = "", resources: str = "", page: str
     for line in range(8):
         content += f"7 {4 + 0.1 * line:.1f} m 8 {4 + 0.1 * line:.1f} l S\n"
     objects = [
-        f"<< /Type /Catalog /Pages 2 0 R {catalog} >>",
+        "<< /Type /Catalog /Pages 2 0 R >>",
         "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 400 300] /Contents 4 0 R {page} "
-        f"/Resources << /Font << /F1 5 0 R >> {resources} >> >>",
+        "<< /Type /Page /Parent 2 0 R /MediaBox [0 0 400 300] /Contents 4 0 R "
+        "/Resources << /Font << /F1 5 0 R >> >> >>",
         f"<< /Length {len(content)} >>\nstream\n{content}endstream",
         "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-        *others,
     ]
     out, offsets = "%PDF-1.4\n", []
     for number, body in enumerate(objects, 1):
@@ -422,31 +418,6 @@ def test_pdf_with_lines_is_read_as_a_drawing(picture: str, count: int):
     assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.35 * 5.0, 4.55 * 5.0], rel=5e-3)
     (door,) = lines(plan.document, "door")
     assert door.length == pytest.approx(0.9, abs=0.02)
-
-
-_WALL = "2 0 0.1 5.3 re f"
-_FORM = f"<< /Subtype /Form /BBox [0 0 99 99] /OC 6 0 R /Length {len(_WALL)} >>\nstream\n{_WALL}\nendstream"
-
-
-@pytest.mark.parametrize(
-    ("states", "drawn", "layer", "named"),
-    [
-        ("/OFF [6 0 R]", "/OC /L BDC {} EMC", "<< /Type /OCG /Name (New) >>", "'New'"),
-        ("/BaseState /OFF /ON [7 0 R]", "/OC /L BDC {} EMC", "<< /Type /OCG /Name <FEFF00C400DF> >>", "'Äß'"),
-        ("/OFF [7 0 R]", "/OC /L BDC {} EMC", "<< /Type /OCMD /OCGs [7 0 R] >>", "one without a name"),
-        ("", "/OC /L BDC {} EMC", "<< /Type /OCMD /VE [/Not 7 0 R] >>", "one without a name"),
-        ("/OFF [6 0 R]", "/X Do", "<< /Type /OCG /Name (New) >>", "one without a name"),
-        ("", "/OC /L BDC {} EMC", "<< /Type /OCG /Name (New) >>", ""),
-    ],
-)
-def test_layers_of_a_pdf_that_are_switched_off_are_not_read(states: str, drawn: str, layer: str, named: str):
-    catalog = f"/OCProperties << /OCGs [6 0 R 7 0 R] /D << {states} >> >>"
-    resources = "/Properties << /L 6 0 R >> /XObject << /X 8 0 R >>"
-    other = "<< /Type /OCG /Name (Old) >>"
-    plan = import_plan(vector_pdf(drawn.format(_WALL), catalog, resources, "/UserUnit 1", layer, other, _FORM))
-    assert len(shapes(plan.document)) == (2 if named else 3)
-    said = [note for note in plan.report.notes if "switched off" in note]
-    assert [note.split(": ")[1].split(";")[0] for note in said] == ([named] if named else [])
 
 
 @pytest.mark.slow
