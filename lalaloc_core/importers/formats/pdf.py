@@ -58,11 +58,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             budget.hints.append(
                 f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan"
             )
-        found.crop, paper = options.crop, page.get_cropbox()
-        if options.crop is not None or not shapely.box(*paper).covers(
-            shapely.box(*shapely.total_bounds(found.drawing.shapes))
-        ):
-            found.drawing = found.drawing.cropped(options.crop or paper)
+        found.crop, paper, shapes = options.crop, options.crop or page.get_cropbox(), found.drawing.shapes
+        if options.crop is not None or (shapes and not shapely.covers(shapely.box(*paper), shapes).all()):
+            found.drawing = found.drawing.cropped(paper)
         notes = list(budget.hints)
         budget.hints += text_hints(found.drawing.letterings, f"page {options.page} of the PDF")
         return _read_plan(found, notes, options, budget)

@@ -8,6 +8,7 @@ import io
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,7 +47,7 @@ _MAX_TEXTS, _MAX_LENGTH = 5000, 200
 # Smallest packed size of a line or area.
 _BYTES_PER_SHAPE = 4
 # Pixels of the longer side of a page on which hidden objects are looked for, and bytes of the name of a layer.
-_SEEN_PX, _NAME_BYTES = 1000, 200
+_SEEN_PX, _NAME_BYTES = 400, 200
 _LAYER, _USER_UNIT = re.compile(rb"/OC(?:G|MD)\b"), re.compile(rb"/UserUnit\s+(\d{1,5}(?:\.\d{1,9})?)")
 # Members of layers that are shown depending on others.
 _CONDITION, _MARKS_OF_ORDER = re.compile(rb"/(?=(?:VE|OCGs)\s*[\[\d])[VO]"), (codecs.BOM_UTF16_BE, codecs.BOM_UTF16_LE)
@@ -110,9 +111,10 @@ def read_page(page: pypdfium2.PdfPage, number: int, budget: Budget) -> PageConte
     Objects on layers that are switched off are made inactive, so that the page is drawn without them, too.
     """
     budget.check_copies(_count_shapes(page.raw, budget), _BYTES_PER_SHAPE)
-    found = _read_objects(page, budget)
+    spent, found = budget.entities, _read_objects(page, budget)
     unit, hidden = None, Counter[str]()
-    with pypdfium2.PdfDocument.new() as alone, io.BytesIO() as file:
+    # A page that cannot be copied has no layers that are known.
+    with suppress(pypdfium2.PdfiumError), pypdfium2.PdfDocument.new() as alone, io.BytesIO() as file:
         # The dictionaries of the file can be compressed; those of a copy of its page are not.
         alone.import_pages(page.pdf, [number - 1])
         alone.save(file)
@@ -121,6 +123,7 @@ def read_page(page: pypdfium2.PdfPage, number: int, budget: Budget) -> PageConte
             with pypdfium2.PdfDocument(_CONDITION.sub(b"/-", file.getvalue())) as copy:
                 hidden = _hide(page, copy[0], budget)
     if hidden:
+        budget.entities = spent
         found = _read_objects(page, budget)
     # The library takes the unit for a point.
     found.hidden, found.unit_m = hidden, _METRES_PER_POINT * ((unit and float(unit[1])) or 1.0)
@@ -138,7 +141,8 @@ def _read_objects(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
     """Return the paths of a page, and the share that pictures cover."""
     width, height = page.get_size()
     found = PageContent(page, size_pt=(float(width), float(height)))
-    for item, matrix, _ in _objects(page.raw, np.eye(3), budget):
+    for item, matrix, _ in _objects(page.raw, np.eye(3)):
+        budget.spend()
         kind = pdfium.FPDFPageObj_GetType(item)
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
             found.out_of_range += _add_path(item, matrix, found, budget)
@@ -164,9 +168,9 @@ def _hide(page: pypdfium2.PdfPage, copy: pypdfium2.PdfPage, budget: Budget) -> C
     document without states and conditions.
     """
     layers: defaultdict[tuple[str, ...], list[tuple[Any, Any]]] = defaultdict(list)
-    drawn = (_objects(part.raw, np.eye(3), budget) for part in (page, copy))
-    for (item, _, names), (same, _, _) in zip(*drawn, strict=True):
-        layers[names].append((item, same))
+    drawn, same = (list(_objects(part.raw, np.eye(3))) for part in (page, copy))
+    for (item, _, names), (copied, _, _) in zip(drawn, same, strict=False):
+        layers[names].append((item, copied))
     pairs = [pair for group in layers.values() for pair in group]
     _activate(pairs, is_active=False)
 
@@ -213,12 +217,11 @@ def _count_shapes(holder: Any, budget: Budget, depth: int = 0) -> int:
 
 
 def _objects(
-    holder: Any, matrix: Matrix, budget: Budget, depth: int = 0, layers: tuple[str, ...] = ()
+    holder: Any, matrix: Matrix, depth: int = 0, layers: tuple[str, ...] = ()
 ) -> Iterator[tuple[Any, Matrix, tuple[str, ...]]]:
     """Yield active objects with the matrix to page coordinates, and the names of their layers; forms are expanded."""
     count, get = _OF_FORM if depth else _OF_PAGE
     for index in range(count(holder)):
-        budget.spend()
         item = get(holder, index)
         own, active = pdfium.FS_MATRIX(), ctypes.c_int()
         if not item or not pdfium.FPDFPageObj_GetMatrix(item, own):
@@ -230,7 +233,7 @@ def _objects(
         if pdfium.FPDFPageObj_GetType(item) != pdfium.FPDF_PAGEOBJ_FORM:
             yield item, total, names
         elif depth < _MAX_FORM_DEPTH:
-            yield from _objects(item, total, budget, depth + 1, names)
+            yield from _objects(item, total, depth + 1, names)
 
 
 def _layers_of(item: Any) -> Iterator[str]:
