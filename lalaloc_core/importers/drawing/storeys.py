@@ -234,28 +234,21 @@ def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Leve
     """Return the parts of a drawing by storey; empty if its walls are of one.
 
     Layers of walls named by words for storeys are over each other. Numbers can count walls as well: they are storeys if
-    other layers have the same ones, or if their walls run around the same outline. Other layers give a warning then.
+    their walls run around the same outline. Other layers give a warning then.
     """
-    drawn = [(item.layer, item.role, item) for item in (*drawing.strokes, *drawing.areas)]
-    main = next((role for role in ("wall", "room") if any(role == found for _, found, _ in drawn)), None)
+    drawn = (*drawing.strokes, *drawing.areas)
+    main = next((role for role in ("wall", "room") if any(item.role == role for item in drawn)), None)
     walls: defaultdict[float | str, list[BaseGeometry]] = defaultdict(list)
     names: dict[float | str, str] = {}
-    for layer, role, item in drawn:
-        name, number = _storey(layer) or (layer, layer)
-        if role == main:
-            if names.get(number, "0").isdecimal():
-                names[number] = name
-            walls[number].append(item.line if isinstance(item, Stroke) else item.shape.boundary)
-    others = {_storey(layer) for layer in {layer for layer, role, _ in drawn if role != main}}
-    others |= {_storey(layer) for layer in {text.layer for text in drawing.letterings}}
-    numbered = {found[1] for found in others if found is not None}
+    for item in (item for item in drawn if item.role == main):
+        name, number = _storey(item.layer) or (item.layer, item.layer)
+        if names.get(number, "0").isdecimal():
+            names[number] = name
+        walls[number].append(item.line if isinstance(item, Stroke) else item.shape.boundary)
     largest = sorted(walls, key=lambda key: -shapely.length(walls[key]).sum())[:_MOST_COMPARED]
     around = {key for a, b in combinations(largest, 2) if _are_over_each_other(walls[a], walls[b]) for key in (a, b)}
-    storeys = [
-        key
-        for key in walls
-        if isinstance(key, float) and (key in around or (main and (key in numbered or not names[key].isdecimal())))
-    ]
+    by_word = {key for key in walls if main and not names[key].isdecimal()}
+    storeys = [key for key in walls if isinstance(key, float) and key in around | by_word]
     boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in storeys}
     pairs = combinations(boxes.values(), 2)
     if len(boxes) < 2 or not all(a.intersection(b).area >= _OVER * min(a.area, b.area) for a, b in pairs):
@@ -268,13 +261,12 @@ def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Leve
         return {}
 
     def part(number: float) -> Drawing:
-        return drawing.on_layers(
-            lambda layer: (
-                (found := _storey(layer)) is None
-                or found[1] == number
-                or (found[0].isdecimal() and found[1] not in boxes)
-            )
-        )
+        def is_wanted(layer: str) -> bool:
+            name, own = _storey(layer) or ("", number)
+            # A number that no walls have counts something else.
+            return own == number or (name.isdecimal() and own not in boxes)
+
+        return drawing.on_layers(is_wanted)
 
     return {names[number]: (Level(names[number], number), part(number)) for number in boxes}
 
