@@ -58,7 +58,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             budget.hints.append(
                 f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan"
             )
-        found.crop, paper, shapes = options.crop, options.crop or page.get_cropbox(), found.drawing.shapes
+        found.crop, paper, shapes = options.crop, options.crop or page.get_bbox(), found.drawing.shapes
         if options.crop is not None or (shapes and not shapely.covers(shapely.box(*paper), shapes).all()):
             found.drawing = found.drawing.cropped(paper)
         notes = list(budget.hints)

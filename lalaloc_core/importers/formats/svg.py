@@ -362,8 +362,8 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > _INVISIBLE
     is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
-    pen: Any = element.stroke
-    is_stroked = pen is not None and pen.value is not None
+    pen: Any = element.stroke if element.stroke is not None else svgelements.Color(None)
+    is_stroked = pen.value is not None
     is_white = is_stroked and is_white_pen(float(pen.red), float(pen.green), float(pen.blue))
     width = element.stroke_width if is_stroked else 0.0
     shells: list[shapely.Polygon] = []
