@@ -44,7 +44,7 @@ _MAX_SEGMENTS = 60_000
 # Texts of title blocks. Frames are drawn along this share of a box, which is so much of the drawing; lines nearer than
 # this (m) to a frame belong to it. Sides of sheets relative to each other, also within margins, and their accuracy.
 _TITLES, _WRITTEN_SCALE = frozenset(PLAN_WORDS["sheets"]["title"].split()), re.compile(r"\b1 ?: ?\d{2,3}\b")
-_DRAWN, _MOST, _BESIDE_FRAME_M, _ON_BOX_M = 0.98, 0.5, 0.6, 0.05
+_DRAWN, _MOST, _BESIDE_FRAME_M, _ON_BOX_M, _MIDDLE, _LEAST = 0.98, 0.5, 0.6, 0.05, 0.4, 0.05
 _SHEETS, _SAME_SIDES = np.array([math.sqrt(2.0), 400 / 277, 277 / 180, 17 / 11, 11 / 8.5]), 0.004
 
 
@@ -226,14 +226,19 @@ def without_frames(drawing: Drawing, most: int = 4) -> tuple[Drawing, list[BaseG
             continue
         own = _beside(tree, box.boundary)
         rest = [line for index, line in enumerate(lines) if index not in own and box.covers(line)]
-        inner = shapely.box(*shapely.total_bounds(rest)) if rest else shapely.Polygon()
+        body = _beside(tree, max(rest, key=shapely.length)) if rest else ()
+        inner = shapely.box(*shapely.total_bounds([lines[k] for k in body])) if rest else shapely.Polygon()
         inside = [text for text in drawing.letterings if box.covers(shapely.Point(text.position))]
         names = [inner.covers(shapely.Point(text.position)) for text in inside if text.room_types]
         short, long = side_lengths(box)
-        is_sheet = bool(np.any(np.abs(long / short / _SHEETS - 1.0) < _SAME_SIDES))
+        is_sheet = bool(np.any(np.abs(long / short / _SHEETS - 1.0) < _SAME_SIDES)) and (
+            any(names) or inner.area >= _LEAST * box.area
+        )
         titles = sum(text.is_title for text in inside)
         is_frame = (is_sheet or titles) and (any(names) or not names) if rest else titles > bool(names)
-        if is_frame and all(items[index].role is None for index in own):
+        # Walls that touch those around a building run through its middle.
+        middle = shapely.affinity.scale(box, _MIDDLE, _MIDDLE)
+        if is_frame and all(items[k].role is None and not middle.intersects(lines[k]) for k in own):
             left = [item for index, item in enumerate(items) if index not in own]
             areas, strokes = ([item for item in left if isinstance(item, kind)] for kind in (Area, Stroke))
             found, frames = without_frames(replace(drawing, areas=areas, strokes=strokes), most - 1)
