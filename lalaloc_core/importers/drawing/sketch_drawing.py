@@ -125,7 +125,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     sketch = Sketch(fixtures=drawing.fixtures)
     if hidden := len(drawing.strokes) - len(drawing.on_paper().strokes):
         builder.notes.append(f"{hidden} white lines were left out: they cannot be seen on paper")
-    drawing, frames = without_frames(drawing.on_paper())
+    drawing, frames = without_frames(drawing.on_paper(), budget.check_time)
     for frame in frames:
         short, long = side_lengths(frame)
         builder.unsure.append(

@@ -22,7 +22,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import extent_of, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import extent_of, lines_of, polygons_from_geometry, segments_of
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
@@ -280,10 +280,16 @@ def _are_over_each_other(first: Sequence[BaseGeometry], second: Sequence[BaseGeo
     least = _MOSTLY_ALONG * small.length
     if not small.area or along.length < least:
         return False
-    a, b = shapely.union_all(first), shapely.union_all(second)
-    near_a, near_b = a.buffer(_SAME_LINE_M), b.buffer(_SAME_LINE_M)
-    own = (a.difference(near_b).length / a.length, b.difference(near_a).length / b.length)
-    return along.intersection(near_a).intersection(near_b).length >= least and min(own) > _OWN
+    trees = [shapely.STRtree(lines_of(segments_of(shapely.get_parts(group).tolist()))) for group in (first, second)]
+    for tree, other in (trees, trees[::-1]):
+        near = tree.geometries[tree.query(along, predicate="dwithin", distance=_SAME_LINE_M)]
+        along = along.intersection(shapely.union_all(near).buffer(_SAME_LINE_M))
+        middles = shapely.line_interpolate_point(tree.geometries, 0.5, normalized=True)
+        shared = np.unique(other.query(middles, predicate="dwithin", distance=_SAME_LINE_M)[0])
+        lengths = shapely.length(tree.geometries)
+        if lengths[shared].sum() > (1.0 - _OWN) * lengths.sum():
+            return False
+    return along.length >= least
 
 
 @lru_cache(maxsize=1024)

@@ -45,6 +45,7 @@ _MAX_SEGMENTS = 60_000
 # this (m) to a frame belong to it. Sides of sheets relative to each other, also within margins, and their accuracy.
 _TITLES, _WRITTEN_SCALE = frozenset(PLAN_WORDS["sheets"]["title"].split()), re.compile(r"\b1 ?: ?\d{2,3}\b")
 _DRAWN, _MOST, _BESIDE_FRAME_M, _ON_BOX_M, _MIDDLE, _LEAST = 0.98, 0.5, 0.6, 0.05, 0.4, 0.05
+_LINES_AT_A_TIME = 100
 _SHEETS, _SAME_SIDES = np.array([math.sqrt(2.0), 400 / 277, 277 / 180, 17 / 11, 11 / 8.5]), 0.004
 
 
@@ -206,11 +207,13 @@ class Drawing:
         )
 
 
-def without_frames(drawing: Drawing, most: int = 4) -> tuple[Drawing, list[BaseGeometry]]:
+def without_frames(
+    drawing: Drawing, check_time: Callable[[], None], most: int = 4
+) -> tuple[Drawing, list[BaseGeometry]]:
     """Return a drawing in metres without the frames of its sheet and what they touch, such as a title block; and these.
 
     A frame is a rectangle around most lines, which are away from it, of a sheet's proportions or with a title. Up to
-    `most` frames around each other are found.
+    `most` frames around each other are found. `check_time` raises an exception to stop.
     """
     items = [*drawing.areas, *drawing.strokes]
     lines = [item.line if isinstance(item, Stroke) else item.shape.boundary for item in items]
@@ -224,9 +227,9 @@ def without_frames(drawing: Drawing, most: int = 4) -> tuple[Drawing, list[BaseG
         along = shapely.intersection(tree.geometries[tree.query(edge, predicate="intersects")], edge)
         if shapely.union_all(along).length < _DRAWN * box.length:
             continue
-        own = _beside(tree, box.boundary)
+        own = _beside(tree, box.boundary, check_time)
         rest = [line for index, line in enumerate(lines) if index not in own and box.covers(line)]
-        body = _beside(tree, max(rest, key=shapely.length)) if rest else ()
+        body = _beside(tree, max(rest, key=shapely.length), check_time) if rest else ()
         inner = shapely.box(*shapely.total_bounds([lines[k] for k in body])) if rest else shapely.Polygon()
         inside = [text for text in drawing.letterings if box.covers(shapely.Point(text.position))]
         names = [inner.covers(shapely.Point(text.position)) for text in inside if text.room_types]
@@ -241,18 +244,21 @@ def without_frames(drawing: Drawing, most: int = 4) -> tuple[Drawing, list[BaseG
         if is_frame and all(items[k].role is None and not middle.intersects(lines[k]) for k in own):
             left = [item for index, item in enumerate(items) if index not in own]
             areas, strokes = ([item for item in left if isinstance(item, kind)] for kind in (Area, Stroke))
-            found, frames = without_frames(replace(drawing, areas=areas, strokes=strokes), most - 1)
+            found, frames = without_frames(replace(drawing, areas=areas, strokes=strokes), check_time, most - 1)
             return found, [box, *frames]
     return drawing, []
 
 
-def _beside(tree: shapely.STRtree, frame: BaseGeometry) -> set[int]:
+def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[], None]) -> set[int]:
     """Return the numbers of the lines that are connected with a frame, or are beside it."""
-    found, new = set[int](), np.array([frame])
-    while len(new):
-        near = set(tree.query(new, predicate="dwithin", distance=_BESIDE_FRAME_M)[1].tolist()) - found
+    found, new = set[int](), [frame]
+    while new:
+        check_time()
+        # A long line can be near all others.
+        some, new = new[-_LINES_AT_A_TIME:], new[:-_LINES_AT_A_TIME]
+        near = set(tree.query(some, predicate="dwithin", distance=_BESIDE_FRAME_M)[1].tolist()) - found
         found |= near
-        new = tree.geometries[list(near)]
+        new += tree.geometries[list(near)].tolist()
     return found
 
 
