@@ -203,17 +203,17 @@ def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple
     assert any("never seen" in line for line in plan.report.unsure)
 
 
-def _storeys(*layers: str) -> dict[str, list[float]]:
-    """Return the areas of the storeys of a drawing with a wall of 8 x 6 m, and a partition, on each layer."""
+def _storeys(*layers: str, offset: float = 0.0) -> dict[str, ImportedPlan]:
+    """Return the storeys of a drawing with a wall of 8 x 6 m, each inside the last, and a partition, on each layer."""
     document: Any = new_dxf("R2010", units=6)
     for number, layer in enumerate(layers):
-        for inner in (0.0, 0.3):
+        for inner in (offset * number, offset * number + 0.3):
             ring = [(inner, inner), (8.0 - inner, inner), (8.0 - inner, 6.0 - inner), (inner, 6.0 - inner)]
             document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
         for x in (3.0 + number, 3.2 + number):
             document.modelspace().add_line((x, 0.3), (x, 5.7), dxfattribs={"layer": layer})
     plans = import_plans(dxf_file(document))
-    return {plan.level.name if plan.level else "": _areas(plan) for plan in plans}
+    return {plan.level.name if plan.level else "": plan for plan in plans}
 
 
 @pytest.mark.parametrize(
@@ -227,12 +227,20 @@ def _storeys(*layers: str) -> dict[str, list[float]]:
         (("1NP-ZDI", "2NP-ZDI"), ("1NP", "2NP")), (("壁1階", "壁2階"), ("1F", "2F")), (("SEINAT_1KRS",) * 2, ("",)),
         (("VEGG 2.etg", "VEGG 1.etg"), ("1.etg", "2.etg")), (("MURI_P1", "MURI_PT"), ("PT", "P1")),
         (("WALL_0", "EG-Wand", "OG-Wand"), ("EG", "OG")), (("EG-Wand", "WALL_0", "OG-Wand"), ("EG", "OG")),
+        (("2_WALL", "1_WALL"), ("1", "2")), (("Walls 01", "Walls 02"), ("01", "02")), (("WALL1", "WALL2"), ("",)),
+        (("WAND-0", "WAND-1"), ("0", "1")), (("Muro +3.00", "Muro -0.20"), ("-0.20", "+3.00")),
     ],
 )  # fmt: skip
 def test_words_for_storeys_count_before_numbers_of_layers(layers: tuple[str, ...], names: tuple[str, ...]):
     found = _storeys(*layers)
     assert tuple(found) == names
-    assert len(names) != len(layers) or sorted(found.values()) == [[20.0, 18.9], [24.3, 14.6]]
+    assert len(names) != len(layers) or sorted(map(_areas, found.values())) == [[20.0, 18.9], [24.3, 14.6]]
+
+
+@pytest.mark.parametrize(("layers", "offset"), [(("WALL1", "WALL2"), 0.0), (("WALL-1", "WALL-2"), 0.15)])
+def test_walls_around_one_outline_are_said_but_leaves_of_a_wall_are_not(layers: tuple[str, str], offset: float):
+    warnings = _storeys(*layers, offset=offset)[""].report.warnings
+    assert any("run around the same outline" in line for line in warnings) == (not offset)
 
 
 def _robot_map(*segments: list[list[int]], walls: list[list[int]]) -> bytes:

@@ -169,10 +169,16 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     return found
 
 
-def even_odd_polygons(rings: Iterable[shapely.Polygon]) -> list[shapely.Polygon]:
-    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule)."""
+def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = False) -> list[shapely.Polygon]:
+    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule).
+
+    With the rule `is_nonzero`, outlines in one direction are joined where they overlap.
+    """
     shapes: list[BaseGeometry] = list(rings)
     check_network(shapes)
+    if is_nonzero:
+        is_ccw = shapely.is_ccw(shapely.get_exterior_ring(shapes))
+        shapes = [shapely.union_all(np.array(shapes)[is_ccw == direction]) for direction in (True, False)]
     # In pairs, so that the time is not quadratic in the number of outlines.
     while len(shapes) > 1:
         pairs = zip(shapes[::2], shapes[1::2], strict=False)

@@ -47,6 +47,10 @@ _NO_FLOOR, _OUTDOOR, _INSIDE = (
 _OPENING_TAGS: Mapping[str, tuple[Role, Role]] = {
     "window": ("window", "ignored"), "door": ("door", "passage"), "entrance": ("door", "ignored"),
 }  # fmt: skip
+# Properties with the name of a level, and of a room.
+_LEVEL_KEYS, _NAME_KEYS = (tuple(PLAN_WORDS["features"][key].split()) for key in ("level_keys", "name_keys"))
+# Points of a line that can be the outline of a room.
+_CORNERS = 3
 # Width (m) of an opening drawn as a point without a width.
 _USUAL_WIDTH_M: Mapping[OpeningKind, float] = {"door": 0.9, "window": 1.2, "passage": 1.0}
 _LENGTH = re.compile(r"(\d{1,9}(?:[.,]\d{1,99})?)\s*(mm|cm|m|ft|in|'|\"|)(?:\s*(\d{1,9}(?:\.\d{1,99})?)\s*(?:in|\"))?")
@@ -84,7 +88,9 @@ def import_features(
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
     _refuse_map(features, format)
     # The other formats state which number is the latitude.
-    placed = projection([feature.shape for feature in features], crs if format == "geojson" else ORDERED, options)
+    areas = [_number(feature.properties, "area_m2", "area", "floor_area") for feature in features]
+    order = crs if format == "geojson" else ORDERED
+    placed = projection([feature.shape for feature in features], order, options, areas)
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
     on_any_level: list[Feature] = []
@@ -140,7 +146,7 @@ def _refuse_map(features: Sequence[Feature], format: str) -> None:
 def _levels_of(feature: Feature) -> list[str]:
     """Return the ids of a feature's levels, none if it gives none; OpenStreetMap writes "0;1" and "0-2"."""
     found: dict[str, None] = {}
-    for key in ("level_id", "level", "ordinal", "floor", "storey", "repeat_on"):
+    for key in (*_LEVEL_KEYS, "repeat_on"):
         value = feature.properties.get(key)
         if found and key != "repeat_on":
             continue
@@ -252,6 +258,9 @@ class _Drawer:
     def _add_rooms(self, feature: Feature, shape: BaseGeometry, layer: str) -> None:
         # Some tools write the outline of a room as a line.
         area = shape if shapely.get_dimensions(shape) == 2 else shapely.build_area(shape)
+        if area.is_empty and isinstance(shape, shapely.LineString) and len(shape.coords) > _CORNERS:
+            area = shapely.Polygon(shape.coords)
+            self._builder.notes.append(f"the open outline of '{_name(feature.properties)}' was closed")
         properties, parts = feature.properties, polygons_from_geometry(area)
         self._builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
         name = _name(properties)
@@ -318,7 +327,7 @@ def _layer(properties: Mapping[str, Any]) -> str:
 
 
 def _name(properties: Mapping[str, Any]) -> str | None:
-    for key in ("name", "alt_name", "label", "ref", "title"):
+    for key in _NAME_KEYS:
         value = in_english(properties.get(key))
         if isinstance(value, str) and value.strip():
             return value

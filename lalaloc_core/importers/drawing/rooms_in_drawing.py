@@ -24,6 +24,7 @@ from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, clusters, split_lines
 
 _MAX_NAMED = 8
+_NAMED = "the walls"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +114,10 @@ def choose_reading(
 def _is_better(reading: Reading, best: Reading) -> bool:
     if not best.rooms:
         return bool(reading.rooms)
+    # A plot around the named walls of a building is no room.
+    named = shapely.union_all([room.shape for room in best.rooms]) if best.source.endswith(_NAMED) else None
+    if named is not None and any(shapely.covers(room.shape, named) for room in reading.rooms):
+        return False
     bounds = best.bounds
     trust = bounds.trust_in_marks if best.walls is None else 1.0
     ratio = reading.explained / max(best.explained, 1e-9) / trust
@@ -328,7 +333,7 @@ class GapFinder:
 
 # Walls by which rooms are looked for, in words, in the order of trust.
 _WALLS: Mapping[str, Callable[[Drawing, Budget], Enclosed | None]] = {
-    "the walls": _by_named_walls,
+    _NAMED: _by_named_walls,
     "the dark areas and thick lines": _by_dark_areas,
     "all lines": _by_all_lines,
 }

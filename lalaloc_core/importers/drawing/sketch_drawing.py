@@ -34,7 +34,15 @@ from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_r
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
 from lalaloc_core.importers.drawing.rooms_in_drawing import GapFinder, choose_reading, marked_rooms, report_unused
 from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale, measures_of
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing, clusters, split_lines
+from lalaloc_core.importers.drawing.vector_drawing import (
+    Area,
+    Drawing,
+    Lettering,
+    Swing,
+    clusters,
+    split_lines,
+    without_frames,
+)
 
 # Letters of a line of prose, and the least number of such lines on a page of text.
 _LINE_LETTERS, _MIN_LINES_OF_TEXT = 25, 8
@@ -115,6 +123,15 @@ def text_hints(letterings: Sequence[Lettering], subject: str) -> list[str]:
 def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> Sketch:
     """Find the rooms and openings of a drawing in metres, y up."""
     sketch = Sketch(fixtures=drawing.fixtures)
+    if hidden := len(drawing.strokes) - len(drawing.on_paper().strokes):
+        builder.notes.append(f"{hidden} white lines were left out: they cannot be seen on paper")
+    drawing, frames = without_frames(drawing.on_paper(), budget.check_time)
+    for frame in frames:
+        short, long = side_lengths(frame)
+        builder.unsure.append(
+            f"a rectangle of {long:.1f} m x {short:.1f} m is taken for the sheet's frame, and was left out with the "
+            "lines beside it; if it is a wall, set crop to the walls"
+        )
     drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]

@@ -22,7 +22,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import extent_of, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import extent_of, lines_of, polygons_from_geometry, segments_of
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
@@ -46,8 +46,13 @@ _NUMBERED = re.compile(
 )
 # A number of a storey with a word of another script.
 _OTHER_SCRIPTS = re.compile(r"(\d{1,2}) ?(?:[階层層]|этаж)", re.IGNORECASE)
+# Height of a storey: "Muro +3.00".
+_HEIGHT = re.compile(r"(?:[+±]|(?<![^\s_])-)\d{1,3}[.,]\d{2}(?!\d)")
 # Parts of names of layers, and share of a smaller storey's box that one covers.
 _PARTS, _OVER = re.compile(r"[^\w+]+|_"), 0.5
+# Lines nearer than this (m) are the same. Share of an outline that storeys over each other both run along, and of the
+# lines of each that the other lacks; layers that are compared.
+_SAME_LINE_M, _MOSTLY_ALONG, _OWN, _MOST_COMPARED = 0.05, 0.5, 0.02, 8
 
 
 def assemble_storeys(
@@ -221,35 +226,70 @@ def by_storey(
         report.notes.append(f"storey '{level.name}' by the names of layers; layers without a storey belong to all")
         return make(part, report, level)
 
-    storeys = storeys_of(drawing)
+    storeys = storeys_of(drawing, builder)
     return assemble_levels(storeys, options, budget, make_level) if storeys else (make(drawing, builder, None),)
 
 
-def storeys_of(drawing: Drawing) -> dict[str, tuple[Level, Drawing]]:
-    """Return the parts of a drawing by storey; empty if its walls are of one."""
-    walls: defaultdict[float, list[BaseGeometry]] = defaultdict(list)
-    others: set[float] = set()
-    names: dict[float, str] = {}
-    for item in (*drawing.strokes, *drawing.areas):
-        storey = _storey(item.layer)
-        if storey is not None and item.role == "wall":
-            if names.get(storey[1], "0").isdecimal():
-                names[storey[1]] = storey[0]
-            walls[storey[1]].append(item.line if isinstance(item, Stroke) else item.shape)
-        elif storey is not None:
-            others.add(storey[1])
-    others |= {storey[1] for text in drawing.letterings if (storey := _storey(text.layer)) is not None}
-    # Numbers count walls as well as storeys, unless other layers have the same ones.
-    named = {number for number in walls if not names[number].isdecimal() or number in others}
-    boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in named}
+def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Level, Drawing]]:
+    """Return the parts of a drawing by storey; empty if its walls are of one.
+
+    Layers of walls named by words for storeys are over each other. Numbers can count walls as well: they are storeys if
+    their walls run around the same outline. Other layers give a warning then.
+    """
+    drawn = (*drawing.strokes, *drawing.areas)
+    main = next((role for role in ("wall", "room") if any(item.role == role for item in drawn)), None)
+    walls: defaultdict[float | str, list[BaseGeometry]] = defaultdict(list)
+    names: dict[float | str, str] = {}
+    for item in (item for item in drawn if item.role == main):
+        name, number = _storey(item.layer) or (item.layer, item.layer)
+        if names.get(number, "0").isdecimal():
+            names[number] = name
+        walls[number].append(item.line if isinstance(item, Stroke) else item.shape.boundary)
+    largest = sorted(walls, key=lambda key: -shapely.length(walls[key]).sum())[:_MOST_COMPARED]
+    around = {key for a, b in combinations(largest, 2) if _are_over_each_other(walls[a], walls[b]) for key in (a, b)}
+    by_word = {key for key in walls if main and not names[key].isdecimal()}
+    storeys = [key for key in walls if isinstance(key, float) and key in around | by_word]
+    boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in storeys}
     pairs = combinations(boxes.values(), 2)
     if len(boxes) < 2 or not all(a.intersection(b).area >= _OVER * min(a.area, b.area) for a, b in pairs):
+        if around:
+            layers = " and ".join(f"'{names[key]}'" for key in walls if key in around)
+            builder.warnings.append(
+                f"lines on the layers {layers} run around the same outline, and were read as one storey; if they are "
+                "of several, set layers to those of one"
+            )
         return {}
 
     def part(number: float) -> Drawing:
-        return drawing.on_layers(lambda layer: (storey := _storey(layer)) is None or storey[1] == number)
+        def is_wanted(layer: str) -> bool:
+            name, own = _storey(layer) or ("", number)
+            # A number that no walls have counts something else.
+            return own == number or (name.isdecimal() and own not in boxes)
+
+        return drawing.on_layers(is_wanted)
 
     return {names[number]: (Level(names[number], number), part(number)) for number in boxes}
+
+
+def _are_over_each_other(first: Sequence[BaseGeometry], second: Sequence[BaseGeometry]) -> bool:
+    """Return whether the lines of both run around most of the same outline, and both have others as well."""
+    small, large = sorted(
+        (shapely.convex_hull(shapely.GeometryCollection(g)) for g in (first, second)), key=lambda hull: hull.area
+    )
+    along = small.boundary.intersection(large.boundary.buffer(_SAME_LINE_M))
+    least = _MOSTLY_ALONG * small.length
+    if not small.area or along.length < least:
+        return False
+    trees = [shapely.STRtree(lines_of(segments_of(shapely.get_parts(group).tolist()))) for group in (first, second)]
+    for tree, other in (trees, trees[::-1]):
+        near = tree.geometries[tree.query(along, predicate="dwithin", distance=_SAME_LINE_M)]
+        along = along.intersection(shapely.union_all(near).buffer(_SAME_LINE_M))
+        middles = shapely.line_interpolate_point(tree.geometries, 0.5, normalized=True)
+        shared = np.unique(other.query(middles, predicate="dwithin", distance=_SAME_LINE_M)[0])
+        lengths = shapely.length(tree.geometries)
+        if lengths[shared].sum() > (1.0 - _OWN) * lengths.sum():
+            return False
+    return along.length >= least
 
 
 @lru_cache(maxsize=1024)
@@ -268,5 +308,7 @@ def _storey(layer: str) -> tuple[str, float] | None:
                 return whole if digit or key != word else letters, _counted(float(_STOREYS[key]), abs(digit))
         if (after or before) and (word in _BESIDE or (is_joined and word in _JOINED)):
             return layer[found.start() : max(found.end(), found.end(4))], float(after or before)
+    if (height := _HEIGHT.search(layer)) is not None:
+        return height[0], float(height[0].replace(",", ".").replace("±", ""))
     numbers = (part for part in _PARTS.split(layer) if part.isdecimal() and len(part) <= 2 and part != layer)
     return next(((part, float(part)) for part in numbers), None)

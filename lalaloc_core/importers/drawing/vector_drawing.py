@@ -6,6 +6,7 @@ The readers of SVG, PDF and DXF produce a `Drawing`; `sketch_drawing` finds room
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,13 +16,23 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import check_network, extent_of, lines_of, point_xy, segments_of
+from lalaloc_core.floorplan.room_types import PLAN_WORDS, room_types_from_name, split_words
+from lalaloc_core.importers.common.geometry import (
+    check_network,
+    distinct,
+    extent_of,
+    lines_of,
+    point_xy,
+    segments_of,
+    side_lengths,
+)
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
 # Fills of lower luminance (of 255) can be walls.
 _DARK = 110.0
+# Channels of white from here on.
+_WHITE = 250.0
 # Glass is bluer than red by this.
 _BLUER = 20.0
 # Straight pieces per curve.
@@ -30,6 +41,12 @@ CURVE_STEPS = 12
 _SWING_DEG = (55.0, 125.0)
 _ROUND = 0.03
 _MAX_SEGMENTS = 60_000
+# Texts of title blocks. Frames are drawn along this share of a box, which is so much of the drawing; lines nearer than
+# this (m) to a frame belong to it. Sides of sheets relative to each other, also within margins, and their accuracy.
+_TITLES, _WRITTEN_SCALE = frozenset(PLAN_WORDS["sheets"]["title"].split()), re.compile(r"\b1 ?: ?\d{2,3}\b")
+_DRAWN, _MOST, _BESIDE_FRAME_M, _ON_BOX_M, _MIDDLE, _LEAST = 0.98, 0.5, 0.6, 0.05, 0.4, 0.05
+_LINES_AT_A_TIME = 100
+_SHEETS, _SAME_SIDES = np.array([math.sqrt(2.0), 400 / 277, 277 / 180, 17 / 11, 11 / 8.5]), 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +74,14 @@ class Area:
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """Polyline with the width of its pen, 0 if unknown, and its place in the order of painting."""
+    """Polyline with the width of its pen, 0 if unknown, its place in the order of painting, and whether it is white."""
 
     line: shapely.LineString
     layer: str
     role: Role | None = None
     width: float = 0.0
     order: int = 0
+    is_white: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +122,11 @@ class Lettering:
     is_ocr: bool = False
 
     @property
+    def is_title(self) -> bool:
+        """Whether title blocks have such a text: a scale, or a word such as "project"."""
+        return bool(_WRITTEN_SCALE.search(self.text)) or not _TITLES.isdisjoint(split_words(self.text))
+
+    @property
     def room_types(self) -> tuple[str, ...]:
         """Types of the room that the text names; empty if it names none."""
         return (room_types_from_reading if self.is_ocr else room_types_from_name)(self.text)
@@ -134,6 +157,11 @@ class Drawing:
     def extent(self) -> float:
         """Longer side of the box around areas and lines; NaN without any."""
         return extent_of(self.shapes)
+
+    def on_paper(self) -> Drawing:
+        """Return the drawing without white lines, which hide others, unless most is white, as on a dark ground."""
+        seen = [stroke for stroke in self.strokes if not stroke.is_white or stroke.role is not None]
+        return replace(self, strokes=seen) if 2 * len(seen) + len(self.areas) > len(self.strokes) else self
 
     def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
         """Return what is on some layers; patches, which have none, stay."""
@@ -177,6 +205,61 @@ class Drawing:
             [replace(patch, shape=shape(patch.shape)) for patch in self.patches],
             [replace(fixture, shape=shape(fixture.shape)) for fixture in self.fixtures],
         )
+
+
+def without_frames(
+    drawing: Drawing, check_time: Callable[[], None], most: int = 4
+) -> tuple[Drawing, list[BaseGeometry]]:
+    """Return a drawing in metres without the frames of its sheet and what they touch, such as a title block; and these.
+
+    A frame is a rectangle around most lines, which are away from it, of a sheet's proportions or with a title. Up to
+    `most` frames around each other are found. `check_time` raises an exception to stop.
+    """
+    items = [*drawing.areas, *drawing.strokes]
+    lines = [item.line if isinstance(item, Stroke) else item.shape.boundary for item in items]
+    if not items or not most:
+        return drawing, []
+    tree, whole = shapely.STRtree(lines), shapely.box(*shapely.total_bounds(lines))
+    outlines = [area.shape for area in drawing.areas if not area.is_dark]
+    large = [box for box in shapely.envelope(outlines) if box.area >= _MOST * whole.area]
+    for box in distinct([whole, *sorted(large, key=lambda box: -box.area)])[:most]:
+        edge = box.boundary.buffer(_ON_BOX_M)
+        along = shapely.intersection(tree.geometries[tree.query(edge, predicate="intersects")], edge)
+        if shapely.union_all(along).length < _DRAWN * box.length:
+            continue
+        own = _beside(tree, box.boundary, check_time)
+        rest = [line for index, line in enumerate(lines) if index not in own and box.covers(line)]
+        body = _beside(tree, max(rest, key=shapely.length), check_time) if rest else ()
+        inner = shapely.box(*shapely.total_bounds([lines[k] for k in body])) if rest else shapely.Polygon()
+        inside = [text for text in drawing.letterings if box.covers(shapely.Point(text.position))]
+        names = [inner.covers(shapely.Point(text.position)) for text in inside if text.room_types]
+        short, long = side_lengths(box)
+        is_sheet = bool(np.any(np.abs(long / short / _SHEETS - 1.0) < _SAME_SIDES)) and (
+            any(names) or inner.area >= _LEAST * box.area
+        )
+        titles = sum(text.is_title for text in inside)
+        is_frame = (is_sheet or titles) and (any(names) or not names) if rest else titles > bool(names)
+        # Walls that touch those around a building run through its middle.
+        middle = shapely.affinity.scale(box, _MIDDLE, _MIDDLE)
+        if is_frame and all(items[k].role is None and not middle.intersects(lines[k]) for k in own):
+            left = [item for index, item in enumerate(items) if index not in own]
+            areas, strokes = ([item for item in left if isinstance(item, kind)] for kind in (Area, Stroke))
+            found, frames = without_frames(replace(drawing, areas=areas, strokes=strokes), check_time, most - 1)
+            return found, [box, *frames]
+    return drawing, []
+
+
+def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[], None]) -> set[int]:
+    """Return the numbers of the lines that are connected with a frame, or are beside it."""
+    found, new = set[int](), [frame]
+    while new:
+        check_time()
+        # A long line can be near all others.
+        some, new = new[-_LINES_AT_A_TIME:], new[:-_LINES_AT_A_TIME]
+        near = set(tree.query(some, predicate="dwithin", distance=_BESIDE_FRAME_M)[1].tolist()) - found
+        found |= near
+        new += tree.geometries[list(near)].tolist()
+    return found
 
 
 def fit_swing(
@@ -233,6 +316,11 @@ def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometr
 def is_dark(red: float, green: float, blue: float) -> bool:
     """Return whether a fill can be a wall, by the luminance (ITU-R BT.601) of its channels, 0 to 255."""
     return 0.299 * red + 0.587 * green + 0.114 * blue < _DARK
+
+
+def is_white_pen(red: float, green: float, blue: float) -> bool:
+    """Return whether a line of a colour cannot be seen on paper, by its channels, 0 to 255."""
+    return min(red, green, blue) >= _WHITE
 
 
 def is_bluish(red: float, green: float, blue: float) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,6 +26,7 @@ from ezdxf.entities.dxfentity import DXFEntity, DXFTagStorage
 from ezdxf.entities.dxfgfx import DXFGraphic
 from ezdxf.entities.image import Image
 from ezdxf.entities.insert import Insert
+from ezdxf.entities.layer import Layer
 from ezdxf.entities.lwpolyline import LWPolyline
 from ezdxf.entities.mline import MLine
 from ezdxf.entities.mtext import MText
@@ -65,6 +66,7 @@ _NO_LINES = {"POINT", "DIMENSION", "ARC_DIMENSION", "LARGE_RADIAL_DIMENSION", "L
 # Remedies for what is not read; EXPLODE makes lines of other kinds.
 _BIND = "bind it (XREF, Bind), or send that drawing"
 _DASHED = " is to be demolished or lies above and was left out: draw walls with whole lines"
+_UNPLOTTED = " is not plotted, and was left out: plot it, or set layers to those that are read"
 _MAKE_PLAIN = "turn such objects into lines (EXPORTTOAUTOCAD), or print a PDF"
 _REMEDIES = {"PDFUNDERLAY": "send that PDF, or import it (PDFIMPORT)", "DGNUNDERLAY": "import it (DGNIMPORT)",
              "DWFUNDERLAY": "send the drawing it was made of", "ACAD_PROXY_ENTITY": _MAKE_PLAIN}  # fmt: skip
@@ -212,15 +214,22 @@ def _weight(entity: DXFEntity) -> int:
 
 def _read_drawing(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
     drawing = Drawing()
-    hidden = {layer.dxf.name.casefold() for layer in document.layers if layer.is_off() or layer.is_frozen()}
+    states = (Layer.is_off, Layer.is_frozen, lambda layer: not layer.dxf.plot)
+    off, frozen, unplotted = (frozenset(x.dxf.name.casefold() for x in document.layers if state(x)) for state in states)
     low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
     size = max(abs(high[0] - low[0]), abs(high[1] - low[1]))
     # The maximum distance of a curve from its polyline, in drawing units.
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     missing = _count_missing(document, builder)
-    for entity, context in _walk(document.modelspace(), None, 0, budget):
-        if context.layer.casefold() in hidden:
-            builder.use(context.layer, "ignored (layer is off)")
+    for entity, context in _walk(document.modelspace(), None, 0, budget, frozen):
+        if context.layer.casefold() in off | frozen or entity.dxf.get("invisible", 0):
+            builder.use(
+                context.layer,
+                "ignored (layer is off)" if context.layer.casefold() in off | frozen else "ignored (invisible)",
+            )
+        elif context.layer.casefold() in unplotted and context.role is None and not options.layers:
+            builder.use(context.layer, "ignored (layer is not plotted)")
+            missing[f"layer '{context.layer[:50]}'", _UNPLOTTED] += 1
         elif isinstance(entity, Insert) and context.fixture is not None and options.includes_layer(context.layer):
             _add_block(entity, context, drawing, builder, sag, budget)
         elif context.role in ("ignored", "demolished") or not options.includes_layer(context.layer):
@@ -284,11 +293,12 @@ def _count_missing(document: DxfDocument, builder: ReportBuilder) -> Counter[tup
 
 
 def _walk(
-    entities: Iterable[Any], block: _Context | None, depth: int, budget: Budget
+    entities: Iterable[Any], block: _Context | None, depth: int, budget: Budget, frozen: Container[str] = ()
 ) -> Iterator[tuple[DXFGraphic, _Context]]:
     """Yield entities with their contexts. Blocks are expanded, except for windows, passages, obstacles and fixtures.
 
-    `block` is the context of the block that contains the entities, None for the model space.
+    `block` is the context of the block that contains the entities, None for the model space. All of a block that is
+    invisible, or on a `frozen` layer, is hidden, and it is not expanded.
     """
     for entity in entities:
         if not isinstance(entity, DXFGraphic) or depth > _MAX_BLOCK_DEPTH:
@@ -300,7 +310,9 @@ def _walk(
         role = role_from_name(layer)
         if block is not None and block.role is not None and role in (None, "text"):
             role = block.role
-        if isinstance(entity, Insert):
+        if isinstance(entity, Insert) and (layer.casefold() in frozen or entity.dxf.get("invisible", 0)):
+            yield entity, _Context(layer, role)
+        elif isinstance(entity, Insert):
             block_role = role_from_name(entity.dxf.name)
             role = block_role if block_role in _OF_BLOCKS else role
             for attribute in entity.attribs:
@@ -311,7 +323,7 @@ def _walk(
                 if context.fixture is not None or role in ("window", "passage", "obstacle"):
                     yield copy, context
                 else:
-                    yield from _walk(copy.virtual_entities(), context, depth + 1, budget)
+                    yield from _walk(copy.virtual_entities(), context, depth + 1, budget, frozen)
         elif isinstance(entity, MLine | Polyface | Polymesh):
             for part in entity.virtual_entities():
                 budget.check_time()
@@ -326,7 +338,7 @@ def _add(
     kind, role = entity.dxftype(), context.role
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
-        position = _anchor(entity)
+        text, position = text.replace("\\~", " "), _anchor(entity)
         if position is not None and text.strip() and in_range(np.array(position)):
             drawing.letterings += [Lettering(line[:200], position, context.layer) for line in text.splitlines()[:20]]
             builder.use(context.layer, "texts")

@@ -21,6 +21,8 @@ from lalaloc_core.importers.common.tagged_features import Feature, import_featur
 
 # Decimals of exported degrees; the ninth is a tenth of a millimetre.
 _DECIMALS = 9
+# Depth of rings in the coordinates of a geometry.
+_RINGS = {"Polygon": 1, "MultiPolygon": 2}
 
 
 def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -74,12 +76,14 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     if geometry is None:
         return
     budget.spend(1 + _count_numbers(geometry, where) // 2)
+    if isinstance(geometry, Mapping) and (depth := _RINGS.get(str(geometry.get("type")))):
+        geometry = {**geometry, "coordinates": _closed(geometry.get("coordinates"), depth)}
     try:
         shape = shapely.from_geojson(json.dumps(geometry))
     except (shapely.errors.ShapelyError, ValueError, TypeError) as error:
         raise InvalidFloorPlanError(
             f"the geometry of {where} is not a GeoJSON geometry: it must have a known 'type', and 'coordinates' that "
-            "are lists of numbers, closed rings for a polygon; export it again"
+            "are lists of numbers; export it again"
         ) from error
     if shape is None or shape.is_empty:
         return
@@ -88,6 +92,8 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     check_coordinates(shapely.get_coordinates(shape), f"the geometry of {where}")
     given = raw.get("properties")
     properties = dict(given) if isinstance(given, Mapping) else {}
+    # Shapefiles have names of ten capitals.
+    properties = {str(key).casefold(): value for key, value in properties.items()} | properties
     # Some converters of OpenStreetMap data nest its tags.
     if isinstance(properties.get("tags"), Mapping):
         properties = properties["tags"] | {"id": properties.get("id", raw.get("id"))}
@@ -95,6 +101,15 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
         properties["feature_type"] = raw["feature_type"]
     identity = raw.get("id", properties.get("id"))
     yield Feature(shape, properties, str(identity)[:200] if isinstance(identity, str | int) else None)
+
+
+def _closed(parts: Any, depth: int) -> Any:
+    """Return rings, or lists of them, with their first position at the end, which some programs leave out."""
+    if not isinstance(parts, list):
+        return parts
+    if depth:
+        return [_closed(part, depth - 1) for part in parts]
+    return [*parts, parts[0]] if len(parts) > 2 and parts[0] != parts[-1] else parts
 
 
 def _count_numbers(value: Any, where: str) -> int:

@@ -336,16 +336,25 @@ class _Meshes:
                 f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}' has more than {limit} entities "
                 "(max_entities) with those of its mapped items, or contains itself; simplify it"
             )
-        settings = ifcopenshell.geom.settings()
-        settings.set("use-world-coords", True)
-        try:
-            shape = ifcopenshell.geom.create_shape(settings, element)
-        except RuntimeError:
-            return None
-        vertices = np.array(shape.geometry.verts, dtype=float).reshape(-1, 3)  # type: ignore[union-attr]
-        triangles = np.array(shape.geometry.faces, dtype=int).reshape(-1, 3)  # type: ignore[union-attr]
-        check_coordinates(vertices, f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}'")
-        return (vertices, triangles) if len(triangles) else None
+        outlines = ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS
+        # Some programs write the outline of a space alone.
+        for dimensionality in (None, outlines) if element.is_a("IfcSpace") else (None,):
+            settings = ifcopenshell.geom.settings()
+            settings.set("use-world-coords", True)
+            if dimensionality is not None:
+                settings.set("dimensionality", dimensionality)
+            try:
+                geometry: Any = ifcopenshell.geom.create_shape(settings, element).geometry  # type: ignore[union-attr]
+            except RuntimeError:
+                continue
+            vertices = np.array(geometry.verts, dtype=float).reshape(-1, 3)
+            triangles = np.array(geometry.faces, dtype=int).reshape(-1, 3)
+            check_coordinates(vertices, f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}'")
+            if len(triangles):
+                return vertices, triangles
+            if (mesh := _inside(vertices, np.array(geometry.edges, dtype=int).reshape(-1, 2))) is not None:
+                return mesh
+        return None
 
     def _size(self, value: Any) -> float:
         """Count an entity and all that it refers to, repeated as often as referred to; infinite for a cycle."""
@@ -359,6 +368,17 @@ class _Meshes:
             self._sizes[key] = math.inf
             self._sizes[key] = sum((self._size(attribute) for attribute in value), 1.0)
         return self._sizes[key]
+
+
+def _inside(vertices: Float[np.ndarray, "n 3"], edges: Any) -> _Mesh | None:
+    """Return a flat mesh of the area that edges enclose, None without one."""
+    area = shapely.build_area(shapely.multilinestrings(vertices[edges][:, :, :2]))
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
+    if not len(triangles):
+        return None
+    corners = np.concatenate([np.asarray(triangle.exterior.coords)[:3] for triangle in triangles])
+    flat = np.column_stack([corners, np.full(len(corners), vertices[:, 2].min())])
+    return flat, np.arange(len(corners)).reshape(-1, 3)
 
 
 def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shapely.Polygon]:

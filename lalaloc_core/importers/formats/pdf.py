@@ -6,7 +6,6 @@ A PDF has neither rooms nor meaningful layers, so the result is always a draft.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -36,7 +35,6 @@ from lalaloc_core.importers.picture.ink import blank_outside
 from lalaloc_core.importers.picture.lettering import READ_PX, PictureTexts, read_texts
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
-_METRES_PER_POINT, _USER_UNIT = 0.0254 / 72.0, re.compile(rb"/UserUnit\s+(\d{1,5}(?:\.\d{1,9})?)")
 # A page with fewer lines, or with a larger share covered by pictures, is a scan; smaller pictures are logos.
 _MIN_LINES, _MOSTLY, _LEAST = 12, 0.5, 0.02
 _FINEST_M, _COARSEST_PT = 0.01, 4.0
@@ -54,22 +52,30 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         where = f"page {options.page} of {len(document)} was read: set page to that of the plan"
         budget.hints += [where] * (len(document) > 1)
         budget.begin(f"reading page {options.page} of {len(document)}")
-        found = read_page(page, budget)
-        # The library takes the unit for a point.
-        unit = _USER_UNIT.search(content)
-        found.unit_m = _METRES_PER_POINT * ((unit and float(unit[1])) or 1.0)
-        if options.crop is not None:
-            found.crop, found.drawing = options.crop, found.drawing.cropped(options.crop)
+        found = read_page(page, options.page, budget)
+        if found.hidden:
+            named = ", ".join(repr(layer) if layer else "one without a name" for layer in found.hidden)
+            budget.hints.append(
+                f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan"
+            )
+        found.crop, paper, shapes = options.crop, options.crop or page.get_bbox(), found.drawing.shapes
+        if options.crop is not None or (shapes and not shapely.covers(shapely.box(*paper), shapes).all()):
+            found.drawing = found.drawing.cropped(paper)
+        notes = list(budget.hints)
         budget.hints += text_hints(found.drawing.letterings, f"page {options.page} of the PDF")
-        return _read_plan(found, options, budget)
+        return _read_plan(found, notes, options, budget)
     finally:
         document.close()
 
 
-def _read_plan(found: PageContent, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    builder = ReportBuilder("pdf", is_draft=True, notes=[hint for hint in budget.hints if "set page" in hint])
+def _read_plan(
+    found: PageContent, notes: list[str], options: ImportOptions, budget: Budget
+) -> tuple[ImportedPlan, ...]:
+    builder = ReportBuilder("pdf", is_draft=True, notes=notes)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
+    for layer, count in found.hidden.items():
+        builder.use(layer, "ignored (layer is off)", count)
     scan = _read_scan(found, builder, budget)
     # A unit of a PDF is always a point.
     without_units, drawings = replace(options, units=None), [found.drawing, scan.drawing]

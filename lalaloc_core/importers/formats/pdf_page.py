@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
 import ctypes
-from collections.abc import Iterator
+import io
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,9 +16,10 @@ import numpy as np
 import pypdfium2
 import pypdfium2.raw as pdfium
 import shapely
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.assemble import clean_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.drawing.vector_drawing import (
@@ -26,6 +32,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     fit_swing,
     is_bluish,
     is_dark,
+    is_white_pen,
 )
 
 # Functions that count and return the objects of a page, and those of a form in it.
@@ -34,11 +41,17 @@ _OF_FORM: Any = pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject
 _MAX_FORM_DEPTH = 8
 # Pages' worth of areas that are painted; each takes some milliseconds.
 _MAX_PAINTED = 1000
-# Opacity (of 255) of fills that can be walls, and of fills that hide what is below them.
+# Opacity (of 255) of what can be walls, and of fills that hide what is below them.
 _OPAQUE, _HIDING = 60, 230
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
 # Smallest packed size of a line or area.
 _BYTES_PER_SHAPE = 4
+# Pixels of the longer side of a page on which hidden objects are looked for, and bytes of the name of a layer.
+_SEEN_PX, _NAME_BYTES = 400, 200
+_LAYER, _USER_UNIT = re.compile(rb"/OC(?:G|MD)\b"), re.compile(rb"/UserUnit\s+(\d{1,5}(?:\.\d{1,9})?)")
+# Members of layers that are shown depending on others.
+_CONDITION, _MARKS_OF_ORDER = re.compile(rb"/(?=(?:VE|OCGs)\s*[\[\d])[VO]"), (codecs.BOM_UTF16_BE, codecs.BOM_UTF16_LE)
+_METRES_PER_POINT = 0.0254 / 72.0
 Matrix = Float[np.ndarray, "3 3"]
 
 
@@ -48,7 +61,7 @@ class PageContent:
 
     `out_of_range` lines are left out, as their coordinates are out of range. `painted` is the area of all fills and
     pictures, in pages. `crop` is the part of the page that is read (points); None for all of it. `unit_m` is the length
-    of a point on paper.
+    of a point on paper. `hidden` counts the objects on layers that are switched off, by layer, which are left out.
     """
 
     page: pypdfium2.PdfPage
@@ -59,7 +72,8 @@ class PageContent:
     letters: list[shapely.Polygon] = field(default_factory=list)
     out_of_range: int = 0
     painted: float = 0.0
-    unit_m: float = 0.0
+    unit_m: float = _METRES_PER_POINT
+    hidden: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass
@@ -91,12 +105,44 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
         ) from error
 
 
-def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
-    """Return the paths and texts of a page, and the share that pictures cover."""
-    width, height = page.get_size()
+def read_page(page: pypdfium2.PdfPage, number: int, budget: Budget) -> PageContent:
+    """Return the paths and texts of a page, counted from 1, and the share that pictures cover.
+
+    Objects on layers that are switched off are made inactive, so that the page is drawn without them, too.
+    """
     budget.check_copies(_count_shapes(page.raw, budget), _BYTES_PER_SHAPE)
+    spent, found = budget.entities, _read_objects(page, budget)
+    unit, hidden = None, Counter[str]()
+    # A page that cannot be copied has no layers that are known.
+    with suppress(pypdfium2.PdfiumError), pypdfium2.PdfDocument.new() as alone, io.BytesIO() as file:
+        # The dictionaries of the file can be compressed; those of a copy of its page are not.
+        alone.import_pages(page.pdf, [number - 1])
+        alone.save(file)
+        unit = _USER_UNIT.search(file.getvalue())
+        if _LAYER.search(file.getvalue()):
+            with pypdfium2.PdfDocument(_CONDITION.sub(b"/-", file.getvalue())) as copy:
+                hidden = _hide(page, copy[0], budget)
+    if hidden:
+        budget.entities = spent
+        found = _read_objects(page, budget)
+    # The library takes the unit for a point.
+    found.hidden, found.unit_m = hidden, _METRES_PER_POINT * ((unit and float(unit[1])) or 1.0)
+    text = page.get_textpage()
+    for index in range(min(text.count_rects(), _MAX_TEXTS)):
+        left, bottom, right, top = text.get_rect(index)
+        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_MAX_LENGTH]
+        if words:
+            found.drawing.letterings.append(Lettering(words, (0.5 * (left + right), 0.5 * (bottom + top))))
+    text.close()
+    return found
+
+
+def _read_objects(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
+    """Return the paths of a page, and the share that pictures cover."""
+    width, height = page.get_size()
     found = PageContent(page, size_pt=(float(width), float(height)))
-    for item, matrix in _objects(page.raw, np.eye(3), budget):
+    for item, matrix, _ in _objects(page.raw, np.eye(3)):
+        budget.spend()
         kind = pdfium.FPDFPageObj_GetType(item)
         if kind == pdfium.FPDF_PAGEOBJ_PATH:
             found.out_of_range += _add_path(item, matrix, found, budget)
@@ -112,14 +158,49 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
                 f"the areas and pictures of the page cover it more than {_MAX_PAINTED} times, the limit; remove areas "
                 "that lie over one another"
             )
-    text = page.get_textpage()
-    for index in range(min(text.count_rects(), _MAX_TEXTS)):
-        left, bottom, right, top = text.get_rect(index)
-        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_MAX_LENGTH]
-        if words:
-            found.drawing.letterings.append(Lettering(words, (0.5 * (left + right), 0.5 * (bottom + top))))
-    text.close()
     return found
+
+
+def _hide(page: pypdfium2.PdfPage, copy: pypdfium2.PdfPage, budget: Budget) -> Counter[str]:
+    """Make objects on layers that are switched off inactive, and count them by layer.
+
+    The library states no layer's state, but draws accordingly: hidden is what is drawn on the copy alone, which is of a
+    document without states and conditions.
+    """
+    layers: defaultdict[tuple[str, ...], list[tuple[Any, Any]]] = defaultdict(list)
+    drawn, same = (list(_objects(part.raw, np.eye(3))) for part in (page, copy))
+    for (item, _, names), (copied, _, _) in zip(drawn, same, strict=False):
+        layers[names].append((item, copied))
+    pairs = [pair for group in layers.values() for pair in group]
+    _activate(pairs, is_active=False)
+
+    def hidden_of(group: Sequence[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        budget.check_time()
+        _activate(group, is_active=True)
+        seen, all_seen = _pixels(page), _pixels(copy)
+        _activate(group, is_active=False)
+        if not seen.any() or len(group) == 1 or np.array_equal(seen, all_seen):
+            return list(group) if all_seen.any() and not seen.any() else []
+        half = len(group) // 2
+        return [*hidden_of(group[:half]), *hidden_of(group[half:])]
+
+    hidden = {names: hidden_of(group) for names, group in layers.items()}
+    _activate(pairs, is_active=True)
+    _activate([pair for group in hidden.values() for pair in group], is_active=False)
+    shown = {name for names, group in layers.items() if len(group) > len(hidden[names]) for name in names}
+    return +Counter({", ".join(n for n in names if n not in shown): len(group) for names, group in hidden.items()})
+
+
+def _activate(pairs: Sequence[tuple[Any, Any]], *, is_active: bool) -> None:
+    for item in (item for pair in pairs for item in pair):
+        pdfium.FPDFPageObj_SetIsActive(item, is_active)
+
+
+def _pixels(page: pypdfium2.PdfPage) -> UInt8[np.ndarray, "h w c"]:
+    """Return the pixels of the active objects of a page, transparent where there are none."""
+    scale = _SEEN_PX / max(*page.get_size(), 1.0)
+    bitmap = page.render(scale=scale, fill_color=(0, 0, 0, 0), draw_annots=False, may_draw_forms=False)
+    return np.asarray(bitmap.to_numpy())
 
 
 def _count_shapes(holder: Any, budget: Budget, depth: int = 0) -> int:
@@ -135,20 +216,34 @@ def _count_shapes(holder: Any, budget: Budget, depth: int = 0) -> int:
     return shapes
 
 
-def _objects(holder: Any, matrix: Matrix, budget: Budget, depth: int = 0) -> Iterator[tuple[Any, Matrix]]:
-    """Yield objects with the matrix to page coordinates; forms are expanded."""
+def _objects(
+    holder: Any, matrix: Matrix, depth: int = 0, layers: tuple[str, ...] = ()
+) -> Iterator[tuple[Any, Matrix, tuple[str, ...]]]:
+    """Yield active objects with the matrix to page coordinates, and the names of their layers; forms are expanded."""
     count, get = _OF_FORM if depth else _OF_PAGE
     for index in range(count(holder)):
-        budget.spend()
         item = get(holder, index)
-        own = pdfium.FS_MATRIX()
+        own, active = pdfium.FS_MATRIX(), ctypes.c_int()
         if not item or not pdfium.FPDFPageObj_GetMatrix(item, own):
             continue
+        if pdfium.FPDFPageObj_GetIsActive(item, active) and not active.value:
+            continue
         total = matrix @ np.array([[own.a, own.c, own.e], [own.b, own.d, own.f], [0.0, 0.0, 1.0]])
+        names = (*layers, *_layers_of(item))
         if pdfium.FPDFPageObj_GetType(item) != pdfium.FPDF_PAGEOBJ_FORM:
-            yield item, total
+            yield item, total, names
         elif depth < _MAX_FORM_DEPTH:
-            yield from _objects(item, total, budget, depth + 1)
+            yield from _objects(item, total, depth + 1, names)
+
+
+def _layers_of(item: Any) -> Iterator[str]:
+    """Yield the names of the layers of an object; of marks of other kinds only those with a name count."""
+    name, size = (ctypes.c_ubyte * _NAME_BYTES)(), ctypes.c_ulong()
+    for index in range(pdfium.FPDFPageObj_CountMarks(item)):
+        mark = pdfium.FPDFPageObj_GetMark(item, index)
+        if pdfium.FPDFPageObjMark_GetParamBlobValue(mark, b"Name", name, _NAME_BYTES, size):
+            raw = bytes(name)[: size.value]
+            yield clean_name(raw.decode("utf-16" if raw[:2] in _MARKS_OF_ORDER else "latin-1", "replace")) or ""
 
 
 def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> int:
@@ -157,8 +252,10 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
     fill, stroke = ctypes.c_int(), ctypes.c_int()
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return 0
-    is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
-    fill_colour = _fill(item) if is_filled else None
+    is_filled = fill.value != pdfium.FPDF_FILLMODE_NONE
+    fill_colour = _colour(item, pdfium.FPDFPageObj_GetFillColor) if is_filled else None
+    pen_colour = _colour(item, pdfium.FPDFPageObj_GetStrokeColor) if stroke.value else None
+    is_stroked, is_white = pen_colour is not None, pen_colour is not None and is_white_pen(*pen_colour[:3])
     is_wall = fill_colour is not None and is_dark(*fill_colour[:3])
     width = ctypes.c_float()
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
@@ -176,15 +273,16 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
             found.painted += float(share)
         swings = [fit_swing(_apply(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
         leaves = [swing for swing in swings if swing is not None]
-        if leaves and not is_filled:
+        if leaves and is_stroked and not is_filled:
             drawing.swings += leaves
-        elif len(points) >= 3 and (subpath.is_closed or is_filled):
+        elif len(points) >= 3 and (subpath.is_closed or is_filled) and (is_stroked or is_filled):
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and is_stroked and (line := shapely.LineString(points)).length > 0.0:
-            drawing.strokes.append(Stroke(line, "", None, pen, drawing.next_order))
+            drawing.strokes.append(Stroke(line, "", None, pen, drawing.next_order, is_white))
     if not shells:
         return out_of_range
-    parts, order = even_odd_polygons(shells), drawing.next_order
+    is_nonzero = fill.value == pdfium.FPDF_FILLMODE_WINDING
+    parts, order = even_odd_polygons(shells, is_nonzero=is_nonzero), drawing.next_order
     if fill_colour is not None and not is_wall and fill_colour[3] >= _HIDING:
         drawing.patches += [Patch(part, order, is_bluish(*fill_colour[:3])) for part in parts]
     # A coloured floor or a white background has no drawn outline.
@@ -238,10 +336,9 @@ def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarra
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _fill(item: Any) -> tuple[float, float, float, float] | None:
-    """Return the channels and the opacity of a fill, 0 to 255; None for one that shows most of what is below it."""
+def _colour(item: Any, get: Any) -> tuple[float, float, float, float] | None:
+    """Return the channels and the opacity of a colour, 0 to 255; None for one that shows most of what is below it."""
     red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
-    is_opaque = pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) and alpha.value >= _OPAQUE
-    if not is_opaque:
+    if not get(item, red, green, blue, alpha) or alpha.value < _OPAQUE:
         return None
     return float(red.value), float(green.value), float(blue.value), float(alpha.value)

@@ -40,8 +40,9 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     fit_swing,
     is_bluish,
     is_dark,
+    is_white_pen,
 )
-from lalaloc_core.importers.formats.svg_limits import check_work
+from lalaloc_core.importers.formats.svg_limits import HREF, check_work
 
 # Attribute of the root element with the scale of exported drawings.
 _SCALE_ATTRIBUTE = "data-metres-per-unit"
@@ -54,13 +55,19 @@ _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _AUTOMATIC = re.compile(
     r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I
 )
+# A character in an id of Illustrator.
+_ESCAPED = re.compile(r"_x([0-9A-F]{2,4})_")
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_ANY_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc|px|%|)")
+# Attributes of the view of a drawing or symbol, and shares of the free space before it.
+_OF_VIEW = ("x", "y", "width", "height", "viewBox", "preserveAspectRatio", "transform")
+_ALIGNED = {"Min": 0.0, "Mid": 0.5, "Max": 1.0}
 _LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc)\s*")
-# Fills that are less opaque do not hide what is below them.
-_OPAQUE = 0.9
+# Fills that are less opaque do not hide what is below them, and lines are invisible.
+_OPAQUE, _INVISIBLE = 0.9, 0.2
 # Elements without a shape, and elements that are drawn only where they are used.
-_IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker")
+_IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker", "mask", "clipPath")
 # Export at 1:100: user units per metre, millimetres on paper per metre, and margin.
 _UNITS_PER_M, _MM_PER_M, _MARGIN_M = 100.0, 10.0, 0.5
 _STYLE = (
@@ -106,15 +113,10 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     texts = sum(any(text.strip() for text in element.itertext()) for element in hypertexts)
     for parent in list(root.iter()):
         parent[:] = [child for child in parent if local_name(child) not in _IGNORED_ELEMENTS]
-        # Symbols are drawn where they are used, as the library draws all but definitions.
-        if local_name(parent) == "symbol":
-            inner = Element(f"{_SVG}g", parent.attrib)
-            inner[:] = list(parent)
-            parent.clear()
-            parent.tag = f"{_SVG}defs"
-            parent.append(inner)
-        elif local_name(parent) == "text":
+        if local_name(parent) == "text":
             _join_parts(parent)
+    views = {e.get("id"): dict(e.attrib) for e in root.iter() if local_name(e) in ("symbol", "svg") and e is not root}
+    _place_views(root, views, _view(root.attrib, (0.0, 0.0))[0])
     check_work(root, budget)
     # The title of a shape is its name, unless it has one; the title of the drawing names nothing.
     for element in root.iter():
@@ -138,6 +140,53 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             "save the styles as attributes"
         )
     return _read_plan(root, warnings, options, budget)
+
+
+def _place_views(parent: Element, views: Mapping[str | None, Mapping[str, str]], size: tuple[float, float]) -> None:
+    """Make groups of nested drawings and symbols, with the transforms of their views, which the library reads wrong.
+
+    `views` are their attributes by id, and `size` is that of the view around. Symbols are drawn where they are used.
+    """
+    for element in parent:
+        name, inside, own = local_name(element), size, element.attrib
+        if name == "use" and (target := views.get(own.get("href", own.get(HREF, ""))[1:])) is not None:
+            moved = {key: value for key, value in own.items() if key in ("x", "y", "width", "height")}
+            _, view = _view({**target, "x": "0", "y": "0", **moved}, size)
+            own["transform"] = f"{own.get('transform', '')} {view}"
+            for key in moved:
+                del own[key]
+        elif name in ("svg", "symbol"):
+            inside, view = _view(own, size)
+            inner = Element(f"{_SVG}g", {key: value for key, value in own.items() if key not in _OF_VIEW})
+            inner[:] = list(element)
+            element.clear()
+            element.tag = f"{_SVG}{'defs' if name == 'symbol' else 'g'}"
+            element.set("transform", view)
+            element.append(inner)
+        _place_views(element, views, inside)
+
+
+def _view(attributes: Mapping[str, str], around: tuple[float, float]) -> tuple[tuple[float, float], str]:
+    """Return the size of the view of a drawing or symbol in its own units, and the transform that places it."""
+
+    def length(key: str, usual: str, whole: float) -> float:
+        found = _ANY_LENGTH.match(attributes.get(key, usual)) or _ANY_LENGTH.match(usual)
+        number, unit = (float(found[1]), found[2]) if found is not None else (0.0, "")
+        return number * (0.01 * whole if unit == "%" else _METRES.get(unit, _METRES["px"]) / _METRES["px"])
+
+    x, y = length("x", "0", around[0]), length("y", "0", around[1])
+    width, height = length("width", "100%", around[0]), length("height", "100%", around[1])
+    box = [float(number) for number in _NUMBER.findall(attributes.get("viewBox", ""))]
+    left, top, wide, high = box if len(box) == 4 and min(box[2:]) > 0.0 else (0.0, 0.0, width, height)
+    scales = width / (wide or 1.0), height / (high or 1.0)
+    fit = attributes.get("preserveAspectRatio", "xMidYMid")
+    if "none" not in fit:
+        scales = (max(scales) if "slice" in fit else min(scales),) * 2
+    free = (width - scales[0] * wide, height - scales[1] * high)
+    shares = (next((share for word, share in _ALIGNED.items() if axis + word in fit), 0.5) for axis in "xY")
+    across, down = (rest * share for rest, share in zip(free, shares, strict=True))
+    place = f"translate({x + across - scales[0] * left!r} {y + down - scales[1] * top!r})"
+    return (wide, high), f"{attributes.get('transform', '')} {place} scale({scales[0]!r} {scales[1]!r})"
 
 
 def _join_parts(text: Element) -> None:
@@ -226,8 +275,10 @@ def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
     sides = [_LENGTH.fullmatch(root.get(key, "")) for key in ("width", "height")]
     width_m, height_m = (0.0 if side is None else float(side[1]) * _METRES[side[2]] for side in sides)
     numbers = [float(number) for number in _NUMBER.findall(root.get("viewBox", ""))]
-    units = numbers[2] if len(numbers) == 4 else width_m / _METRES["px"]
-    return (width_m / units, max(width_m, height_m)) if width_m > 0.0 and units > 0.0 else (None, None)
+    units = numbers[2:] if len(numbers) == 4 else [width_m / _METRES["px"], height_m / _METRES["px"]]
+    scales = [size / unit for size, unit in zip((width_m, height_m), units, strict=True) if min(size, unit) > 0.0]
+    # A drawing is not stretched by default, and leaves a margin on a sheet of other proportions.
+    return (min(scales), max(width_m, height_m)) if scales else (None, None)
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
@@ -295,7 +346,8 @@ def _is_hidden(element: Any) -> bool:
     values = element.values
     # As "0", "0.0" or "0%".
     is_transparent = not str(values.get("opacity", 1)).strip("0.%")
-    return is_transparent or str(values.get("display")) == "none" or str(values.get("visibility")) == "hidden"
+    is_invisible = str(values.get("visibility")).startswith(("hidden", "collapse"))
+    return is_transparent or is_invisible or str(values.get("display")).startswith("none")
 
 
 def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
@@ -308,9 +360,12 @@ def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
 def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
     name = _name_of(element, context)
     fill: Any = element.fill
-    is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
+    is_filled = fill is not None and fill.value is not None and fill.opacity > _INVISIBLE
     is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
-    width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
+    pen: Any = element.stroke if element.stroke is not None else svgelements.Color(None)
+    is_stroked = pen.value is not None
+    is_white = is_stroked and is_white_pen(float(pen.red), float(pen.green), float(pen.blue))
+    width = element.stroke_width if is_stroked else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(element, budget):
         swings = [fit_swing(curve, context.layer) for curve in curves] if context.role in (None, "door") else []
@@ -318,20 +373,23 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         if leaves:
             drawing.swings += leaves
             builder.use(context.layer, "door swings", len(leaves))
+        elif is_stroked and pen.opacity <= _INVISIBLE and not closed and context.role is None:
+            builder.use(context.layer, "ignored (invisible)")
         elif len(points) >= 4 and (closed or (context.role in ("room", "wall", "obstacle") and is_filled)):
             shells += polygons_from_geometry(shapely.Polygon(points))
         elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
             line, order = shapely.LineString(points), drawing.next_order
-            drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order))
+            drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order, is_white))
             builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
         elif not len(points):
             builder.use(context.layer, "ignored (coordinates out of range)")
     order = drawing.next_order
-    for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
+    is_nonzero = is_filled and str(element.values.get("fill-rule", "nonzero")) == "nonzero"
+    for shape in even_odd_polygons(shells, is_nonzero=is_nonzero) if len(shells) > 1 else shells:
         if fill is not None and is_filled and not is_wall and context.role is None and fill.opacity > _OPAQUE:
             drawing.patches.append(Patch(shape, order, is_bluish(float(fill.red), float(fill.green), float(fill.blue))))
-        pen = float(width or 0.0)
-        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, pen, order))
+        width = float(width or 0.0)
+        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, width, order))
         builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
 
 
@@ -377,7 +435,7 @@ def _name_of(element: Any, context: _Context) -> str | None:
     """Return the label or id of a room's shape, else the words of its class besides "room"."""
     own = element.values.get("attributes") or {}
     for key in (_LABEL, "data-name", "id"):
-        text = str(own.get(key) or "").strip()
+        text = _ESCAPED.sub(lambda found: chr(int(found[1], 16)), str(own.get(key) or "")).strip()
         if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_from_name(text) is None):
             return text.replace("_", " ")
     if context.role != "room" or context.kind is None:

@@ -16,7 +16,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.bounded_files import local_name
 from lalaloc_core.importers.common.import_limits import Budget
 
-_HREF = "{http://www.w3.org/1999/xlink}href"
+HREF = "{http://www.w3.org/1999/xlink}href"
 _BYTES_PER_ENTITY, _BYTES_PER_SHAPE = 12, 20
 # Characters of styles, and multiples of them that a class, a transform and a path take: a second for 30 million.
 _CLASS, _TRANSFORM, _PATH = 6, 12, 100
@@ -62,7 +62,7 @@ def check_work(root: Element, budget: Budget) -> None:
         for child in element:
             total += work(child)
         if local_name(element) == "use":
-            target = by_id.get(element.get("href", element.get(_HREF, "#"))[1:])
+            target = by_id.get(element.get("href", element.get(HREF, "#"))[1:])
             total += work(target) if target is not None else _Work()
         # A transform is read again for every element inside.
         characters = _TRANSFORM * len(element.get("transform", "")) * total.copies + len(element.attrib) * total.copies
