@@ -46,8 +46,7 @@ def test_batch_is_answered_line_by_line(desktop: Visit) -> None:
 @pytest.mark.slow
 def test_broken_answer_says_what_to_do(desktop: Visit) -> None:
     script = """
-        const body = new ReadableStream({ pull: (to) => to.error(new TypeError("broken")) });
-        window.fetch = async () => new Response(body);
+        window.fetch = async () => new Response(new ReadableStream({ pull: (to) => to.error(new TypeError("")) }));
         return new Client().localiseBatch({}, [photo]).next().catch(({ title, detail }) => `${title}: ${detail}`);
         """
     assert run(desktop.open(), script).startswith("The connection broke off: Check that the service runs")

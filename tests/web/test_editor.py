@@ -237,7 +237,6 @@ def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> Non
 def test_comma_is_a_decimal_point(desktop: Visit) -> None:
     north = _editing(desktop, "Commas").locator("#plan-form-north")
     north.press_sequentially("22,5")
-    north.press("Tab")
     expect(north).to_have_value("22.5")
 
 

@@ -300,9 +300,11 @@ def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
 @pytest.mark.slow
 def test_plans_of_one_name_show_date_and_revision(desktop: Visit) -> None:
     for _ in range(2):
-        upload(desktop.client, FLAT | {"name": "Twin"})
-    told = [re.compile(r"Twin.*stored \d+ \w+ \d{4}, [\d:]{8}, revision 1$")] * 2
-    for path, entries in (("/", "#plan-list .plan"), ("/", "#venue-form-plan option"), ("/pin", "#plan-choice option")):
+        plan = {"floorplan_id": upload(desktop.client, FLAT | {"name": "Twin"}), "level": 0}
+        desktop.client.post("/venues", json={"name": "Twins", "plans": [plan]}).raise_for_status()
+    told = [re.compile(r"Twin.*stored \d+ \w+ \d{4}, [\d:]{8}(, revision 1)?$")] * 2
+    lists = ("/", "#plan-list .plan"), ("/", "#venue-list .plan"), ("/pin", "[label=Plans] option")
+    for path, entries in (*lists, ("/", "#venue-form-plan option")):
         expect(desktop.open(path).locator(entries, has_text="Twin")).to_have_text(told)
 
 
