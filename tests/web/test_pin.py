@@ -194,7 +194,7 @@ def test_photographs_wait_for_a_plan(browser: Browser, start_app: StartApp, tmp_
             # The folder before is listed with its date.
             saved = page.locator("#plan-choice optgroup[label='Saved folders'] option")
             names = "Six photographed rooms", "Example flat"
-            expect(saved).to_have_text([re.compile(rf"\d{{4}}, {name}$") for name in names])
+            expect(saved).to_have_text([re.compile(rf"\d{{4}}, [\d:]{{5}}, {name}$") for name in names])
             page.locator("#plan-choice").select_option(saved.last.get_attribute("value"))
             expect(page.locator("#plan .room")).to_have_count(len(FLAT["rooms"]))
             expect(page.locator("#plan .pin")).to_have_count(2)

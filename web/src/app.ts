@@ -3,14 +3,14 @@
 import { AnswerController } from "./answer_controller";
 import { linkedAnswer } from "./answer_link";
 import { api } from "./api";
-import { byId, connectNumbers, named } from "./dom";
+import { byId, named } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan, TURN } from "./example";
 import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
 import { LookAround } from "./look/look_around";
 import { PhoneLink } from "./look/phone_link";
-import { attempt, clearErrors, InputError, say, showError } from "./notices";
+import { attempt, clearErrors, connectNumbers, InputError, say, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";

@@ -66,19 +66,6 @@ export const ARROWS: Record<string, [number, number]> = {
   ArrowDown: [0, -1],
 };
 
-/** Take a comma for the decimal point in fields for numbers, where browsers of some languages drop it; tell what is no number. */
-export function connectNumbers(): void {
-  addEventListener("beforeinput", (event) => {
-    const isNumber = (event.target as Element).matches("[type=number]");
-    if (!isNumber || !/^[^.,]*,[^.,]*$/.test(event.data ?? "")) return;
-    event.preventDefault();
-    document.execCommand("insertText", false, event.data!.replace(",", "."));
-  });
-  addEventListener("change", ({ target }) => {
-    if ((target as HTMLInputElement).validity?.badInput) (target as HTMLInputElement).reportValidity();
-  });
-}
-
 /** Call `move` for every movement of the pointer until it is released, and then `done`. */
 export function followPointer(move: (event: PointerEvent) => void, done?: () => void): void {
   const end = (): void => {

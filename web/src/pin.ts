@@ -1,10 +1,10 @@
 /** Page at /pin: a plan or venue, a folder of photographs, and a pin for each. */
 
 import { api, key } from "./api";
-import { button, byId, connectNumbers, download, h, named, s, show } from "./dom";
+import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
-import { attempt, InputError, say } from "./notices";
+import { attempt, connectNumbers, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { Floors, folderOption, listPlaces, type Row } from "./pin_floors";
@@ -79,6 +79,7 @@ class PinPage {
       if (document.visibilityState === "visible") void this.guarded(() => this.refresh());
     });
     addEventListener("beforeprint", () => this.fillPages());
+    addEventListener("beforeunload", (event) => this.reading !== "" && event.preventDefault());
     await this.guarded(() => this.begin());
   }
 
