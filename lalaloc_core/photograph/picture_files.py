@@ -311,7 +311,7 @@ def _unreadable(content: bytes) -> str:
     if kind == HEIC:
         return f"the photograph is {kind}, which is damaged; save or export it as {_SUPPORTED}"
     if kind is None or kind.removeprefix("a ").removesuffix(" picture").upper() in FORMATS:
-        return f"the photograph is not a readable {_SUPPORTED} picture"
+        return f"the photograph is not a readable {_SUPPORTED} or HEIC picture"
     return f"the photograph is {kind}, which is not supported; save or export it as {_SUPPORTED}"
 
 

@@ -97,16 +97,16 @@ def parse_document(model: type[Model], content: bytes, max_values: int) -> Model
 
 
 async def check_parameters(request: Request) -> None:
-    """Refuse unknown query parameters; a dependency of every route."""
+    """Refuse unknown query parameters, except of pages; a dependency of every route."""
     counts = Counter(name for name, _ in request.query_params.multi_items())
-    if not counts:
-        return
     route = request.scope.get("route")
+    # Messengers and mail programs add parameters to links to pages, which are not in the schema.
+    if not counts or not getattr(route, "include_in_schema", True):
+        return
     known = _parameters_of(route)
     unknown = _unknown(known, is_form=_takes_form(route))
     faults = [(name[:50], unknown) for name in counts if name not in known]
-    once = [name for name, repeatable in known.items() if not repeatable]
-    faults += [(name, "given more than once") for name in once if counts[name] > 1]
+    faults += [(name, "given more than once") for name, many in known.items() if counts[name] > 1 and not many]
     if faults:
         raise InvalidRequestError(faults)
 

@@ -44,6 +44,15 @@ def test_batch_is_answered_line_by_line(desktop: Visit) -> None:
 
 
 @pytest.mark.slow
+def test_broken_answer_says_what_to_do(desktop: Visit) -> None:
+    script = """
+        window.fetch = async () => new Response(new ReadableStream({ pull: (to) => to.error(new TypeError("")) }));
+        return new Client().localiseBatch({}, [photo]).next().catch(({ title, detail }) => `${title}: ${detail}`);
+        """
+    assert run(desktop.open(), script).startswith("The connection broke off: Check that the service runs")
+
+
+@pytest.mark.slow
 def test_upload_reports_its_progress(desktop: Visit) -> None:
     plan_id, page = upload(desktop.client, json.loads((EXAMPLES / "flat.json").read_text())), desktop.open()
     progress, answer = run(

@@ -234,6 +234,13 @@ def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> Non
 
 
 @pytest.mark.slow
+def test_comma_is_a_decimal_point(desktop: Visit) -> None:
+    north = _editing(desktop, "Commas").locator("#plan-form-north")
+    north.press_sequentially("22,5")
+    expect(north).to_have_value("22.5")
+
+
+@pytest.mark.slow
 def test_leaving_with_changes_asks_first(desktop: Visit) -> None:
     page = _editing(desktop, "Left")
     _enter(page, "#plan-form-ceiling", "-1")

@@ -245,6 +245,38 @@ def test_levels_of_a_file_are_a_list(desktop: Visit, tmp_path: Path) -> None:
     expect(page.locator("#venue-bar")).to_contain_text("2 plans")
     expect(form).to_be_empty()
     expect(page.locator("#venue-plan option")).to_have_count(2)
+    # An import that ends while the user edits a plan changes neither the plan nor what is left to choose.
+    page.locator("#plan-file").set_input_files(tmp_path / "house.geojson")
+    held = list[Route]()
+    page.route("**/venues", lambda route: held.append(route))
+    form.get_by_role("button", name="Import all levels as a venue").click()
+    expect(page.locator("#plan-state")).to_contain_text("Importing all")
+    name = page.locator("#plan-name").inner_text()
+    page.locator("#edit-plan").click()
+    for place in (form, page.locator("#venue-bar")):
+        expect(place).to_be_hidden()
+    page.evaluate("""() => { const dataTransfer = new DataTransfer();
+        dataTransfer.items.add(new File(['{}'], 'other.json'));
+        document.getElementById('plan-panel').dispatchEvent(new DragEvent('drop', { dataTransfer })); }""")
+    expect(page.locator("#toast")).to_contain_text("Save or stop editing first, then add “other.json” again.")
+    held[0].continue_()
+    expect(page.locator("#toast")).to_contain_text("is stored: choose it under “Plans”")
+    page.locator("#stop").click()
+    expect(page.locator("#plan-name")).to_have_text(name)
+    expect(form).to_be_empty()
+    page.get_by_text("Plans", exact=True).click()
+    expect(page.locator("#venue-list button")).to_have_count(2)
+
+
+@pytest.mark.slow
+def test_warnings_of_one_cause_are_one(desktop: Visit) -> None:
+    plan_id = upload(desktop.client, FLAT | {"name": "Guessed"})
+    plan = desktop.client.get(f"/floorplans/{plan_id}").json()
+    gaps = [f"a gap of 0.8{index} m at ({index}.5, 2.25) is taken for a door" for index in range(3)]
+    plan["import_report"] = {"is_draft": False, "unsure": [*gaps, "no door is drawn"], "no_room": []}
+    desktop.page.route(f"**/floorplans/{plan_id}", lambda route: route.fulfill(json=plan))
+    items = desktop.open(f"/#plan={plan_id}").locator("#plan-warnings > li")
+    expect(items).to_have_text([f"{gaps[0]}2 more of this kind{gaps[1]}{gaps[2]}", "no door is drawn"])
 
 
 @pytest.mark.slow
@@ -268,9 +300,11 @@ def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
 @pytest.mark.slow
 def test_plans_of_one_name_show_date_and_revision(desktop: Visit) -> None:
     for _ in range(2):
-        upload(desktop.client, FLAT | {"name": "Twin"})
-    told = [re.compile(r"Twin.*stored \d+ \w+ \d{4}, \d\d:\d\d, revision 1$")] * 2
-    for path, entries in (("/", "#plan-list .plan"), ("/", "#venue-form-plan option"), ("/pin", "#plan-choice option")):
+        plan = {"floorplan_id": upload(desktop.client, FLAT | {"name": "Twin"}), "level": 0}
+        desktop.client.post("/venues", json={"name": "Twins", "plans": [plan]}).raise_for_status()
+    told = [re.compile(r"Twin.*stored \d+ \w+ \d{4}, [\d:]{8}(, revision 1)?$")] * 2
+    lists = ("/", "#plan-list .plan"), ("/", "#venue-list .plan"), ("/pin", "[label=Plans] option")
+    for path, entries in (*lists, ("/", "#venue-form-plan option")):
         expect(desktop.open(path).locator(entries, has_text="Twin")).to_have_text(told)
 
 

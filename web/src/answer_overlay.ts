@@ -10,15 +10,18 @@ import type { Answer } from "./types";
 // 95 % of a normal distribution in two dimensions lie within this many standard deviations.
 const WITHIN_95 = Math.sqrt(5.991);
 
+/** Covariance of x, y and perhaps more. */
+type Covariance = [[number, number, ...number[]], [number, number, ...number[]], ...number[][]];
+
 /** Return the radii (m) of the ellipse that contains a position with a probability of 95 %, the longer one first. */
-export function within95([[xx, xy], [, yy]]: NonNullable<Answer["covariance_m2"]>): [number, number] {
+export function within95([[xx, xy], [, yy]]: Covariance): [number, number] {
   const mean = 0.5 * (xx + yy),
     spread = Math.hypot(0.5 * (xx - yy), xy);
   return [WITHIN_95 * Math.sqrt(mean + spread), WITHIN_95 * Math.sqrt(Math.max(mean - spread, 0))];
 }
 
 /** Draw the ellipse that contains the camera with a probability of 95 %. */
-export function ellipse(answer: Pick<Answer, "covariance_m2" | "position">): SVGElement | null {
+export function ellipse(answer: Pick<Answer, "position"> & { covariance_m2: Covariance | null }): SVGElement | null {
   if (answer.covariance_m2 === null) return null;
   const [[xx, xy], [, yy]] = answer.covariance_m2,
     [major, minor] = within95(answer.covariance_m2);

@@ -15,7 +15,7 @@ import {
   viewWords,
 } from "./answer_words";
 import { button, byId, h, show } from "./dom";
-import { say, showError } from "./notices";
+import { attempt, say } from "./notices";
 import type { Photo } from "./photos";
 import { type Place, placesOf, remainder } from "./places";
 import { percent, plainWords } from "./plain_words";
@@ -178,14 +178,12 @@ function facts(answer: Answer): HTMLElement {
     .filter(({ probability }) => probability !== null)
     .slice(0, MAX_PLANS)
     .map((plan) => `${planLabel(plan)}: ${percent(plan.probability!)}`);
-  const earth = answer.geopose?.position;
+  const earth = answer.geopose?.position,
+    source = HEADING_SOURCES[answer.heading_source] ?? HEADING_SOURCES.photograph;
   const pairs: [string, string][] = [
     ...(plans.length > 0 ? [["Plans", plans.join("; ")] as [string, string]] : []),
     ...(earth ? [["On Earth", `${earth.lat.toFixed(6)}, ${earth.lon.toFixed(6)}`] as [string, string]] : []),
-    [
-      "Heading",
-      `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${HEADING_SOURCES[answer.heading_source] ?? HEADING_SOURCES.photograph}`,
-    ],
+    ["Heading", `${headingWords(answer.heading_deg, answer.heading_std_deg)}, ${source}`],
     ...(answer.view == null ? [] : [["Seen", seenWords(answer.view)] as [string, string]]),
     ["Camera height", `${answer.camera_height_m.toFixed(2)} m (best fit)`],
     ["Time", `${milliseconds(answer.timings_ms.total ?? 0)} (${stages.join(", ")})`],
@@ -229,13 +227,8 @@ function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): 
   );
 }
 
-async function copyLink(answer: Answer): Promise<void> {
-  try {
-    await copy(await linkTo(answer), "link");
-  } catch (error) {
-    showError(byId("photo-error"), error);
-  }
-}
+const copyLink = (answer: Answer): Promise<void> =>
+  attempt(byId("photo-error"), async () => copy(await linkTo(answer), "link"));
 
 async function copy(text: string, name: string): Promise<void> {
   const shown = byId("copied");

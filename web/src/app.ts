@@ -10,7 +10,7 @@ import { connectGuide } from "./guide";
 import { connectKeyDialog } from "./key_dialog";
 import { LookAround } from "./look/look_around";
 import { PhoneLink } from "./look/phone_link";
-import { attempt, clearErrors, InputError, showError } from "./notices";
+import { attempt, clearErrors, connectNumbers, InputError, say, showError } from "./notices";
 import { showCaption } from "./plan_caption";
 import { PlanScene } from "./plan_scene";
 import { Plans } from "./plans";
@@ -48,7 +48,7 @@ class Page {
     started: () => this.onStarted(),
     picked: () => this.venues.leave(),
     listed: (plans) => this.venues.offer(plans),
-    imported: (venue) => void this.venues.take(venue),
+    imported: (venue, isShown) => void (isShown ? this.venues.take(venue) : this.venues.load("")),
     searched: (name) => void this.venues.load(name),
     example: (plan, photos, isTurn) => {
       if (plan !== null) this.onExample(plan);
@@ -76,6 +76,7 @@ class Page {
   async start(): Promise<void> {
     const { scene, answers, editor, session } = this;
     connectKeyDialog();
+    connectNumbers();
     connectGuide();
     scene.arrange(editor.underlay.element, answers.hints.element, [session.layer, ...editor.layers]);
     byId("edit-plan").addEventListener("click", () => this.edit(scene.plan));
@@ -84,7 +85,7 @@ class Page {
     // Phones have no use for a code.
     byId("phone-link").hidden = !matchMedia("(pointer: fine)").matches;
     byId("phone-link").addEventListener("click", () => void this.showPhoneLink());
-    addEventListener("hashchange", () => void this.open());
+    addEventListener("hashchange", () => void (editor.isOpen ? say("Save or stop editing first.") : this.open()));
     await answers.start();
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;

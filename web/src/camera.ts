@@ -13,6 +13,8 @@ export type CameraView = Pick<ViewAnswer, "projection" | "camera" | "hfov" | "pi
 const LARGEST_STEP = radians(1);
 // Perspective cameras are drawn up to this angle from the optical axis.
 const WIDEST = Math.tan(radians(80));
+// A picture whose ratio of sides differs by more than this share from the camera's has bars.
+const BARS = 0.02;
 
 export const dot = (a: Ray, b: Ray): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
@@ -75,15 +77,18 @@ export function tiltOf(view: Pick<CameraView, "projection" | "pitch" | "roll">):
 export function placeOf(view: CameraView, size: Size): Place {
   const { camera } = view;
   if (camera === null) return around(view, size);
-  const across = size.width / camera.width,
-    down = size.height / camera.height;
+  const { width, height } = camera;
+  let [across, down] = [size.width / width, size.height / height];
+  // Bars around a photograph, which the service cuts off, are taken for equal.
+  if (Math.abs(Math.log(across / down)) > BARS) across = down = Math.min(across, down);
   const bend = view.projection === "fisheye" ? fisheye(camera.distortion) : pinhole(camera.distortion);
   return (ray) => {
     const point = bend(ray);
+    if (point === null) return null;
     // OpenCV counts from the centre of the first pixel.
-    return (
-      point && [(camera.fx * point[0] + camera.cx + 0.5) * across, (camera.fy * point[1] + camera.cy + 0.5) * down]
-    );
+    const [x, y] = [camera.fx * point[0] + camera.cx + 0.5, camera.fy * point[1] + camera.cy + 0.5];
+    if (!inside([x, y], camera)) return null;
+    return [0.5 * size.width + (x - 0.5 * width) * across, 0.5 * size.height + (y - 0.5 * height) * down];
   };
 }
 

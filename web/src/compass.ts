@@ -1,6 +1,6 @@
 /** Dial over the photograph that shows and sets the azimuth of its centre in the plan. */
 
-import { byId } from "./dom";
+import { ARROWS, byId } from "./dom";
 import { degrees } from "./layout";
 
 export class Compass {
@@ -70,15 +70,9 @@ export class Compass {
   }
 
   private onKey(event: KeyboardEvent): void {
-    const steps: Record<string, number> = {
-      ArrowRight: 1,
-      ArrowUp: 1,
-      ArrowLeft: -1,
-      ArrowDown: -1,
-      PageUp: 10,
-      PageDown: -10,
-    };
-    const step = steps[event.key];
+    const pages: Record<string, number> = { PageUp: 10, PageDown: -10 };
+    const arrow = ARROWS[event.key],
+      step = arrow ? arrow[0] + arrow[1] : pages[event.key];
     if (step !== undefined) this.turn(Math.round(this.heading ?? this.found ?? -step) + step);
     else if (event.key === "Home") this.turn(0);
     else if (event.key === "Delete" || event.key === "Escape") this.turn(null);

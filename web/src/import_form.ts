@@ -149,8 +149,9 @@ export class ImportForm {
     );
   }
 
-  /** Close the form and forget its values. */
-  close(): void {
+  /** Close the form, by default whatever its file, and forget its values. */
+  close(file = this.file): void {
+    if (file !== this.file) return;
     this.file = null;
     this.picture.close();
     this.isPlan.checked = false;

@@ -107,3 +107,16 @@ export function say(text: string): void {
   // Long ones stay as long as they take to read.
   hide = window.setTimeout(() => place.classList.remove("shown"), Math.max(4000, 60 * text.length));
 }
+
+/** Take a comma for the decimal point in fields for numbers, where browsers of some languages drop it; tell what is no number. */
+export function connectNumbers(): void {
+  addEventListener("beforeinput", (event) => {
+    const isNumber = (event.target as Element).matches("[type=number]");
+    if (!isNumber || !/^[^.,]*,[^.,]*$/.test(event.data ?? "")) return;
+    event.preventDefault();
+    document.execCommand("insertText", false, event.data!.replace(",", "."));
+  });
+  addEventListener("focusout", ({ target: field }) => {
+    if (field instanceof HTMLInputElement && field.validity.badInput) say(field.validationMessage);
+  });
+}

@@ -5,25 +5,10 @@ import { attempt, InputError } from "./notices";
 
 // Pixels of the longer side, and properties that style sheets set.
 const PIXELS = 2400;
-const STYLES = [
-  "display",
-  "fill",
-  "fill-opacity",
-  "font-family",
-  "font-size",
-  "font-weight",
-  "opacity",
-  "paint-order",
-  "stroke",
-  "stroke-dasharray",
-  "stroke-linecap",
-  "stroke-linejoin",
-  "stroke-opacity",
-  "stroke-width",
-  "text-anchor",
-  "vector-effect",
-  "visibility",
-];
+const STYLES = (
+  "display fill fill-opacity font-family font-size font-weight opacity paint-order stroke " +
+  "stroke-dasharray stroke-linecap stroke-linejoin stroke-opacity stroke-width text-anchor vector-effect visibility"
+).split(" ");
 
 /** Load a picture, whose address is to be revoked after use. Rejects with a message if the browser cannot show the file. */
 export async function loadPicture(file: Blob, message: string): Promise<HTMLImageElement> {

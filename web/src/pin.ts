@@ -4,7 +4,7 @@ import { api, key } from "./api";
 import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
-import { attempt, InputError, say } from "./notices";
+import { attempt, connectNumbers, InputError, say } from "./notices";
 import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { Floors, folderOption, listPlaces, type Row } from "./pin_floors";
@@ -58,6 +58,7 @@ class PinPage {
 
   async start(): Promise<void> {
     connectKeyDialog();
+    connectNumbers();
     this.svg.append(this.base, this.names, this.pins);
     this.choice.addEventListener("change", () => void this.guarded(() => this.choose(this.choice.value)));
     this.levels.addEventListener("change", () => void this.guarded(() => this.showPlan(this.levels.value)));
@@ -78,6 +79,7 @@ class PinPage {
       if (document.visibilityState === "visible") void this.guarded(() => this.refresh());
     });
     addEventListener("beforeprint", () => this.fillPages());
+    addEventListener("beforeunload", (event) => this.reading !== "" && event.preventDefault());
     await this.guarded(() => this.begin());
   }
 
@@ -211,21 +213,24 @@ class PinPage {
     if (left > 0) tell(`A folder has at most ${most} photographs; left out: ${left}. Choose the plan again for them.`);
     let sent = 0,
       copies = 0;
-    for await (const { file, line } of added(album.id, wanted)) {
-      if (typeof line === "string") tell(`${file.name}: ${line}`);
-      else if (!line.photograph) tell(`${file.name}: ${plainWords(line.problem?.detail ?? "not added")}`);
-      else {
-        if (line.status === 200) copies++;
-        // Features have no width: the service cannot tell whose they are.
-        if (line.photograph.view.width !== null) this.files.set(line.photograph.id, file);
-        const picture = this.thumbnails.has(line.photograph.id) ? null : await thumbnailOf(file);
-        if (picture !== null) this.thumbnails.set(line.photograph.id, picture);
+    try {
+      for await (const { file, line } of added(album.id, wanted)) {
+        if (typeof line === "string") tell(`${file.name}: ${line}`);
+        else if (!line.photograph) tell(`${file.name}: ${plainWords(line.problem?.detail ?? "not added")}`);
+        else {
+          if (line.status === 200) copies++;
+          // Features have no width: the service cannot tell whose they are.
+          if (line.photograph.view.width !== null) this.files.set(line.photograph.id, file);
+          const picture = this.thumbnails.has(line.photograph.id) ? null : await thumbnailOf(file);
+          if (picture !== null) this.thumbnails.set(line.photograph.id, picture);
+        }
+        this.reading = `${++sent} of ${wanted.length} photographs read, `;
+        byId("pin-state").textContent = `${this.reading}${sureOf(this.rows)} pinned for sure`;
+        if (sent % 5 === 0) void this.guarded(() => this.follow());
       }
-      this.reading = `${++sent} of ${wanted.length} photographs read, `;
-      byId("pin-state").textContent = `${this.reading}${sureOf(this.rows)} pinned for sure`;
-      if (sent % 5 === 0) void this.guarded(() => this.follow());
+    } finally {
+      this.reading = "";
     }
-    this.reading = "";
     if (copies > 0) tell(`Photographs that the folder has already: ${copies}`);
     await this.polling;
     await this.follow();
@@ -242,10 +247,7 @@ class PinPage {
       const key = [now.revision, now.solved_revision_number, now.place_revision].join();
       const photographs = key === seen ? this.rows : (await api.albumPhotographs(album.id)).photographs;
       seen = key;
-      const places = photographs.flatMap(({ pin }) => [
-        ...(pin?.place ? [pin.place] : []),
-        ...(pin?.suggestions ?? []),
-      ]);
+      const places = photographs.flatMap(({ pin }) => [pin?.place ?? [], pin?.suggestions ?? []].flat());
       await this.floors.load(places.map((place) => place.floorplan_id));
       if (album.id !== this.album?.id) return;
       [this.album, this.rows] = [now, photographs];

@@ -105,8 +105,9 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
     const details = event.currentTarget as HTMLElement;
     if (details.childElementCount === 1) details.append(suggestions());
   };
+  // The first one of a sure pin is its own place.
   const others =
-    choices.length > 0 &&
+    choices.length > (pin?.state === "uncertain" ? 0 : 1) &&
     (pin?.state === "uncertain" ? suggestions() : h("details", { ontoggle: onOpen }, h("summary", {}, "Other places")));
   const label = `Photograph ${row.number}, ${row.name ?? ""}: ${factsOf(row)}`;
   const onkeydown = ((event: KeyboardEvent) => {
@@ -128,7 +129,10 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
       h("strong", { class: "name" }, `${row.number} ${row.name ?? ""}`),
       h("p", {}, factsOf(row)),
       h("p", { class: "hint" }, row.view.taken_at?.replace("T", " ").slice(0, 16)),
-      ...(pin?.warnings ?? []).map((text) => h("p", { class: "hint" }, plainWords(text))),
+      // Photographs of a folder have no fields.
+      ...(pin?.warnings ?? []).map((text) =>
+        h("p", { class: "hint" }, plainWords(text).replace("“Field of view” or ", "")),
+      ),
     ),
     others,
     h(

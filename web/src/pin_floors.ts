@@ -46,7 +46,7 @@ export async function listPlaces(choice: HTMLElement, saved: HTMLElement): Promi
 
 /** Return a saved folder as a choice, by its date, which a long name would cut off, and its name. */
 export function folderOption(album: Pick<Schemas["AlbumSummary"], "id" | "name" | "updated_at">): HTMLOptionElement {
-  const date = new Date(album.updated_at).toLocaleDateString("en-GB", { dateStyle: "medium" });
+  const date = new Date(album.updated_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
   return h("option", { value: `album:${album.id}` }, `${date}, ${album.name}`);
 }
 

@@ -9,6 +9,9 @@ import type { Point } from "./types";
 
 const STEP_M = 0.25;
 const TURN_DEG = 15;
+// Distance of the centres of pins that do not cover each other, in radii, and most steps to reach it.
+const GAP = 2.3;
+const MAX_ROUNDS = 100;
 
 export interface PinActions {
   move(row: Row, position: Point, heading_deg: number | null): void;
@@ -16,18 +19,25 @@ export interface PinActions {
   show(row: Row): void;
 }
 
-/** Return where pins with places are drawn: those of one spot, such as of a turn, side by side around it. */
+/** Return where pins with places are drawn: those that would cover others, such as of a turn, are pushed aside. */
 export function fanned(rows: Row[], radius: number): Point[] {
-  const spots = rows.map(({ pin }): Point => [pin!.place!.position.x_m, pin!.place!.position.y_m]);
-  const firsts = spots.map(([x, y]) => spots.findIndex(([a, b]) => Math.hypot(a - x, b - y) < 1.5 * radius));
-  return spots.map((spot, index) => {
-    const group = [...spots.keys()].filter((other) => firsts[other] === firsts[index]);
-    if (group.length === 1) return spot;
-    const turn = (2 * Math.PI * group.indexOf(index)) / group.length,
-      reach = (1.15 * radius) / Math.sin(Math.PI / group.length);
-    const [x, y] = spots[firsts[index]!]!;
-    return [x + reach * Math.sin(turn), y + reach * Math.cos(turn)];
-  });
+  const seen = rows.map(({ pin }): Point => [pin!.place!.position.x_m, pin!.place!.position.y_m]);
+  for (let round = 0, isClear = false; round < MAX_ROUNDS && !isClear; round++) {
+    isClear = true;
+    seen.forEach((a, i) => {
+      for (const b of seen.slice(0, i)) {
+        const [x, y] = [a[0] - b[0], a[1] - b[1]],
+          near = GAP * radius - Math.hypot(x, y);
+        if (near <= 0) continue;
+        // Those of one spot have directions of their own.
+        const turn = x === 0 && y === 0 ? i : Math.atan2(y, x);
+        const [dx, dy] = [0.5 * near * Math.cos(turn), 0.5 * near * Math.sin(turn)];
+        [a[0], a[1], b[0], b[1]] = [a[0] + dx, a[1] + dy, b[0] - dx, b[1] - dy];
+        isClear &&= near < 0.1 * radius;
+      }
+    });
+  }
+  return seen;
 }
 
 /** Return the pin of a photograph, drawn at a point with a radius (m); without actions, for paper. */

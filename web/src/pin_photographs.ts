@@ -19,15 +19,18 @@ type Line = Schemas["AlbumLine"];
 const WIDTH = 480;
 const AT_ONCE = 20;
 const PORTION_BYTES = 60e6;
+// Files that a note names.
+const MAX_NAMED = 8;
 
 /** Return the photographs among some files in the order of their names, and a sentence on the others. */
 export function photographsOf(files: File[]): { photographs: File[]; note: string | null } {
   const seen = files.filter((file) => !file.name.startsWith("."));
   // As on the command line, whose numbers the photographs then have.
   const photographs = sorted(seen.filter(isPicture), nameKey);
-  const others = seen.length - photographs.length;
-  const note = others === 0 ? null : `Files that are empty or no JPEG, PNG, WebP or HEIC, left out: ${others}`;
-  return { photographs, note };
+  const others = seen.filter((file) => !photographs.includes(file)).map(({ name }) => name),
+    named = [...others.slice(0, MAX_NAMED), ...(others.length > MAX_NAMED ? ["…"] : [])].join(", ");
+  const note = `Files that are empty or no JPEG, PNG, WebP or HEIC, left out: ${others.length} (${named})`;
+  return { photographs, note: others.length === 0 ? null : note };
 }
 
 /** Return the photographs to send to an album: those that it has do not count for its limit, and get copies. */

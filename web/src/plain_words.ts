@@ -44,12 +44,13 @@ export const labelOf = (field: string): string => LABELS[field] ?? field;
 
 /** Return a probability; none is 0 or 100 %. */
 export const percent = (share: number): string =>
-  share < 0.01 ? "< 1 %" : share > 0.99 ? "> 99 %" : `${Math.round(100 * share)} %`;
+  share < 0.005 ? "< 1 %" : share >= 0.995 ? "> 99 %" : `${Math.round(100 * share)} %`;
 
 /** Replace names of fields in a message by their labels; leave out those of settings and of files of documentation. */
 export function plainWords(message: string): string {
   return message
     .replace(/[;,] see docs\/\S+$/, "")
+    .replace(/\b(\d+)\d{5} bytes/g, (_, tenths: string) => `${Number(tenths) / 10} MB`)
     .replace(/ \((?:LALALOC_[A-Z_]+|([a-z]+(?:_[a-z]+)+))\)/g, (whole, name: string) => (name in LABELS ? whole : ""))
     .replace(/\b([a-z]+)=(\w+(?:[.,:]\d+)*)/g, (whole, field: string, value: string) =>
       field in LABELS ? `“${labelOf(field)}” (${VALUES[value] ?? value})` : whole,

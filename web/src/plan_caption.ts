@@ -29,7 +29,7 @@ type Stored = Pick<PlanSummary, "name" | "updated_at"> & { revision_number?: num
 /** Tell a plan or venue from others of its name in a list by its last change; "" if no other has its name. */
 export function storedAs({ name, updated_at, revision_number: revision }: Stored, listed: Stored[]): string {
   if (listed.filter((other) => other.name === name).length < 2) return "";
-  const date = new Date(updated_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
+  const date = new Date(updated_at).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
   return `stored ${date}${revision === undefined ? "" : `, revision ${revision}`}`;
 }
 
@@ -41,18 +41,24 @@ function showWarnings(plan: Plan | null): void {
   const report = plan?.import_report;
   // An assumed ceiling is a warning of the plan and a guess of the import.
   const texts = [
-    ...new Set([
-      ...(report?.is_draft ? [DRAFT] : []),
-      ...(plan?.warnings ?? []),
-      ...(report?.unsure ?? []),
-      ...(report?.rejected_texts ?? []),
-    ]),
+    ...(report?.is_draft ? [DRAFT] : []),
+    ...(plan?.warnings ?? []),
+    ...(report?.unsure ?? []),
+    ...(report?.rejected_texts ?? []),
   ];
-  const items = texts.map((text) => h("li", {}, plainWords(text)));
-  const rest = items.splice(MAX_WARNINGS);
-  show(
-    byId("plan-warnings"),
-    ...items,
-    rest.length > 0 && h("li", {}, h("details", {}, h("summary", {}, `${rest.length} more`), h("ul", {}, ...rest))),
-  );
+  // Texts that differ in numbers alone have one cause.
+  const causes = new Map<string, Set<string>>();
+  for (const text of texts) {
+    const cause = text.replace(/\d+(\.\d+)?/g, "#");
+    causes.set(cause, (causes.get(cause) ?? new Set()).add(text));
+  }
+  const list = (items: (HTMLElement | string)[]): HTMLElement[] => items.map((item) => h("li", {}, item));
+  const folded = (summary: string, items: (HTMLElement | string)[]): HTMLElement | false =>
+    items.length > 0 && h("details", {}, h("summary", {}, summary), h("ul", {}, ...list(items)));
+  const items = [...causes.values()].map((alike) => {
+    const [first, ...others] = [...alike].map(plainWords);
+    return h("div", {}, first, folded(`${others.length} more of this kind`, others));
+  });
+  const rest = folded(`${items.length - MAX_WARNINGS} more`, items.splice(MAX_WARNINGS));
+  show(byId("plan-warnings"), ...list(items), rest && h("li", {}, rest));
 }

@@ -34,8 +34,8 @@ export interface PlanActions {
   started: () => void;
   /** The user picked a plan from the list or uploaded one. */
   picked: () => void;
-  /** All levels of a file were stored as a venue. */
-  imported: (venue: { id: string }) => void;
+  /** All levels of a file were stored as a venue, which is to be shown unless the user did something else meanwhile. */
+  imported: (venue: { id: string }, isShown: boolean) => void;
   /** The user picked an example; the plan is null if it is stored already. */
   example: (plan: PlanDocument | null, photos: File[], isTurn: boolean) => void;
   /** The user searches for a name. */
@@ -49,7 +49,7 @@ export class Plans {
   private readonly menu = byId<HTMLDetailsElement>("plan-menu");
   private readonly importing = new ImportForm(
     (file, fields) => void this.upload(file, fields),
-    (file, fields) => void this.uploadLevels(file, fields),
+    (file, fields) => void this.upload(file, fields, true),
     () => this.closeImport(),
   );
   private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
@@ -72,9 +72,8 @@ export class Plans {
       }, SEARCH_AFTER_MS);
     });
     this.connectMenu();
-    byId("example-turn").addEventListener("click", () => (this.pending = this.pickExample(TURN)));
-    byId("example-spheres").addEventListener("click", () => (this.pending = this.pickExample(SPHERES)));
-    byId("example-rooms").addEventListener("click", () => (this.pending = this.pickExample(ROOMS)));
+    for (const [name, example] of Object.entries({ turn: TURN, spheres: SPHERES, rooms: ROOMS }))
+      byId(`example-${name}`).addEventListener("click", () => (this.pending = this.pickExample(example)));
     acceptChoice(byId("plan-file"), ([file]) => void this.begin(file!));
     acceptDrops(byId("plan-panel"), ([file]) => {
       if (file !== undefined) void this.begin(file);
@@ -166,6 +165,8 @@ export class Plans {
 
   /** Pictures seldom state their scale, so the form asks for it first, unless the service would refuse the file. */
   private async begin(file: File): Promise<void> {
+    if (document.body.classList.contains("editing"))
+      return say(`Save or stop editing first, then add “${file.name}” again.`);
     this.actions.started();
     const request = this.discardPending(),
       isPicture = PICTURES.test(file.type);
@@ -187,51 +188,36 @@ export class Plans {
     this.importing.close();
   }
 
-  async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
+  /** Upload a file as a plan, or all of its levels as plans and their venue. */
+  async upload(file: File, fields: Record<string, string> = {}, isAll = false): Promise<void> {
     clearError(this.error, this.importing.fields);
     // The form of the previous file does not apply to this one.
-    if (Object.keys(fields).length === 0) this.importing.close();
-    const request = this.discardPending();
-    const state = byId("plan-state");
-    state.textContent = `Importing “${file.name}” …`;
+    if (!isAll && Object.keys(fields).length === 0) this.importing.close();
+    const request = this.discardPending(),
+      isLast = (): boolean => request === this.requests,
+      state = byId("plan-state");
+    state.textContent = `Importing ${isAll ? "all levels of " : ""}“${file.name}” …`;
     try {
-      const plan = await api.uploadPlan(file, fields, { onStep: showStep(file) });
-      if (request === this.requests) {
+      const stored = await api[isAll ? "uploadLevels" : "uploadPlan"](file, fields, { onStep: showStep(file) });
+      const isShown = isLast();
+      if (!("plan" in stored)) {
+        this.importing.close(file);
+        this.actions.imported(stored, isShown);
+      } else if (isShown) {
         this.actions.picked();
-        this.take(plan);
-        if (isCertain(plan)) this.importing.close();
-        else this.importing.ask(file, false, plan.import_report?.levels, plan.import_report?.scale_factor);
+        this.take(stored);
+        if (isCertain(stored)) this.importing.close();
+        else this.importing.ask(file, false, stored.import_report?.levels, stored.import_report?.scale_factor);
       }
       await this.load();
-      say(`“${plan.name}” is stored.`);
+      say(`“${stored.name}” is stored${isShown ? "" : ": choose it under “Plans”"}.`);
     } catch (error) {
       const levels = error instanceof ServiceError ? error.levels : [];
-      if (levels.length > 0 || hasOptions(file)) this.importing.ask(file, true, levels);
-      if (levels.length === 0 && !this.importing.askForScale(error))
+      if (!isAll && isLast() && (levels.length > 0 || hasOptions(file))) this.importing.ask(file, true, levels);
+      if (!isLast() || (levels.length === 0 && !this.importing.askForScale(error)))
         showError(this.error, error, this.importing.fields);
     } finally {
-      if (state.textContent.startsWith("Importing")) state.textContent = "";
-    }
-  }
-
-  /** Upload all levels of a file as plans and their venue. */
-  private async uploadLevels(file: File, fields: Record<string, string>): Promise<void> {
-    clearError(this.error, this.importing.fields);
-    const request = this.discardPending(),
-      state = byId("plan-state");
-    state.textContent = `Importing all levels of “${file.name}” …`;
-    try {
-      const venue = await api.uploadLevels(file, fields, { onStep: showStep(file) });
-      await this.load();
-      if (request === this.requests) {
-        this.importing.close();
-        this.actions.imported(venue);
-      }
-      say(`“${venue.name}” is stored.`);
-    } catch (error) {
-      showError(this.error, error, this.importing.fields);
-    } finally {
-      state.textContent = "";
+      if (state.textContent.includes(`“${file.name}”`)) state.textContent = "";
     }
   }
 

@@ -191,7 +191,6 @@ export class LiveSession {
     }
     const isHere = (at: { floorplan_id?: string | null }): boolean => (at.floorplan_id ?? session.floorplan_id) === id;
     const path = session.path.filter(isHere).map(({ position }) => position);
-    const [[xx, xy], [, yy]] = pose.covariance;
     const { x_m, y_m } = pose.position;
     show(
       this.layer,
@@ -210,14 +209,7 @@ export class LiveSession {
             s("title", {}, `${rival.room}, ${percent(rival.probability)} probable`),
           ),
         ),
-      isHere(pose) &&
-        ellipse({
-          position: pose.position,
-          covariance_m2: [
-            [xx, xy],
-            [xy, yy],
-          ],
-        }),
+      isHere(pose) && ellipse({ position: pose.position, covariance_m2: pose.covariance }),
       isHere(pose) &&
         s(
           "g",

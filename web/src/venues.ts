@@ -3,6 +3,7 @@
 import { api } from "./api";
 import { byId, h, planButton, show } from "./dom";
 import { attempt, showError } from "./notices";
+import { storedAs } from "./plan_caption";
 import type { ChosenVenue, PlanSummary, Venue } from "./types";
 import { VenueForm } from "./venue_form";
 
@@ -104,13 +105,14 @@ export class Venues {
   }
 
   private draw(): void {
-    const entries = this.found.map(({ id, name, plans }) =>
-      h(
+    const entries = this.found.map((venue) => {
+      const facts = [`venue, ${venue.plans} plans`, storedAs(venue, this.found)].filter(Boolean).join(", ");
+      return h(
         "li",
         {},
-        planButton(name, `venue, ${plans} plans`, id === this.current?.id, () => this.pick(id)),
-      ),
-    );
+        planButton(venue.name, facts, venue.id === this.current?.id, () => this.pick(venue.id)),
+      );
+    });
     show(this.list, ...entries);
     byId("venues").hidden = this.found.length === 0;
   }

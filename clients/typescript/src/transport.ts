@@ -52,20 +52,24 @@ export async function endOf(response: Response, onStep?: (step: ImportStep) => v
     }
     onStep(step);
   }
-  throw new ServiceError(0, "The import broke off", "The connection ended before the answer; send the file again.");
+  throw brokenOff();
 }
+
+const brokenOff = (): ServiceError =>
+  new ServiceError(0, "The connection broke off", "Check that the service runs and the network works, then try again.");
 
 /** Yield the lines of an answer as they arrive; a caller that stops early closes the connection. */
 export async function* linesOf(response: Response): AsyncGenerator<string> {
   const reader = response.body!.pipeThrough(new TextDecoderStream()).getReader();
+  const read = () => reader.read().catch((error) => Promise.reject(error instanceof TypeError ? brokenOff() : error));
   let text = "";
   try {
-    for (let part = await reader.read(); !part.done; part = await reader.read()) {
+    for (let part = await read(); !part.done; part = await read()) {
       const lines = (text + part.value).split("\n");
       text = lines.pop()!;
       yield* lines;
     }
   } finally {
-    await reader.cancel();
+    await reader.cancel().catch(() => undefined);
   }
 }

@@ -307,7 +307,7 @@ def _pin(
         return replace(base, state="set_aside", reason=reason)
     confidence = float(share[order[0]])
     is_sure = fits and confidence >= SURE
-    also = ", ".join(f"{row.room} {100.0 * row.probability:.0f} %" for row in listed[1:3])
+    also = ", ".join(f"{row.room} {100.0 * row.probability:.0f} %" for row in listed[1:3] if row.probability >= 0.005)
     reason = f"it also fits: {also}" if also else "the photographs fit this plan badly" if not fits else ""
     return replace(
         base,

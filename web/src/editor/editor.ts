@@ -239,12 +239,7 @@ export class Editor {
         plan.rooms.length === 0 ? 0 : Math.max(...plan.rooms.flatMap(({ polygon }) => polygon.map(([x]) => x))) + 0.1;
     const [width, depth] = NEW_ROOM_M;
     this.tools.choose("select");
-    const corners: Point[] = [
-      [right, 0],
-      [right + width, 0],
-      [right + width, depth],
-      [right, depth],
-    ];
+    const corners = [0, width, width, 0].map((x, index): Point => [right + x, index < 2 ? 0 : depth]);
     this.edit(change.addRoom(plan, corners), false, { kind: "room", index: plan.rooms.length });
     this.scene.viewport.fit(boxOf(this.history.now));
   }
