@@ -44,8 +44,11 @@ def _pin(arguments: argparse.Namespace) -> None:
     from lalaloc_core.api import LaLaLoc
     from lalaloc_core.cli.pin_files import write_pin_files
     from lalaloc_core.localise.answers.pinned import read_pins
+    from lalaloc_core.photograph.picture_folders import left_out, pictures_in
 
-    paths, notes = _photographs_in(arguments.folder, arguments.out, arguments.plan)
+    folder, plan = arguments.folder, arguments.plan
+    paths = [path for path in pictures_in(folder) if path.resolve() != plan.resolve()]
+    notes = [f"'{folder}': {text}" for text in left_out(folder, [*paths, arguments.out, plan])]
     _check_out(arguments.out, [*paths, arguments.plan, arguments.previous], replace=arguments.replace)
     previous = None if arguments.previous is None else read_pins(arguments.previous)
     stated = stated_camera(arguments)
@@ -106,21 +109,6 @@ def _check_out(out: Path, sources: Iterable[Path | None], *, replace: bool) -> N
         raise InvalidInputError(
             f"'{out}' has files; choose a new folder, or add --replace to write over an earlier run's"
         )
-
-
-def _photographs_in(folder: Path, out: Path, plan: Path) -> tuple[list[Path], list[str]]:
-    """Return the picture files of a folder, and notes on what is left out."""
-    from lalaloc_core.photograph.picture_folders import pictures_in
-
-    found = [path for path in pictures_in(folder) if path.resolve() != plan.resolve()]
-    others = [path for path in folder.iterdir() if not path.name.startswith(".") and path not in found]
-    others = [path for path in others if path.resolve() not in (out.resolve(), plan.resolve())]
-    folders, notes = sum(path.is_dir() for path in others), []
-    if folders < len(others):
-        notes.append(f"'{folder}' has files that are no pictures, which are left out: {len(others) - folders}")
-    if folders:
-        notes.append(f"'{folder}' has folders, which are left out: {folders}; pin them by themselves")
-    return found, notes
 
 
 def _row(entry: dict[str, Any]) -> tuple[str, ...]:

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import math
 import re
+import struct
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
 
 from PIL import ExifTags, Image
 
@@ -20,20 +23,8 @@ from PIL import ExifTags, Image
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 # Sides of a 4:3 sensor with that diagonal.
 _LONG_MM, _SHORT_MM = 0.8 * _FILM_DIAGONAL_MM, 0.6 * _FILM_DIAGONAL_MM
-# Action cameras whose wide lens is a fisheye: maker and model, and the angle (degrees) across the longer side at 4:3:
-# as the maker states it (GoPro), else 0.8 of the diagonal that it states.
-_FISHEYES = tuple(
-    (re.compile(pattern, re.I), angle_deg)
-    for pattern, angle_deg in (
-        (r"gopro\b", 122.6),
-        (r"dji.*(action|\bac00\d)", 124.0),
-        (r"(arashi vision|insta360)\b", 126.0),
-        (r"(sjcam|akaso|eken|apeman|campark|dragon touch|thieye|victure)\b", 136.0),
-        (r"(xiaoyi|yi technology|yi)\b", 124.0),
-        (r"sony (hdr-a|fdr-x[13]0)", 136.0),
-        (r"garmin.*virb", 122.0),
-    )
-)
+_CAMERAS = tomllib.loads(Path(__file__).with_name("action_cameras.toml").read_text(encoding="utf-8"))
+_FISHEYES = [(re.compile(pattern, re.I), angle_deg) for pattern, angle_deg in _CAMERAS["fisheyes"].items()]
 # Longer equivalent focal lengths of these cameras are those of linear and narrow modes.
 _MAX_FISHEYE_MM = 18.0
 # A crop that Lightroom, unless the pixels do not have it yet, or darktable states.
@@ -49,6 +40,8 @@ _SENSOR_RANGE_MM = (1.5, 60.0)
 _ZOOM_RANGE = (1.0, 20.0)
 # Relative difference of aspect ratios from which a picture counts as cropped after it was taken.
 _CROPPED = 0.03
+# Ratios of the sides of cameras' pictures, and their relative deviation; sides are multiples of some pixels.
+_SHAPES, _SHAPE_SD, _MULTIPLE = (1.0, 8 / 7, 1.25, 4 / 3, 1.5, 16 / 9, 2.0, 2.06, 2.11, 2.17, 2.22, 2.33), 0.015, 4
 # `CustomRendered` of Apple's panorama mode, in which the focal length is that of the moving camera.
 _STRIP = 6
 # Relative standard deviations of the focal length: rounding and lens of the usual shapes, and of cropped sensors.
@@ -68,6 +61,10 @@ _TIME = re.compile(
 _TIMES = (
     (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal, ExifTags.Base.OffsetTimeOriginal),
     (ExifTags.Base.DateTimeDigitized, ExifTags.Base.SubsecTimeDigitized, ExifTags.Base.OffsetTimeDigitized),
+)
+# Times that XMP packets state; the first names are the surest.
+_XMP_TIME = re.compile(
+    rb"\b(exif:DateTimeOriginal|photoshop:DateCreated|xmp:CreateDate)\s{0,9}(?:=\s{0,9}.|>)\s{0,9}([^\"'<>]{10,40})"
 )
 
 
@@ -121,7 +118,8 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
     lens = _in_range(tags, ExifTags.Base.FocalLength, _FOCAL_RANGE_MM, " mm", warnings)
     sizes, long, ratio = stated_sizes(exif, packets), max(width, height), max(width, height) / min(width, height)
     has_crop = any(map(_HAS_CROP.search, packets)) and not any(map(_NOT_APPLIED.search, packets))
-    if has_crop or any(abs(max(size) / min(size) / ratio - 1.0) > _CROPPED for size in sizes):
+    is_odd = all(abs(ratio / shape - 1.0) > _SHAPE_SD for shape in _SHAPES)
+    if has_crop or is_odd or any(abs(max(size) / min(size) / ratio - 1.0) > _CROPPED for size in sizes):
         if film is not None or lens is not None:
             warnings.append("the photograph was cropped after it was taken, so its EXIF focal length is not used")
         return ExifLens(warnings=tuple(warnings))
@@ -132,19 +130,24 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
     elif lens is not None and (side_mm := _sensor_side_mm(tags, warnings)) is not None:
         focal = zoom * lens / side_mm * long
     is_edited = _EDITORS.search(_text(exif.get(ExifTags.Base.Software))) is not None
+    is_edited |= any(side % _MULTIPLE for side in (width, height))
     # Makers disagree whether the equivalent focal length includes digital zoom.
     doubt = 0.5 * math.log(zoom) if film is not None else 0.0
     camera = " ".join(_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)).strip()
-    is_wide = film is None or film <= _MAX_FISHEYE_MM
-    angle_deg = next((angle for pattern, angle in _FISHEYES if pattern.match(camera)), None) if is_wide else None
+    fisheye = fisheye_of(camera) if film is None or film <= _MAX_FISHEYE_MM else None
     return ExifLens(
         focal=focal,
         focal_sd=max(_SD if usual else _CROPPED_SD, doubt),
         is_doubtful=is_edited or any(sorted(size) != sorted((width, height)) for size in sizes),
-        fisheye=None if angle_deg is None else math.radians(angle_deg),
-        camera="" if angle_deg is None else camera,
+        fisheye=fisheye,
+        camera="" if fisheye is None else camera,
         warnings=tuple(warnings),
     )
+
+
+def fisheye_of(camera: str) -> float | None:
+    """Return the angle (radians) across the longer side of an action camera's wide lens, by its maker and model."""
+    return next((math.radians(angle_deg) for pattern, angle_deg in _FISHEYES if pattern.match(camera)), None)
 
 
 def _film_side_mm(ratio: float) -> float:
@@ -210,13 +213,26 @@ def finite_number(value: object) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def read_taken(exif: Image.Exif, *, width: int, height: int) -> Taken:
-    """Read time and camera of an upright picture of `width` x `height` pixels."""
+def read_taken(exif: Image.Exif, packets: Sequence[bytes], *, width: int, height: int) -> Taken:
+    """Read time and camera of an upright picture of `width` x `height` pixels, by Exif, XMP or GPS."""
     make, model = (_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
     tags = exif.get_ifd(ExifTags.IFD.Exif)
     # The time of the file's last change is not used.
-    times = (read_time(*(_text(tags.get(tag)) for tag in names)) for names in _TIMES)
-    return Taken(at=next(filter(None, times), None), make=make, model=model, width=width, height=height)
+    texts = [[_text(tags.get(tag)) for tag in names] for names in _TIMES]
+    stated = sorted(found for packet in packets for found in _XMP_TIME.findall(packet))
+    texts += [[text.decode(errors="replace").strip()] for _, text in stated]
+    at = next(filter(None, (read_time(*text) for text in texts)), None) or _time_of_gps(exif)
+    return Taken(at=at, make=make, model=model, width=width, height=height)
+
+
+def _time_of_gps(exif: Image.Exif) -> datetime | None:
+    """Return the time of the last fix, which can be some minutes early; None without one."""
+    try:
+        tags = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        hour, minute, second = (int(part) for part in tags[ExifTags.GPS.GPSTimeStamp])
+    except (ArithmeticError, LookupError, OSError, SyntaxError, TypeError, ValueError, struct.error):
+        return None
+    return read_time(f"{_text(tags.get(ExifTags.GPS.GPSDateStamp))} {hour:02d}:{minute:02d}:{second:02d}Z")
 
 
 def read_time(text: str, subseconds: str = "", offset: str = "") -> datetime | None:

@@ -24,15 +24,15 @@ from jaxtyping import UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidFilmError
-from lalaloc_core.photograph.exif import ExifLens
+from lalaloc_core.photograph.exif import ExifLens, fisheye_of
 from lalaloc_core.photograph.film_motion import FlowTracker
 from lalaloc_core.photograph.overlap import LIKELY_SD, Step
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
-from lalaloc_core.photograph.projection import find_lens
-from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, inside_bars
-from lalaloc_core.photograph.stated_camera import StatedCamera
+from lalaloc_core.photograph.projection import find_lens, is_twice_as_wide
+from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format, inside_bars
+from lalaloc_core.photograph.stated_camera import AUTO, StatedCamera
 from lalaloc_core.photograph.turn_angles import TurnAngles, angles_of_turn
 from lalaloc_core.photograph.turned import turn_views, turned_photographs
 
@@ -42,6 +42,9 @@ _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 _EBML, _DOC_TYPES, _HEAD = b"\x1a\x45\xdf\xa3", (b"webm", b"matroska"), 64
 _CODECS = {b"h264": "H.264", b"avc1": "H.264", b"hevc": "HEVC", b"hvc1": "HEVC", b"hev1": "HEVC", b"VP90": "VP9"}
 _CODECS |= {b"vp09": "VP9", b"VP80": "VP8", b"VP8 ": "VP8", b"FMP4": "MPEG-4", b"mp4v": "MPEG-4"}
+# Telemetry of GoPro's films, whose usual mode is a fisheye.
+_ACTION = b"GoPro MET"
+_SPHERES = "films of full spheres are not read: send a frame as a photograph, which shows as much"
 _OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 # All rows and columns.
 _WHOLE = slice(None), slice(None)
@@ -137,16 +140,21 @@ def read_film(
         InvalidFilmError: the file is not such a film, is damaged, exceeds a limit, or shows nothing.
     """
     stated, limits, size = stated or StatedCamera(), limits or FilmLimits(), patch_size or PatchSize()
-    if stated.projection == "auto":
-        stated = replace(stated, projection="perspective")
     stated.check()
     if len(content) > limits.max_bytes:
         raise InvalidFilmError(
             f"the film has {len(content)} bytes; the limit is {limits.max_bytes} (LALALOC_MAX_FILM_BYTES)"
         )
+    is_known = stated.projection != AUTO or stated.hfov_deg is not None or stated.intrinsics is not None
     hfov = None if stated.hfov_deg is None else math.radians(stated.hfov_deg)
+    if not is_known and _ACTION in content:
+        hfov, stated = fisheye_of("GoPro"), replace(stated, projection="fisheye")
+    elif stated.projection == AUTO:
+        stated = replace(stated, projection="perspective")
     tracker, samples, begin = FlowTracker(hfov), _Samples(), process_time()
     _sample_film(content, tracker, samples, limits, begin)
+    if not is_known:
+        _refuse_spheres(samples)
     inside = _inside_bars(samples)
     if inside != _WHOLE:
         tracker, samples = FlowTracker(hfov), _Samples(inside=inside)
@@ -184,9 +192,10 @@ def _turned(
     threads: int,
 ) -> tuple[list[Photograph], list[TurnAngles]]:
     """Return the photographs of frames with the tilt and field of view that their overlap tells, and their angles."""
-    lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=ExifLens(), looks_spherical=lambda: False)
+    exif = ExifLens(fisheye=fisheye_of("GoPro"), camera="GoPro")
+    lens = find_lens(*full_size, stated=stated, sphere=PhotoSphere(), exif=exif, looks_spherical=lambda: False)
     if lens.is_sphere:
-        raise InvalidFilmError("films of full spheres are not read: send a frame as a photograph, which shows as much")
+        raise InvalidFilmError(_SPHERES)
     with ThreadPoolExecutor(threads) as pool:
         jobs = [pool.submit(photograph_of_picture, its.picture, full_size, lens, stated, size, "film") for its in kept]
         photographs = [job.result() for job in jobs]
@@ -201,6 +210,17 @@ def _turned(
     photographs = turned_photographs(photographs, views, angles, size)
     tracker.calibrate(photographs[0].hfov.value, full_size)
     return photographs, angles
+
+
+def _refuse_spheres(samples: _Samples) -> None:
+    """Refuse a film most of whose first looks show a full sphere, in any format, or a grid of pictures."""
+    thumbnails = [Thumbnail(look) for look in samples.looks[:_FIRST_LOOKS]]
+    found = map(find_sphere_format, thumbnails)
+    refused = [each.text.replace("photograph", "film") for each in found if each is not None and each.box is None]
+    if is_twice_as_wide(*samples.stored_size):
+        refused += [_SPHERES for thumbnail in thumbnails if thumbnail.looks_spherical]
+    if 2 * len(refused) > len(thumbnails):
+        raise InvalidFilmError(refused[0])
 
 
 def _likely(angles: Sequence[TurnAngles]) -> list[int]:
@@ -321,8 +341,6 @@ def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
         return _WHOLE
     looks, parts = np.stack(samples.looks), []
     for side, rows, (begin, end) in zip(samples.stored_size[::-1], looks.shape[1:3], inside_bars(looks), strict=True):
-        # A row at each bar can be mixed with it.
-        begin, end = begin + (begin > 0), end - (end < rows)
         parts.append(slice(round(begin * side / rows), round(end * side / rows)))
     inside = [part.stop - part.start for part in parts]
     is_picture = min(inside) >= _LEAST_SIDE and max(inside) <= _LONGEST * min(inside)

@@ -196,7 +196,7 @@ def open_photograph(
     stated.check()
     with opened_picture(content, limits) as file:
         opened = _Opened.of(file, stated, sphere_size, limits)
-        taken = read_taken(file.exif, width=opened.width, height=opened.height)
+        taken = read_taken(file.exif, file.packets, width=opened.width, height=opened.height)
         found = opened.sphere_format()
         if found is not None and found.box is not None:
             opened = opened.taken_out(found)

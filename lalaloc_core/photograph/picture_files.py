@@ -142,9 +142,17 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
     packets = packets or [packet for packet in [image.info.get("xmp")] if packet]
     exif, is_damaged = _exif_of(image)
     was_turned, orientation = _was_turned(exif, packets, size), exif.get(ExifTags.Base.Orientation)
+    is_animated = image.format in ("PNG", "WEBP") and getattr(image, "is_animated", False)
+    unused = image.info.get("original_orientation") or 1
+    is_untold = unused != 1 and b"irot" not in content and b"imir" not in content
+    if is_untold:
+        exif.pop(ExifTags.Base.Orientation, None)
     faults = {
         f"the Exif orientation {orientation} was ignored, because the picture was turned after it was taken: the Exif "
         "size is that of a picture on its side; send the camera's original file if this is wrong": was_turned,
+        f"the Exif orientation {unused} was ignored, as HEIC pictures state their turn otherwise, and this one states "
+        "none: check that the photograph is upright, else turn it in a viewer and save it": is_untold,
+        "the file is animated: the first of its pictures is used": is_animated,
         "the file ends before its picture does: the missing part is grey; send the whole file": is_cut,
         f"texts of {left_out} bytes were ignored; all texts of a PNG can have {MAX_TEXT_BYTES} bytes": left_out > 0,
         f"the last {unread} XMP packets were ignored; the limit is {len(packets)}": unread > 0,

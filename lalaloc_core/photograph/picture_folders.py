@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from datetime import UTC
 from pathlib import Path
 
@@ -28,12 +29,20 @@ def turn_files(folder: Path) -> tuple[list[Path], list[str]]:
     if times and None not in times.values() and len(set(times.values())) == len(used):
         used.sort(key=lambda file: times[file] or 0.0)
     empty = [f"'{file.name}' is empty and was left out" for file in files if not file.stat().st_size]
-    hidden = [file.name for file in folder.iterdir() if file.name.startswith(".") and file.suffix.lower() in PICTURES]
-    others = [file.name for file in folder.iterdir() if not file.name.startswith(".") and file not in files]
-    kinds = (("hidden files", hidden), ("folders or files that are no photographs", others))
-    return used, empty + [
-        f"{len(names)} {kind}, such as '{min(names)}', were left out" for kind, names in kinds if names
-    ]
+    return used, empty + left_out(folder, files)
+
+
+def left_out(folder: Path, used: Iterable[Path]) -> list[str]:
+    """Return lines on what a folder has besides files that are used: hidden files, folders and other files."""
+    known = {path.resolve() for path in used}
+    others = sorted(entry for entry in folder.iterdir() if entry.resolve() not in known)
+    shown = [entry for entry in others if not entry.name.startswith(".")]
+    kinds = {
+        "hidden files": [entry for entry in others if entry not in shown and entry.suffix.lower() in PICTURES],
+        "folders": [entry for entry in shown if entry.is_dir()],
+        "files that are no JPEG, PNG, WebP or HEIC pictures": [entry for entry in shown if not entry.is_dir()],
+    }
+    return [f"{kind}, such as '{of[0].name}', were left out: {len(of)}" for kind, of in kinds.items() if of]
 
 
 def _taken_at(file: Path) -> float | None:
@@ -42,7 +51,7 @@ def _taken_at(file: Path) -> float | None:
         if file.stat().st_size > _MAX_BYTES:
             return None
         with opened_picture(file.read_bytes(), PhotographLimits()) as picture:
-            at = read_taken(picture.exif, width=0, height=0).at
+            at = read_taken(picture.exif, picture.packets, width=0, height=0).at
     except (OSError, InvalidPhotographError):
         return None
     return None if at is None else at.replace(tzinfo=at.tzinfo or UTC).timestamp()

@@ -30,9 +30,17 @@ _EYE, _MIN_CORRELATION, _MAX_SHIFT = (64, 128), 0.75, 6
 # the rows of a bar that have its colour.
 _MAX_BAR_SPREAD, _OF_BAR, _MIN_BARS, _PHOTOGRAPH_BARS, _FEWEST_ROWS = 4.0, 0.8, 0.02, (0.08, 0.85), 48
 _PLAIN_OF_BARS = 0.3
-# Bars that are not alike: largest difference from their colour. All: share of a row beside their edge that is of them.
+# Bars that are not alike: largest difference from their colour. All: share of a row beside their edge that is of them,
+# and rows that mix both, in a photograph and in films, whose blocks have 16 pixels.
 # Blurred ones: ratio of the step at their edge to those beside it, and of the detail within to theirs; largest step.
-_EXACT_SPREAD, _WHOLE_ROW, _EDGE_OF_BLUR, _MAX_STEP = 2.0, 0.98, 2.5, 40
+_EXACT_SPREAD, _WHOLE_ROW, _EDGE_ROWS, _EDGE_OF_BLUR, _MAX_STEP = 2.0, 0.98, (3, 10), 2.5, 40
+# Bars within bars, as in windows. Gradients: samples of a row that tell its colour, largest difference from it, and
+# from one row to the next but one.
+_MOST_NESTED, _SAMPLES, _MAX_GRADED, _MAX_SLOPE = 3, 9, 4, 6
+# Collages: pixels from one side of a border to the other, difference that is a change, share of a border that changes,
+# and how much more that is than of other lines. Of 776 views of 67 rooms none has such lines in the middle both ways,
+# and 99 % of 400 collages of them have.
+_ACROSS, _CHANGE, _MIN_CHANGED, _MORE_CHANGED, _BORDER_SLACK = 3, 8, 0.8, 0.4, 0.03
 # Circles: side (pixels) of judged squares, radii of the ring inside and of the corners, and grey levels of the corners.
 _CIRCLE = 64
 _RING, _CORNERS = (0.8, 0.93), 1.12
@@ -47,6 +55,8 @@ _MAX_SPREAD, _MAX_DIFFERENCE = 5.0, 10.0
 # each other and from which they do not; least shares of continued edges and of broken borders.
 _CONTINUED, _BROKEN = 2.5, 4.0
 _MIN_CONTINUED, _MIN_BROKEN = 0.8, 0.25
+# First row or column between bars, and the end.
+_Side = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +94,7 @@ class Thumbnail:
         return looks_spherical(self.pixels)
 
     @cached_property
-    def inside_bars(self) -> tuple[tuple[int, int], tuple[int, int]]:
+    def inside_bars(self) -> tuple[_Side, _Side]:
         """`inside_bars` of its pixels."""
         return inside_bars(self.pixels[None])
 
@@ -214,7 +224,10 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a sphere within bars of one colour."""
     pixels = thumbnail.pixels
     height, width = pixels.shape[:2]
-    (top, bottom), (left, right) = thumbnail.inside_bars
+    if thumbnail.inside_bars == ((0, height), (0, width)):
+        return None
+    # Within them, a zenith of one colour is of the sphere.
+    (top, bottom), (left, right) = inside_bars(pixels[None], is_exact=True)
     if (bottom - top) * (right - left) > (1.0 - _MIN_BARS) * height * width or min(bottom - top, right - left) < 16:
         return None
     # The bars are equal and the sphere twice as wide as high, which is more exact than the judged pixels.
@@ -248,35 +261,68 @@ def _find_photograph_in_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     return SphereFormat(
         text=f"the photograph is within bars, {share:.0%} of the picture, as in a screenshot: they were cut off; send "
         "the camera's original file",
-        # A row at each bar can be mixed with it.
-        box=tuple(
-            (place + (0 < place < side) * (1 if place < 0.5 * side else -1)) / side
-            for place, side in ((left, width), (top, height), (right, width), (bottom, height))
-        ),  # type: ignore[arg-type]
+        box=(left / width, top / height, right / width, bottom / height),
         is_sphere=False,
     )
 
 
-def inside_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the first and the end of the rows, and of the columns, between bars in one or several pictures."""
-    rows = _between_bars(pictures)
-    # OpenCV reads arrays that numpy transposed very slowly.
-    return rows, _between_bars(np.stack([cv2.transpose(picture) for picture in pictures[:, slice(*rows)]]))
+def inside_bars(pictures: UInt8[np.ndarray, "f n m 3"], *, is_exact: bool = False) -> tuple[_Side, _Side]:
+    """Return the first and the end of the rows, and of the columns, between bars in one or several pictures.
 
-
-def _between_bars(pictures: UInt8[np.ndarray, "f n m 3"]) -> tuple[int, int]:
-    """Return the first row and the end of the rows between bars at the top and bottom.
-
-    Bars have one colour, beside texts, buttons and strips of small pictures, or are a blurred copy of the picture.
+    Bars within them and rows that are mixed with them count as bars, unless `is_exact`.
     """
-    rows = pictures.shape[1]
+    top = left = 0
+    for level in range(1 if is_exact else _MOST_NESTED):
+        size, is_within = pictures.shape[1:3], level > 0
+        begin, end = _between_bars(pictures, is_within=is_within, is_exact=is_exact)
+        # OpenCV reads arrays that numpy transposed very slowly.
+        turned = np.stack([cv2.transpose(picture) for picture in pictures[:, begin:end]])
+        first, last = _between_bars(turned, is_within=is_within, is_exact=is_exact)
+        top, left, pictures = top + begin, left + first, pictures[:, begin:end, first:last]
+        if pictures.shape[1:3] == size or min(pictures.shape[1:3]) < _FEWEST_ROWS:
+            break
+    return (top, top + pictures.shape[1]), (left, left + pictures.shape[2])
+
+
+def _between_bars(pictures: UInt8[np.ndarray, "f n m 3"], *, is_within: bool, is_exact: bool) -> tuple[int, int]:
+    """Return the first row and the end of the rows between bars at the top and bottom; `is_within` others.
+
+    Bars have one colour, beside texts, buttons and strips of small pictures, or are a gradient or a blurred copy of the
+    picture.
+    """
     ends = pictures, pictures[:, ::-1]
     (top, colour), (bottom, other) = (_plain_rows(end, 2.0 * _MAX_BAR_SPREAD) for end in ends)
-    if not top or not bottom or np.abs(colour - other).max() > 2.0 * _MAX_BAR_SPREAD:
-        top, bottom = (_plain_rows(end, _EXACT_SPREAD)[0] for end in ends)
-    if not top and not bottom:
-        top = bottom = _blurred_rows(np.stack([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]))
-    return top, rows - bottom
+    is_alike = top and bottom and np.abs(colour - other).max() <= 2.0 * _MAX_BAR_SPREAD
+    if not is_alike and not (is_within and (top or bottom)):
+        greys = np.stack([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures])
+        top, bottom = _graded_rows(greys)
+        if not top:
+            top, bottom = (_plain_rows(end, _EXACT_SPREAD)[0] for end in ends)
+        if not top and not bottom:
+            top = bottom = _blurred_rows(greys)
+    mixed = 0 if is_exact else 1
+    return top + mixed * (top > 0), pictures.shape[1] - bottom - mixed * (bottom > 0)
+
+
+def _graded_rows(greys: UInt8[np.ndarray, "f n m"]) -> tuple[int, int]:
+    """Return the number of rows of a gradient above and below the picture, up to edges along most of a row.
+
+    Each of the rows has one colour, or they are all the same.
+    """
+    first, last, rows = greys[:, :1], greys[:, -1:], greys.shape[1]
+    is_same = bool((cv2.absdiff(first, last) <= _MAX_GRADED).mean() > _WHOLE_ROW)
+    if not is_same and max(np.ptp(first), np.ptp(last)) > _MAX_GRADED:
+        return 0, 0
+    changes = [cv2.threshold(cv2.absdiff(grey[2:], grey[:-2]), _MAX_SLOPE, 255, cv2.THRESH_BINARY)[1] for grey in greys]
+    shares = np.min([cv2.reduce(change, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] for change in changes], axis=0)
+    edges = np.flatnonzero(shares > 0.5 * 255.0)
+    if len(edges) < 2:
+        return 0, 0
+    top, bottom = int(edges[0]) + 2, rows - 1 - int(edges[-1])
+    beside = np.concatenate([greys[:, :top], greys[:, rows - bottom :]], axis=1)
+    usual = first if is_same else np.median(beside[:, :, :: max(1, greys.shape[2] // _SAMPLES)], axis=2, keepdims=True)
+    is_bar = (np.abs(beside - usual.astype(np.float32)) <= _MAX_GRADED).mean(axis=2).min(axis=0) > _OF_BAR
+    return (top, bottom) if min(is_bar[:top].mean(), is_bar[top:].mean()) > _OF_BAR else (0, 0)
 
 
 def _plain_rows(pictures: UInt8[np.ndarray, "f n m 3"], spread: float) -> tuple[int, Float[np.ndarray, "3 1"]]:
@@ -289,8 +335,10 @@ def _plain_rows(pictures: UInt8[np.ndarray, "f n m 3"], spread: float) -> tuple[
     shares = np.min([cv2.reduce(mask, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] for mask in masks], axis=0) / 255.0
     # The picture is the longest part without a row of that colour: texts and strips of small pictures are shorter.
     parts = np.flatnonzero(np.diff(shares <= _WHOLE_ROW, prepend=False, append=False)).reshape(-1, 2)
-    rows = int(parts[np.argmax(np.ptp(parts, axis=1)), 0]) if len(parts) else 0
-    is_sharp = 2 < rows < len(shares) - 2 and shares[rows - 2] > _WHOLE_ROW and shares[rows + 2] < 0.5
+    begin = int(parts[np.argmax(np.ptp(parts, axis=1)), 0]) if len(parts) else 0
+    edge = np.flatnonzero(shares[begin:][: _EDGE_ROWS[len(pictures) > 1]] < 0.5)
+    rows = begin + int(edge[0]) if len(edge) else 0
+    is_sharp = 2 < begin < rows + 1 < len(shares) - 1 and shares[begin - 2] > _WHOLE_ROW
     return rows if is_sharp and (shares[:rows] > _OF_BAR).mean() > _PLAIN_OF_BARS else 0, colour
 
 
@@ -309,6 +357,31 @@ def _blurred_rows(greys: UInt8[np.ndarray, "f n m"]) -> int:
     beside = [(detail + detail[::-1])[: rows - 2].mean() / 2.0 for detail in details]
     inside = [detail[rows:-rows].mean() for detail in details]
     return rows if is_edged and np.mean(beside) * _EDGE_OF_BLUR < np.mean(inside) else 0
+
+
+def _find_collage(thumbnail: Thumbnail) -> SphereFormat | None:
+    """Return the format of a grid of photographs: along the borders of its cells nearly all of the picture changes."""
+    rows, columns = thumbnail.inside_bars
+    inside = np.ascontiguousarray(thumbnail.pixels[slice(*rows), slice(*columns)])
+    if min(inside.shape[:2]) < _FEWEST_ROWS:
+        return None
+    down = _cells(inside)
+    across = _cells(cv2.transpose(inside)) if down > 1 else 1
+    text = f"the photograph is a collage of {across} x {down} photographs: send each of them as a file of its own"
+    return SphereFormat(text=text, is_sphere=False) if across > 1 else None
+
+
+def _cells(picture: UInt8[np.ndarray, "n m 3"]) -> int:
+    """Return the number of equal cells above one another."""
+    half = cv2.resize(picture, None, fx=0.5, fy=1.0, interpolation=cv2.INTER_NEAREST)
+    same = cv2.inRange(cv2.absdiff(half[_ACROSS:], half[:-_ACROSS]), (0, 0, 0), (_CHANGE,) * 3)
+    changed = 1.0 - cv2.reduce(same, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0] / 255.0
+    least, slack = max(_MIN_CHANGED, float(np.median(changed)) + _MORE_CHANGED), _BORDER_SLACK * len(changed)
+    for cells in (2, 3):
+        borders = [len(changed) * border / cells for border in range(1, cells)]
+        if all(changed[int(border - slack) : int(border + slack) + 1].max() >= least for border in borders):
+            return cells
+    return 1
 
 
 def _find_cube(thumbnail: Thumbnail) -> SphereFormat | None:
@@ -376,5 +449,6 @@ _DETECTORS: tuple[Callable[[Thumbnail], SphereFormat | None], ...] = (
     _find_stereo,
     _find_bars,
     _find_cube,
+    _find_collage,
     _find_photograph_in_bars,
 )

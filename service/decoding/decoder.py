@@ -7,7 +7,9 @@ affected. No client keeps all workers busy.
 from __future__ import annotations
 
 import threading
+import tomllib
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,27 +42,7 @@ _QUEUE = 32
 _FILM_QUEUE, _FILM_MARGIN_S = 4, 40.0
 # Largest turn whose angles take no longer than decoding a photograph; those of more are found where films are read.
 _SHORT_TURN = 10
-# Faults of files that a worker could not read, by task and reason; the limit is of CPU time.
-_FAULTS = {
-    "photograph": {
-        "poisoned": "the photograph crashed the decoder twice: save it anew or smaller",
-        "stalled": "decoding the photograph took more than {:g} s of CPU time (decode_stall_s): save it anew, or send "
-        "a smaller one",
-        "fault": "the photograph is damaged: save it anew",
-    },
-    "turn": {
-        "poisoned": "finding the angles of the photographs crashed the decoder twice: send their relative_heading_deg",
-        "stalled": "finding the angles of the photographs took more than {:g} s of CPU time: send fewer photographs, "
-        "or their relative_heading_deg",
-        "fault": "the angles of the photographs cannot be found: send their relative_heading_deg",
-    },
-    "film": {
-        "poisoned": "the film crashed the decoder twice: export it anew",
-        "stalled": "reading the film took more than {:g} s of CPU time (max_film_cpu_s): send a film with fewer "
-        "pixels, or a shorter one",
-        "fault": "the film is damaged: export it anew",
-    },
-}
+_FAULTS = tomllib.loads(Path(__file__).with_name("faults.toml").read_text(encoding="utf-8"))
 
 
 class Decoder:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ipaddress
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Self
 
 from starlette.routing import compile_path
@@ -36,54 +38,9 @@ OPEN_PATHS = frozenset({"/healthz", "/readyz"})
 # Pages, open without a key; they ask for one themselves.
 PAGES = frozenset({"/", "/pin", "/docs", "/web/{name}", "/favicon.ico"})
 
-# Scopes of all other routes. With keys on, a route without a row does not exist.
+_TABLE = tomllib.loads(Path(__file__).with_name("scopes.toml").read_text(encoding="utf-8"))
 _SCOPES: Mapping[str, Mapping[str, Permission]] = {
-    "/openapi.json": {"GET": Permission.READ},
-    "/metrics": {"GET": Permission.METRICS},
-    "/limits": {"GET": Permission.READ},
-    "/usage": {"GET": Permission.READ},
-    "/floorplans": {"GET": Permission.READ, "POST": Permission.WRITE},
-    "/floorplans/{floorplan_id}": {"GET": Permission.READ, "PUT": Permission.WRITE, "DELETE": Permission.WRITE},
-    "/floorplans/{floorplan_id}/events": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/layout": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/original": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/export": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/preview.svg": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/mesh.glb": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/localisability": {"GET": Permission.READ},
-    "/floorplans/{floorplan_id}/localisability.svg": {"GET": Permission.READ},
-    "/venues": {"GET": Permission.READ, "POST": Permission.WRITE},
-    "/venues/{venue_id}": {
-        "GET": Permission.READ,
-        "PUT": Permission.WRITE,
-        "PATCH": Permission.WRITE,
-        "DELETE": Permission.WRITE,
-    },
-    "/venues/{venue_id}/plans": {"GET": Permission.READ},
-    "/answers/{answer_id}": {"GET": Permission.READ, "DELETE": Permission.LOCALISE},
-    "/model/{file}": {"GET": Permission.LOCALISE},
-    "/localise": {"POST": Permission.LOCALISE},
-    "/localise/batch": {"POST": Permission.LOCALISE},
-    "/localise/sequence": {"POST": Permission.LOCALISE},
-    "/sessions": {"POST": Permission.LOCALISE},
-    "/sessions/{session_id}": {"GET": Permission.LOCALISE, "DELETE": Permission.LOCALISE},
-    "/sessions/{session_id}/photographs": {"POST": Permission.LOCALISE},
-    "/albums": {"GET": Permission.LOCALISE, "POST": Permission.LOCALISE},
-    "/albums/{album_id}": {"GET": Permission.LOCALISE, "DELETE": Permission.LOCALISE},
-    "/albums/{album_id}/events": {"GET": Permission.LOCALISE},
-    "/albums/{album_id}/copies": {"POST": Permission.LOCALISE},
-    "/albums/{album_id}/photographs": {"GET": Permission.LOCALISE, "POST": Permission.LOCALISE},
-    "/albums/{album_id}/photographs/{photograph_id}": {
-        "GET": Permission.LOCALISE,
-        "PATCH": Permission.LOCALISE,
-        "DELETE": Permission.LOCALISE,
-    },
-    "/admin/keys": {"GET": Permission.ADMIN, "POST": Permission.ADMIN},
-    "/admin/keys/{key_id}": {"GET": Permission.ADMIN, "DELETE": Permission.ADMIN},
-    "/admin/keys/{key_id}/rotation": {"POST": Permission.ADMIN},
-    "/admin/tenants": {"GET": Permission.ADMIN},
-    "/admin/tenants/{tenant}": {"PATCH": Permission.ADMIN},
-    "/admin/audit": {"GET": Permission.ADMIN},
+    path: {method: Permission(scope) for method, scope in methods.items()} for path, methods in _TABLE.items()
 }
 NEEDED = {(method, path): needed for path, methods in _SCOPES.items() for method, needed in methods.items()}
 _PATTERNS = {path: compile_path(path)[0] for path in _SCOPES}

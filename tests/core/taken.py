@@ -80,8 +80,12 @@ def within_bars(picture: np.ndarray, kind: str) -> np.ndarray:
     border = cv2.BORDER_WRAP if kind == "blurred" else cv2.BORDER_CONSTANT
     barred = cv2.GaussianBlur(cv2.copyMakeBorder(picture, above, below, 0, 0, border), (0, 0), 15.0)
     barred[above : above + len(picture)] = picture
-    if kind != "blurred":
+    if kind == "gradient":
+        barred[:above] = barred[above + len(picture) :] = np.arange(80)[:, None, None]
+    elif kind != "blurred":
         barred[:above], barred[above + len(picture) :] = 255 * (kind == "of two colours"), 0
     if kind == "with a strip":
         barred[-50:-20] = picture[:30]
+    if kind == "in a window":
+        barred = cv2.copyMakeBorder(barred, 40, 40, 0, 0, cv2.BORDER_CONSTANT, value=(70, 70, 70))
     return barred

@@ -91,6 +91,9 @@ def test_picture_cropped_later_has_no_focal_length() -> None:
     assert read(tags, size=(2016, 1512)).is_doubtful
     assert read(tags, size=(1512, 2016)).focal is not None
     assert "was cropped" in read(tags, size=(1800, 1512)).warnings[0]
+    edited = {Tag.FocalLengthIn35mmFilm: 26, Tag.ExifImageWidth: 1131, Tag.ExifImageHeight: 935}
+    assert "was cropped" in read(edited, size=(1131, 935)).warnings[0]
+    assert read({Tag.FocalLengthIn35mmFilm: 26}, size=(963, 722)).is_doubtful
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import cv2
 import pytest
 
 from lalaloc_core.errors import InvalidFilmError
+from lalaloc_core.photograph.cameras import Fisheye
 from lalaloc_core.photograph.film import read_film
 from tests.core.fault_photographs import FOLDER
 from tests.core.filmed import H264, encode, needs_ffmpeg, turn
-from tests.core.taken import within_bars
+from tests.core.taken import sphere, take, within_bars
+from tests.core.test_sphere_formats import small, unusable
 from tests.strategies import present
 
 
@@ -22,6 +25,32 @@ def test_black_bars_beside_a_film_are_cut_off() -> None:
     camera = film.photographs[0].camera
     assert camera is not None
     assert camera.width < camera.height
+
+
+@needs_ffmpeg
+def test_both_unequal_bars_of_a_film_of_low_quality_are_cut_off(tmp_path: Path) -> None:
+    frames = [cv2.copyMakeBorder(frame, 0, 0, 200, 380, cv2.BORDER_CONSTANT) for frame in turn()[:31]]
+    film = read_film(encode(frames, tmp_path / "barred.mp4", "-c:v", "libx264", "-preset", "fast", "-crf", "35"))
+    assert present(film.photographs[0].camera).width == pytest.approx(270, abs=6)
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("words", ["films of full spheres", "stereo sphere, one", "dual fisheye", "cube map, 3 x 2"])
+def test_films_of_360_degree_cameras_are_refused_by_name(tmp_path: Path, words: str) -> None:
+    room = small("living_room")
+    pictures = {"films of full spheres": room} | unusable(room)
+    frame = next(picture for name, picture in pictures.items() if name.startswith(words))
+    with pytest.raises(InvalidFilmError, match=words):
+        read_film(encode([frame] * 30, tmp_path / "sphere.mp4"))
+
+
+@needs_ffmpeg
+def test_film_with_the_telemetry_of_an_action_camera_is_read_as_fisheye(tmp_path: Path) -> None:
+    camera = Fisheye.of_hfov(640, 480, math.radians(122.6))
+    frames = [take(sphere("living_room"), camera, heading_deg=6.0 * number) for number in range(31)]
+    film = read_film(encode(frames, tmp_path / "action.mp4", *H264, "-metadata", "comment=GoPro MET"))
+    assert math.degrees(film.turned) == pytest.approx(180.0, abs=15.0)
+    assert any("GoPro has a fisheye lens" in text for text in film.photographs[0].warnings)
 
 
 @needs_ffmpeg

@@ -394,6 +394,15 @@ def test_bend_is_measured_in_shares_of_the_longer_side() -> None:
     assert measure_bend(np.concatenate([bent(x, y) for y in (20.0, 40.0, 60.0)]), width=640, height=480) is None
 
 
+def test_exif_orientation_of_a_heic_picture_without_a_turn_is_named() -> None:
+    content = (FOLDER / "phone.heic").read_bytes()
+    # An entry of the orientation in the place of that of the Exif block.
+    entry = b"\x87i\0\4\0\0\0\1\0\0\0\x1a", b"\1\x12\0\3\0\0\0\1\0\6\0\0"
+    photograph = opened(content.replace(*entry))
+    assert photograph.warnings[0].startswith("the Exif orientation 6 was ignored, as HEIC")
+    assert not photograph.is_upright
+
+
 def test_heic_picture_with_a_broken_exif_block_is_read() -> None:
     photograph = opened((FOLDER / "heic_bad_exif.heic").read_bytes())
     assert present(photograph.sphere).std() > 20.0

@@ -63,7 +63,7 @@ def test_folder_is_pinned_with_a_sentence_on_what_is_not(pinned: tuple[Path, Pat
     notes = " ".join(pins["notes"])
     assert "'broken.jpg' is set aside: the photograph is not a readable JPEG" in notes
     assert "copies of other files, which have the same pin: 1" in notes
-    assert "files that are no pictures, which are left out: 1" in notes
+    assert "files that are no JPEG, PNG, WebP or HEIC pictures, such as 'notes.txt', were left out: 1" in notes
     assert pins["counts"]["set_aside"] == 1
 
 

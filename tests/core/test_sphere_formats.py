@@ -122,10 +122,12 @@ def test_sphere_is_taken_out_of_its_bars(name: str) -> None:
         assert np.abs(present(view.sphere).astype(int) - whole).mean() < 6.0, words
 
 
-def test_pictures_of_six_unrelated_faces_are_no_cube_maps() -> None:
-    rooms = [faces(small(name))[:2] for name in NAMES[:3]]
+@pytest.mark.parametrize(("columns", "gap"), [(3, 0), (2, 0), (2, 12)])
+def test_collages_are_refused_and_are_no_cube_maps(columns: int, gap: int) -> None:
+    rooms = [[barred(face, gap, gap) for face in faces(small(name))[:2]] for name in NAMES[:columns]]
     pixels = np.vstack([np.hstack([room[row] for room in rooms]) for row in (0, 1)])
-    assert find_sphere_format(thumbnail(pixels)) is None
+    found = find_sphere_format(thumbnail(pixels))
+    assert present(found).text.startswith(f"the photograph is a collage of {columns} x 2 photographs")
 
 
 def thumbnail(pixels: np.ndarray) -> Thumbnail:
@@ -228,7 +230,10 @@ class TestParts:
             opened(encoded(part, "JPEG", xmp(**stated)))
 
 
-@pytest.mark.parametrize("kind", ["black", "unequal", "of two colours", "on one side", "blurred", "with a strip"])
+_ONE_COLOUR = ["black", "unequal", "of two colours", "on one side", "with a strip", "in a window"]
+
+
+@pytest.mark.parametrize("kind", [*_ONE_COLOUR, "blurred", "gradient"])
 def test_photograph_is_taken_out_of_its_bars(kind: str) -> None:
     view = take(small("study"), Perspective.of_hfov(640, 400, math.radians(80.0)))
     found = opened(picture_file(within_bars(view, kind)))

@@ -14,7 +14,7 @@ from PIL import Image
 
 from lalaloc_core.localise.album.entry import COLOURS, AlbumPhotograph
 from lalaloc_core.localise.album.walk_order import walk_order
-from lalaloc_core.photograph.exif import Taken, read_time
+from lalaloc_core.photograph.exif import Taken, read_taken, read_time
 from lalaloc_core.photograph.picture_folders import pictures_in, turn_files
 
 _TEN = datetime(2026, 5, 1, 10)
@@ -143,6 +143,16 @@ def test_zone_and_fraction_of_a_time_can_be_tags_of_their_own() -> None:
     found = read_time("2024:05:01 10:20:30", "25", "-03:30")
     assert found == datetime(2024, 5, 1, 13, 50, 30, 250_000, tzinfo=UTC)
     assert read_time("2024:05:01 10:20:30", "", "+99:00") == datetime(2024, 5, 1, 10, 20, 30)
+
+
+@pytest.mark.parametrize("name", [b"photoshop:DateCreated", b"xmp:CreateDate", b""])
+def test_times_of_xmp_and_of_gps_count_without_others(name: bytes) -> None:
+    exif, packets = Image.Exif(), [name + b">2026-05-01T12:00:30+02:00<"]
+    if not name:
+        exif.get_ifd(0x8825).update({29: "2026:05:01", 7: (10.0, 0.0, 30.9)})
+    assert read_taken(exif, packets, width=0, height=0).at == _TEN.replace(second=30, tzinfo=UTC)
+    exif.get_ifd(0x8769)[0x9003] = "2026:05:01 09:00:00"
+    assert read_taken(exif, packets, width=0, height=0).at == datetime(2026, 5, 1, 9)
 
 
 def _picture(path: Path, minute: int | None = None) -> None:

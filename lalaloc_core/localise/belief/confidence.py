@@ -258,5 +258,5 @@ def reason_for(confidence: float, elsewhere: float, objects: SeenObjects | None,
         return f"{low}: several places look alike; send hints, such as the heading or the room, or more photographs"
     return (
         f"{low}: the photograph fits no place of the plan; check that the plan shows these rooms and is in metres, the "
-        "camera height, the projection and the tilt"
+        "camera height, the field of view (also after cropping), the projection and the tilt"
     )
