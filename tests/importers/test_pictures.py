@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,39 @@ def test_walls_that_are_paler_than_coloured_floors_are_walls():
     plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document
     assert sorted(room.area for room in shapes(plan)) == pytest.approx([3.24 * 2.6] * 2, rel=0.03)
     assert len(lines(plan, "door")) == 1
+
+
+@pytest.mark.parametrize(
+    ("ground", "floors", "wall"),
+    [
+        ("#f5f7fa", ("#99c8ff", "#ffd68a", "#ffaa96"), None),
+        ("#1c1c1e", ("#3a6296", "#96783c", "#3c7d6e"), None),
+        ("white", ("#19a1a1", "#7ac950", "#df5618"), "#5d6d7e"),
+        ("#e7f0fa", ("#b9ddfb", "#b9ddfb", "#b9ddfb"), "#5c9dde"),
+    ],
+)
+@pytest.mark.parametrize(("turn_deg", "size"), [(0, 1.0), (3, 1.0), (0, 0.5)])
+def test_map_of_a_robot_has_a_room_for_each_colour_or_each_area_between_walls(
+    ground: str, floors: Sequence[str], wall: str | None, turn_deg: int, size: float
+):
+    page = Image.new("RGB", (1000, 900), ground)
+    pen = ImageDraw.Draw(page)
+    for box, floor in zip([(100, 100, 500, 499), (500, 100, 900, 499), (100, 500, 900, 800)], floors, strict=True):
+        pen.rectangle(box, fill=floor)
+        for y in range(box[1] + 20, box[3] - 20, 25):
+            pen.line((box[0] + 20, y, box[2] - 20, y), fill="#f0f0f0", width=2)
+    if wall is not None:
+        pen.rectangle((100, 100, 900, 800), outline=wall, width=5)
+        for line in [(500, 100, 500, 250), (500, 340, 500, 500), (100, 500, 250, 500), (340, 500, 900, 500)]:
+            pen.line(line, fill=wall, width=5)
+    pen.rectangle((200, 600, 350, 750), fill="#ff7070")
+    page = page.rotate(turn_deg, fillcolor=ground, expand=True)
+    page = page.resize((round(page.width * size), round(page.height * size)))
+    plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01 / size))
+    assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([16.0, 16.0, 24.0], rel=0.08)
+    assert len(lines(plan.document, "passage")) == (2 if wall is not None else 0)
+    assert any("doors are unknown" in warning for warning in plan.report.warnings) == (wall is None)
+    assert any("zones or carpets" in guess for guess in plan.report.unsure)
 
 
 def test_symbols_across_walls_of_two_lines_cut_no_wall():

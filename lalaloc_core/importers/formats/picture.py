@@ -28,6 +28,7 @@ from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
 from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
 from lalaloc_core.importers.picture.lettering import read_texts
+from lalaloc_core.importers.picture.occupancy import sketch_map
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 
 _MIN_SIDE_PX = 64
@@ -43,11 +44,12 @@ _MAX_EXTENT_M = 1000.0
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Read the plan in a picture, as a draft."""
     builder = ReportBuilder("picture", is_draft=True)
-    gray, warmth, paper_m_per_pixel = _open(content, builder, budget)
+    gray, warmth, colours, paper_m_per_pixel = _open(content, builder, budget)
     _check_kind(gray, options, builder)
     if options.crop is not None:
         gray = blank_outside(gray, options.crop)
         warmth = None if warmth is None else blank_outside(warmth, options.crop)
+        colours = np.dstack([blank_outside(colours[..., channel], options.crop) for channel in range(3)])
     texts = read_texts(gray, builder, budget)
     budget.hints += text_hints(texts.drawing.letterings, "the picture")
     # Dimensions are preferred to "1:100": scans keep their resolution when they are made smaller.
@@ -82,7 +84,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             f"{_MAX_EXTENT_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
     letterings = texts.placed(factor)
-    sketch = sketch_picture(gray, factor, builder, budget, warmth, letterings=letterings)
+    sketch = sketch_map(colours, factor, builder, budget)
+    if sketch is None or not sketch.rooms:
+        sketch = sketch_picture(gray, factor, builder, budget, warmth, letterings=letterings)
     if not sketch.rooms:
         raise InvalidFloorPlanError(
             f"no walls that enclose a room were found in the picture, which is {columns * factor:.1f} m by "
@@ -114,8 +118,8 @@ def _check_kind(gray: UInt8[np.ndarray, "h w"], options: ImportOptions, builder:
 
 def _open(
     content: bytes, builder: ReportBuilder, budget: Budget
-) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, float | None]:
-    """Return the grey picture on white, its warmth, and the length of a pixel on paper if the file gives it."""
+) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, UInt8[np.ndarray, "h w 3"], float | None]:
+    """Return the grey picture on white, its warmth, its colours, and the length of a pixel on paper if it is given."""
     with open_picture(content, ("PNG", "JPEG"), "the picture", "save it again as PNG", budget) as picture:
         if min(picture.size) < _MIN_SIDE_PX:
             raise InvalidFloorPlanError(
@@ -132,17 +136,17 @@ def _open(
         flat.alpha_composite(drawn)
         gray = np.asarray(flat.convert("L"))
         warmth = None if upright.mode in ("1", "L", "LA", "I", "I;16", "F") else _warmth(flat)
-        if (with_dark_walls := darken_pale_walls(np.asarray(flat.convert("RGB")))) is not None:
+        colours = np.asarray(flat.convert("RGB"))
+        if (with_dark_walls := darken_pale_walls(colours)) is not None:
             gray, warmth = with_dark_walls, None
             builder.notes.append("walls are the areas of one colour between the floors, which are darker")
         elif _has_dark_ground(gray):
             # Red and blue lines are nearly as dark as the ground.
-            colours = np.asarray(flat.convert("RGB"))
             ground = np.median(colours[::8, ::8].reshape(-1, 3), axis=0).astype(np.uint8)
             apart = np.maximum(colours, ground) - np.minimum(colours, ground)
             gray, warmth = 255 - apart.max(axis=2), None
             builder.notes.append("the picture shows light lines on a dark ground and was inverted")
-    return gray, warmth, _paper(dpi)
+    return gray, warmth, colours, _paper(dpi)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Occupancy grids, as robots map them: their frame, and the rooms that their occupied cells enclose."""
+"""Occupancy grids, as robots map them, also in coloured pictures, and the rooms that their occupied cells enclose."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_from_geometry
@@ -17,6 +17,7 @@ from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, Sketch
 from lalaloc_core.importers.drawing.enclosed_rooms import explained_size
 from lalaloc_core.importers.picture.ink import find_skew, rotate_picture
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
+from lalaloc_core.importers.picture.wall_mask import usual_thickness
 
 # Cells are divided until they are this fine (m), because the picture importer expects walls of several pixels.
 _FINE_M = 0.0125
@@ -36,6 +37,17 @@ _SEEN_SHARE, _BESIDE_CELLS, _OLD = 0.6, 3.0, 0.5
 _RECALL = 0.7
 # A smaller share of the free cells in rooms gives a warning.
 _USED_SHARE = 0.8
+# Coloured maps: most cells; lengths (m) of the median that removes paths, notches in floors, gaps between floors, depth
+# inside a floor, reach of outer walls, longest border between walls that is a door, and growth of lines.
+_MOST_CELLS, _PATH_M, _NOTCH_M, _GAP_M, _INSIDE_M = 3e6, 0.08, 0.06, 0.25, 0.3
+_OUTER_M, _DOOR_M, _GROWN_M = 0.1, 1.3, 0.036
+# Tones: number, least shares of the picture, of its edge (ground) and of a floor; tolerances (of 255) of equal tones,
+# of pixels of a tone, and of walls.
+_TONES, _LEAST, _GROUND, _EVEN, _SAME, _OF_TONE, _OF_WALL = 24, 0.001, 0.05, 0.6, 10.0, 24.0, 40.0
+# Blur of edges and thinnest walls (cells), thickest inner and outer walls of maps (m), thickness of paths relative to
+# walls, least share of floors, smallest floor and largest zone inside one (m²), and share of its rim without a wall.
+_BLURRED, _WALL_CELLS, _THICKEST_M, _THINNER = 2.0, 1.5, (0.065, 0.12), 0.35
+_FLOORS, _FLOOR_M2, _ZONE_M2, _OPEN = 0.6, 1.0, 6.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +57,157 @@ class OccupancyGrid:
     frame: MapFrame
     occupied: Bool[np.ndarray, "h w"]
     free: Bool[np.ndarray, "h w"]
+
+
+def sketch_map(
+    colours: UInt8[np.ndarray, "h w 3"], metres_per_pixel: float, builder: ReportBuilder, budget: Budget
+) -> Sketch | None:
+    """Return the rooms and passages of a map as apps of robots show it; None if the picture is none.
+
+    Rooms are areas of flat colours that touch or have thin lines between them, below paths, names and symbols.
+    """
+    factor = min(1.0, metres_per_pixel / _FINE_M, math.sqrt(_MOST_CELLS / colours[..., 0].size))
+    rows, columns = (max(1, round(side * factor)) for side in colours.shape[:2])
+    frame = MapFrame(metres_per_pixel * colours.shape[0] / rows, (0.0, 0.0, 0.0), (rows, columns))
+    cell_m, around = frame.resolution_m, np.ones((3, 3), np.uint8)
+    small = cv2.resize(colours, (columns, rows), interpolation=cv2.INTER_AREA)
+    plain = cv2.medianBlur(small, 2 * round(0.5 * _PATH_M / cell_m) + 1)
+    tones = _frequent_tones(plain)
+    label = _distances(plain, tones).argmin(axis=0)
+    edge = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
+    is_ground = np.array([(edge == k).mean() >= _GROUND for k in range(len(tones))], bool)
+    is_floor = ~is_ground & [_is_floor(label == k, cell_m) for k in range(len(tones))]
+    if not is_ground.any() or not is_floor.any():
+        return None
+    tones, first = np.concatenate([tones[is_ground], tones[is_floor]]), int(is_ground.sum())
+    far = _distances(plain, tones)
+    label = np.where(far.min(axis=0) <= _OF_TONE, far.argmin(axis=0), -1)
+    ground = (label >= 0) & (label < first)
+    ground &= _near(~_near(~ground, _OUTER_M / cell_m), _OUTER_M / cell_m)
+    label = np.where(label >= first, label, 0)
+    walls = _without_specks(_lines_around(ground, label > 0, small, tones, cell_m), frame) > 0
+    areas, zones_m2 = _areas(label, walls, cell_m)
+    free = areas > 0
+    between = _closed(free, _GAP_M / cell_m) & ~free
+    thick_m = [usual_thickness(mask.astype(np.uint8)) * cell_m for mask in (between, walls)]
+    _, found = cv2.connectedComponents(ground.astype(np.uint8))
+    within = np.asarray(found)
+    outer = np.concatenate([within[0], within[-1], within[:, 0], within[:, -1]])
+    inside = ~(ground & np.isin(within, outer))
+    is_map = thick_m[0] <= _THICKEST_M[0] and thick_m[1] <= _THICKEST_M[1] and float(free[inside].mean()) >= _FLOORS
+    if not is_map or not (walls.any() or len(np.unique(areas)) > 2):
+        return None
+    if zones_m2:
+        builder.unsure.append(
+            f"{len(zones_m2)} areas of another colour inside a room, {sum(zones_m2):.1f} m², are taken for zones or "
+            "carpets; draw them in the editor if they are rooms"
+        )
+    # Blurred cells between two floors belong to the nearest.
+    rest = (~free).astype(np.uint8)
+    far, nearest = cv2.distanceTransformWithLabels(rest, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    numbers = np.asarray(nearest, np.int32)
+    owner = np.zeros(int(numbers.max()) + 1, np.int32)
+    owner[numbers[free]] = areas[free]
+    areas = np.where(~walls & (far <= _BLURRED), owner[numbers], areas)
+    free = areas > 0
+    lowest, highest = (change(areas.astype(np.float32), around) for change in (cv2.erode, cv2.dilate))
+    occupied = _near(walls | (lowest != highest), max(1.0, _GROWN_M / cell_m))
+    sketch = sketch_grid(OccupancyGrid(frame, occupied, free & ~occupied), builder, budget)
+    if not walls.any():
+        builder.warnings.append(
+            "rooms are areas of one colour without walls, as in maps of robots, so doors are unknown: add them in the "
+            "editor, or send the map as JSON of Valetudo"
+        )
+        return replace(sketch, openings=[], opening_kinds=())
+    builder.notes.append("rooms are areas of one colour between thin walls, as in maps of robots")
+    # Floors that meet between the ends of walls meet in a door.
+    inner = ((lowest != highest) & (lowest > 0) & ~_near(walls, _BLURRED)).astype(np.uint8)
+    count, found = cv2.connectedComponents(inner, connectivity=8)
+    for number in range(1, count):
+        row, column = np.nonzero(np.asarray(found) == number)
+        places = np.column_stack([column + 0.5, rows - row - 0.5]) * cell_m
+        along = places[:, np.ptp(places, axis=0).argmax()]
+        start, end = places[along.argmin()], places[along.argmax()]
+        if 0.0 < (length_m := math.dist(start, end)) <= _DOOR_M:
+            beyond = _BLURRED * cell_m / length_m * (end - start)
+            sketch.openings.append(SketchedOpening("passage", point_xy(start - beyond), point_xy(end + beyond)))
+    return sketch
+
+
+def _near(mask: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)) <= reach
+
+
+def _closed(mask: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+    rim = math.ceil(reach) + 1
+    return ~_near(~_near(np.pad(mask, rim), reach), reach)[rim:-rim, rim:-rim]
+
+
+def _frequent_tones(colours: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    codes = (colours >> 3).astype(np.int32) @ np.array([1024, 32, 1])
+    counts, tones = np.bincount(codes.ravel()), list[np.ndarray]()
+    for code in np.argsort(-counts)[: int((counts >= _LEAST * codes.size).sum())]:
+        tone = np.median(colours[codes == code], axis=0)
+        if len(tones) < _TONES and all(np.abs(tone - known).max() > _SAME for known in tones):
+            tones.append(tone)
+    return np.array(tones, np.float32)
+
+
+def _distances(colours: np.ndarray, tones: np.ndarray) -> Float[np.ndarray, "n h w"]:
+    return np.array([np.abs(colours.astype(np.float32) - tone).max(axis=2) for tone in tones])
+
+
+def _is_floor(mask: Bool[np.ndarray, "h w"], cell_m: float) -> bool:
+    """Return whether an area is wide somewhere, apart from lines over it."""
+    inside = ~_near(~_closed(mask, _NOTCH_M / cell_m), _INSIDE_M / cell_m)
+    return bool(inside.any()) and float(mask[inside].mean()) >= _EVEN
+
+
+def _lines_around(
+    ground: Bool[np.ndarray, "h w"],
+    floor: Bool[np.ndarray, "h w"],
+    colours: np.ndarray,
+    tones: Float[np.ndarray, "n 3"],
+    cell_m: float,
+) -> Bool[np.ndarray, "h w"]:
+    """Return all lines of the tone that most lines between ground and floors have; none if blends are between them."""
+    far = _distances(colours, tones).min(axis=0)
+    beside = _near(ground, max(1.5, 0.8 * _OUTER_M / cell_m)) & ~ground & _near(floor, 1.5 * _OUTER_M / cell_m)
+    line = colours[beside & (far > _OF_TONE)]
+    least = max(1.0, _WALL_CELLS * float((_near(ground, 1.5) & beside).sum()))
+    if len(line) < least:
+        return np.zeros_like(ground)
+    codes = (line >> 4).astype(np.int32) @ np.array([256, 16, 1])
+    tone = np.median(line[codes == np.bincount(codes).argmax()], axis=0)
+    if (np.abs(line - tone).max(axis=1) <= _OF_WALL).sum() < least:
+        return np.zeros_like(ground)
+    walls = (_distances(colours, tone[None])[0] < np.minimum(far, _OF_WALL)).astype(np.uint8)
+    side = max(1, round(_THINNER * usual_thickness(walls & _near(ground, 1.5 * _OUTER_M / cell_m))))
+    return cv2.morphologyEx(walls, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+
+
+def _areas(
+    label: np.ndarray, walls: Bool[np.ndarray, "h w"], cell_m: float
+) -> tuple[Int[np.ndarray, "h w"], list[float]]:
+    """Return the number of each cell's room, 0 without, and the sizes (m²) of zones and carpets inside rooms."""
+    areas, zones_m2 = np.zeros(label.shape, np.int32), list[float]()
+    for tone in np.unique(label[label > 0]):
+        part = _closed(label == tone, _NOTCH_M / cell_m) & ~walls & ((label == tone) | (label == 0))
+        _, found, stats, _ = cv2.connectedComponentsWithStats(part.astype(np.uint8), connectivity=4)
+        is_room = stats[:, cv2.CC_STAT_AREA] * cell_m**2 >= _FLOOR_M2
+        is_room[0] = False
+        areas = np.maximum(areas, np.where(is_room, areas.max() + np.cumsum(is_room), 0)[np.asarray(found)])
+    for number in range(1, int(areas.max()) + 1):
+        room = (areas == number).astype(np.uint8)
+        outlines, _ = cv2.findContours(room, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        inside = cv2.drawContours(np.zeros_like(room), outlines, -1, 1, cv2.FILLED) & ~room
+        count, found, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=4)
+        for hole in range(1, count):
+            part, area_m2 = np.asarray(found) == hole, float(stats[hole, cv2.CC_STAT_AREA]) * cell_m**2
+            if area_m2 < _ZONE_M2 and walls[part & _near(~part, _BLURRED)].mean() < _OPEN:
+                zones_m2 += [area_m2] if areas[part].any() else []
+                areas[part & ~walls] = number
+    return areas, zones_m2
 
 
 def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> Sketch:

@@ -139,7 +139,7 @@ def _is_in_wall(
         return thin
     sure = is_sure[labels].astype(np.uint8)
     walls = cv2.morphologyEx(sure | ink.mask, cv2.MORPH_OPEN, np.ones((_min_thickness_px(ink),) * 2, np.uint8))
-    usual, widest = (_usual_thickness(walls, share) for share in (0.5, _WIDEST_WALLS))
+    usual, widest = (usual_thickness(walls, share) for share in (0.5, _WIDEST_WALLS))
     near = cv2.dilate(sure, np.ones((_LINES_PX,) * 2, np.uint8))
     is_beside = np.bincount(labels[near > 0], minlength=count) > 0
     inner = max(usual - 2.0 * _PEN_PX, 1.0)
@@ -177,12 +177,12 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     # Strokes of furniture can be broad in scans, and leaves between two lines, but not as broad as walls.
     share, thinnest_m = _STROKE if cavities is None else _LEAF
-    widest = round(min(share * _usual_thickness(thick), thinnest_m / ink.metres_per_pixel))
+    widest = round(min(share * usual_thickness(thick), thinnest_m / ink.metres_per_pixel))
     if widest > size:
         # The middles of even sizes would move walls off the panes between their lines.
         kernel, middle = np.ones((widest, widest), np.uint8), (widest - 1) // 2
         thick = cv2.dilate(cv2.erode(thick, kernel), kernel, anchor=(middle, middle))
-    thickness = _usual_thickness(thick) * ink.metres_per_pixel
+    thickness = usual_thickness(thick) * ink.metres_per_pixel
     if thickness < _MIN_THICKNESS_M:
         return None  # Merged strokes of a hatch are not walls.
     thickness_range = _FILLED_RANGE if cavities is None else _OUTLINED_RANGE
@@ -204,7 +204,7 @@ def _min_thickness_px(ink: Ink) -> int:
     return max(3, round(_MIN_THICKNESS_M / ink.metres_per_pixel))
 
 
-def _usual_thickness(mask: np.ndarray, share: float = 0.5) -> float:
+def usual_thickness(mask: np.ndarray, share: float = 0.5) -> float:
     """Return the thickness of walls in pixels, a quantile by area; 0 without walls."""
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
     ridge = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
