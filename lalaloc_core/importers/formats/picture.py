@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -64,6 +64,13 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
         return measures_of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
 
+    def guess(written: Sequence[tuple[float, str]]) -> tuple[float, str] | None:
+        first = first_scale(drawn_extent(gray))
+        if sketch_map(colours, first, ReportBuilder(), budget) is not None:
+            budget.hints.append("maps as robots draw them have no leaves of doors, which would tell the scale")
+            return None
+        return assume_scale(guess_scale(measure, first, budget), builder, written)
+
     factor, source = builder.metres_per_unit, builder.scale_source = drawing_scale(
         replace(options, units=None),
         "the picture",
@@ -71,9 +78,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         paper_m_per_unit=paper_m_per_pixel,
         paper_m=None if paper_m_per_pixel is None else max(gray.shape) * paper_m_per_pixel,
         own=measured,
-        guess=lambda written: assume_scale(
-            guess_scale(measure, first_scale(drawn_extent(gray)), budget), builder, written
-        ),
+        guess=guess,
     )
     check_scale(factor, source, measured, builder)
     reject_dimensions(dimensions, factor, builder)

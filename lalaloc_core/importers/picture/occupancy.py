@@ -39,7 +39,7 @@ _RECALL = 0.7
 _USED_SHARE = 0.8
 # Coloured maps: most cells; lengths (m) of the median that removes paths, notches in floors, gaps between floors, depth
 # inside a floor, reach of outer walls, longest border between walls that is a door, and growth of lines.
-_MOST_CELLS, _PATH_M, _NOTCH_M, _GAP_M, _INSIDE_M = 3e6, 0.08, 0.06, 0.25, 0.3
+_MOST_CELLS, _PATH_M, _NOTCH_M, _GAP_M, _INSIDE_M = 1e6, 0.08, 0.06, 0.25, 0.3
 _OUTER_M, _DOOR_M, _GROWN_M = 0.1, 1.3, 0.036
 # Tones: number, least shares of the picture, of its edge (ground) and of a floor; tolerances (of 255) of equal tones,
 # of pixels of a tone, and of walls.
