@@ -22,6 +22,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeDecorator
 
+from service.storage.migrations import chunk, counter, optional, owned, part_of, required
+
 METADATA = MetaData()
 
 
@@ -42,38 +44,23 @@ class UtcDateTime(TypeDecorator[datetime]):
         return value.astimezone(UTC) if value.tzinfo else value.replace(tzinfo=UTC)
 
 
-def _stored_bytes() -> Column[int]:
-    """Return the column of a row's stored bytes (`stored_bytes.py`); 0 if an earlier version wrote the row."""
-    return Column("stored_bytes", BigInteger, nullable=False, server_default="0")
-
-
-def _of_revision(*, primary_key: bool = False) -> Column[str]:
-    owner = ForeignKey("revisions.id", ondelete="CASCADE")
-    return Column("revision_id", String(32), owner, primary_key=primary_key, nullable=False)
-
-
 FLOORPLANS = Table(
     "floorplans",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
+    *owned(),
     Column("name", Text, nullable=False),
     # Case-folded name for searches, because databases fold cases differently.
     Column("folded_name", Text, nullable=False),
     # Current revision; no foreign key, because revisions already refer to their plan.
     Column("revision_id", String(32), nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("updated_at", UtcDateTime, nullable=False),
+    *required(UtcDateTime, "created_at", "updated_at"),
     # Circle around the plan, in its own frame; NULL if an earlier version stored a plan that cannot be read.
-    Column("centre_x_m", Double),
-    Column("centre_y_m", Double),
-    Column("reach_m", Double),
+    *optional(Double, "centre_x_m", "centre_y_m", "reach_m"),
     # Centre of the circle on Earth; NULL for a plan without an anchor.
-    Column("latitude", Double),
-    Column("longitude", Double),
+    *optional(Double, "latitude", "longitude"),
     # Number of the tenant's change (`tenants.changes`) that last changed what queries of venues read of this plan; 0
     # before the first one.
-    Column("changed", BigInteger, nullable=False, server_default="0"),
+    counter("changed"),
     Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
     Index("floorplans_by_place", "tenant", "latitude"),
     Index("floorplans_by_revision", "revision_id"),
@@ -84,7 +71,7 @@ REVISIONS = Table(
     "revisions",
     METADATA,
     Column("id", String(32), primary_key=True),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+    part_of("floorplans", "plan_id", nullable=False),
     Column("number", Integer, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
     Column("document", Text, nullable=False),
@@ -96,38 +83,29 @@ REVISIONS = Table(
     Column("original_media_type", String(64)),
     Column("report", Text),
     Column("room_count", Integer, nullable=False),
-    Column("area_m2", Double, nullable=False),
-    Column("camera_height_m", Double, nullable=False),
+    *required(Double, "area_m2", "camera_height_m"),
     # NULL for an unknown camera height, and in rows of earlier versions of the service.
     Column("camera_height_std_m", Double),
     Column("failure", Text),
-    _stored_bytes(),
+    counter("stored_bytes"),
     UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
 )
 
-ORIGINAL_CHUNKS = Table(
-    "original_chunks",
-    METADATA,
-    _of_revision(primary_key=True),
-    Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("content", LargeBinary, nullable=False),
-)
+ORIGINAL_CHUNKS = Table("original_chunks", METADATA, part_of("revisions", "revision_id", primary_key=True), *chunk())
 
 LATENT_GRIDS = Table(
     "latent_grids",
     METADATA,
     Column("id", Integer, primary_key=True, autoincrement=True),
-    _of_revision(),
+    part_of("revisions", "revision_id", nullable=False),
     Column("model_sha256", String(64), nullable=False),
     Column("step_m", Double, nullable=False),
-    Column("camera_height_mm", Integer, nullable=False),
-    Column("poses", Integer, nullable=False),
-    Column("size_bytes", Integer, nullable=False),
+    *required(Integer, "camera_height_mm", "poses", "size_bytes"),
     # NULL in rows of earlier versions of the service, which do not count as stored.
     Column("sha256", String(64)),
     # Input of the choice among a venue's plans; NULL in rows of earlier versions of the service.
     Column("prototypes", LargeBinary),
-    _stored_bytes(),
+    counter("stored_bytes"),
     UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
 )
 
@@ -135,14 +113,13 @@ GRID_CHUNKS = Table(
     "grid_chunks",
     METADATA,
     Column("grid_id", Integer, ForeignKey("latent_grids.id", ondelete="CASCADE"), primary_key=True),
-    Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("content", LargeBinary, nullable=False),
+    *chunk(),
 )
 
 GRID_LEASES = Table(
     "grid_leases",
     METADATA,
-    _of_revision(primary_key=True),
+    part_of("revisions", "revision_id", primary_key=True),
     Column("model_sha256", String(64), primary_key=True),
     Column("step_m", Double, primary_key=True),
     Column("camera_height_mm", Integer, primary_key=True, autoincrement=False),
@@ -159,27 +136,21 @@ GRID_LEASES = Table(
 VENUES = Table(
     "venues",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("name", Text, nullable=False),
-    Column("folded_name", Text, nullable=False),
+    *owned(),
+    *required(Text, "name", "folded_name"),
     Column("revision_id", String(32), nullable=False),
     Column("number", Integer, nullable=False),
     # Anchor; all columns are NULL without one, and `altitude_m` is optional.
-    Column("latitude", Double),
-    Column("longitude", Double),
-    Column("altitude_m", Double),
-    Column("north_deg", Double),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("updated_at", UtcDateTime, nullable=False),
+    *optional(Double, "latitude", "longitude", "altitude_m", "north_deg"),
+    *required(UtcDateTime, "created_at", "updated_at"),
     Index("venues_by_tenant_and_age", "tenant", "created_at", "id"),
 )
 
 VENUE_PLANS = Table(
     "venue_plans",
     METADATA,
-    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE"), primary_key=True),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), primary_key=True),
+    part_of("venues", "venue_id", primary_key=True),
+    part_of("floorplans", "plan_id", primary_key=True),
     Column("level", Double, nullable=False),
     Column("name", Text),
     Index("venue_plans_by_plan", "plan_id"),
@@ -191,34 +162,30 @@ TENANTS = Table(
     METADATA,
     Column("tenant", String(64), primary_key=True),
     # Limits set by the operator; NULL for the limit in the settings.
-    Column("max_stored_bytes", BigInteger),
-    Column("max_bytes_in_flight", BigInteger),
+    *optional(BigInteger, "max_stored_bytes", "max_bytes_in_flight"),
     # Weight of the tenant's CPU seconds in queues; NULL counts as 1.
     Column("cpu_share", Double),
     # Counters of stored bytes by kind, see `stored_bytes.py`.
     *(
-        Column(f"{kind}_bytes", BigInteger, nullable=False, server_default="0")
+        counter(f"{kind}_bytes")
         for kind in ("plans", "grids", "venues", "answers", "sessions", "albums", "idempotency")
     ),
     # Number of changes of plans, grids and venues, and the stored bytes that these changes added. Earlier versions of
     # the service, running beside, count their bytes alone.
-    Column("changes", BigInteger, nullable=False, server_default="0"),
-    Column("counted_bytes", BigInteger, nullable=False, server_default="0"),
+    counter("changes"),
+    counter("counted_bytes"),
 )
 
 API_KEYS = Table(
     "api_keys",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
+    *owned(),
     Column("name", Text, nullable=False),
     Column("hash", String(64), nullable=False, unique=True),
     Column("scopes", Text, nullable=False),
     Column("rate_per_minute", Integer),
     Column("created_at", UtcDateTime, nullable=False),
-    Column("revoked_at", UtcDateTime),
-    Column("last_used_at", UtcDateTime),
-    Column("expires_at", UtcDateTime),
+    *optional(UtcDateTime, "revoked_at", "last_used_at", "expires_at"),
     # Lifetime that a successor inherits; rotation shortens `expires_at`.
     Column("lifetime_s", Double),
     Column("replaces", String(32)),
@@ -233,8 +200,7 @@ AUDIT_LOG = Table(
     Column("created_at", UtcDateTime, nullable=False),
     Column("actor", String(300), nullable=False),
     # Tenant of the actor, or for operators the tenant that they changed; empty for unknown callers.
-    Column("tenant", String(64), nullable=False),
-    Column("address", String(64), nullable=False),
+    *required(String(64), "tenant", "address"),
     Column("action", String(100), nullable=False),
     Column("resource", String(300), nullable=False),
     Column("status", Integer),
@@ -250,12 +216,11 @@ AUDIT_LOG = Table(
 KEPT_ANSWERS = Table(
     "kept_answers",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+    *owned(),
+    part_of("floorplans", "plan_id", nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
     Column("content", Text, nullable=False),
-    _stored_bytes(),
+    counter("stored_bytes"),
     Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
     Index("kept_answers_by_age", "created_at"),
     Index("kept_answers_by_plan", "plan_id"),
@@ -264,14 +229,12 @@ KEPT_ANSWERS = Table(
 SESSIONS = Table(
     "sessions",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
+    *owned(),
     # Either a plan or a venue, and the revision at which the session began.
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
-    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
+    part_of("floorplans", "plan_id"),
+    part_of("venues", "venue_id"),
     Column("revision_id", String(32), nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("expires_at", UtcDateTime, nullable=False),
+    *required(UtcDateTime, "created_at", "expires_at"),
     # The request that began the session, as JSON.
     Column("options", Text, nullable=False),
     Column("photographs", Integer, nullable=False),
@@ -282,7 +245,7 @@ SESSIONS = Table(
     Column("claim", String(32), nullable=False),
     Column("claimed_until_s", Double, nullable=False),
     Column("claim_s", Double),
-    _stored_bytes(),
+    counter("stored_bytes"),
     Index("sessions_by_tenant_and_age", "tenant", "expires_at"),
     Index("sessions_by_age", "expires_at"),
     Index("sessions_by_plan", "plan_id"),
@@ -292,22 +255,18 @@ SESSIONS = Table(
 ALBUMS = Table(
     "albums",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("name", Text, nullable=False),
-    Column("folded_name", Text, nullable=False),
+    *owned(),
+    *required(Text, "name", "folded_name"),
     # Either a plan or a venue.
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
-    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
+    part_of("floorplans", "plan_id"),
+    part_of("venues", "venue_id"),
     # The request that created the album, as JSON.
     Column("options", Text, nullable=False),
     Column("model_sha256", String(64), nullable=False),
     # Revision, which changes with the photographs and their corrections.
     Column("revision_id", String(32), nullable=False),
     Column("number", Integer, nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("updated_at", UtcDateTime, nullable=False),
-    Column("expires_at", UtcDateTime, nullable=False),
+    *required(UtcDateTime, "created_at", "updated_at", "expires_at"),
     Column("photographs", Integer, nullable=False),
     # State that was solved last: number of the album's revision (0: none), revision of the plan or venue, and the
     # highest number of a change of the venue's plans (`floorplans.changed`).
@@ -315,8 +274,7 @@ ALBUMS = Table(
     Column("place_revision_id", String(32)),
     Column("place_change", BigInteger, nullable=False),
     # Common part of the solution as JSON, or the reason why there is none.
-    Column("solution", Text),
-    Column("failure", Text),
+    *optional(Text, "solution", "failure"),
     # Lease of the replica that solves it: seconds since 1970 by `Database.now_s`, 0 without one.
     Column("owner", String(32), nullable=False),
     Column("lease_until_s", Double, nullable=False),
@@ -324,7 +282,7 @@ ALBUMS = Table(
     Column("progress", Double, nullable=False),
     # Number of attempts since it was last solved or changed.
     Column("attempts", Integer, nullable=False),
-    _stored_bytes(),
+    counter("stored_bytes"),
     Index("albums_by_tenant_and_age", "tenant", "created_at", "id"),
     Index("albums_by_age", "expires_at"),
     Index("albums_by_plan", "plan_id"),
@@ -335,7 +293,7 @@ ALBUM_PHOTOGRAPHS = Table(
     "album_photographs",
     METADATA,
     Column("id", String(32), primary_key=True),
-    Column("album_id", String(32), ForeignKey("albums.id", ondelete="CASCADE"), nullable=False),
+    part_of("albums", "album_id", nullable=False),
     # Position in the album, in the order of uploads.
     Column("number", Integer, nullable=False),
     Column("sha256", String(64), nullable=False),
@@ -347,11 +305,10 @@ ALBUM_PHOTOGRAPHS = Table(
     Column("facts", Text, nullable=False),
     # Features; pictures are not stored.
     Column("entry", LargeBinary, nullable=False),
-    Column("correction", Text),
-    Column("pin", Text),
+    *optional(Text, "correction", "pin"),
     # What an attempt to solve the album found about it, until one ends.
     Column("evidence", LargeBinary),
-    _stored_bytes(),
+    counter("stored_bytes"),
     UniqueConstraint("album_id", "sha256", name="photographs_of_album"),
     Index("album_photographs_by_number", "album_id", "number"),
 )
@@ -371,7 +328,7 @@ IDEMPOTENCY = Table(
     Column("status", Integer),
     Column("headers", Text),
     Column("body", LargeBinary),
-    _stored_bytes(),
+    counter("stored_bytes"),
     Index("idempotency_by_age", "created_at"),
     Index("idempotency_by_tenant_and_age", "tenant", "created_at"),
 )
