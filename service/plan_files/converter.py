@@ -16,13 +16,7 @@ from typing import NoReturn
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, OnStep
-from service.errors import (
-    ConverterNotReadyError,
-    DamagedDataError,
-    DeadlineExceededError,
-    OverloadedError,
-    StoppingError,
-)
+from service import errors
 from service.plan_documents import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob, RenditionKind
 from service.plan_files.convert_worker import (
     ConversionJob,
@@ -119,7 +113,7 @@ class Converter:
             result = self._run(ParseJob(document), _PARSE_S)
         except JobLostError:
             return document.plan()
-        except (DamagedDataError, InvalidFloorPlanError):
+        except (errors.DamagedDataError, InvalidFloorPlanError):
             return None
         assert isinstance(result, PackedPlan)
         return result.plan()
@@ -142,7 +136,7 @@ class Converter:
         except (TimeoutError, JobLostError) as error:
             lost = error if isinstance(error, JobLostError) else JobLostError("deadline")
             if predicts and lost.reason not in ("not-ready", "closing"):
-                raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
+                raise errors.DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
             self._raise_lost(lost)
         assert isinstance(result, Rendition)
         return result
@@ -181,12 +175,12 @@ class Converter:
                     "the file is damaged or has an unsupported structure; save it again, or in another format"
                 ) from error
             case "queue-full":
-                raise OverloadedError(_QUEUE) from error
+                raise errors.OverloadedError(_QUEUE) from error
             case "not-ready" | "stopped":
-                raise ConverterNotReadyError from error
+                raise errors.ConverterNotReadyError from error
             case "closing":
-                raise StoppingError from error
+                raise errors.StoppingError from error
             case "deadline" | "died":
-                raise DeadlineExceededError(
+                raise errors.DeadlineExceededError(
                     settings.plans.import_deadline_s, "the plan file was not read or written"
                 ) from error
