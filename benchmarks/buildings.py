@@ -26,15 +26,13 @@ _MAX_DEPTH_M = 350.0
 _LIMITS = PlanLimits(max_rooms=10**6, max_plan_vertices=10**7, max_openings=10**6)
 
 
-def building_of(split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> Building:
-    """Return a building of the homes of a split with at least this floor area, `hall_share` of it in halls."""
-    return Building(split, seed, area_m2, hall_share)
-
-
 class Building:
-    """A large building as one `plan`: wings, each a row of homes or halls with a corridor along it."""
+    """A large building as one `plan`: wings, each a row of homes or halls with a corridor along it.
 
-    def __init__(self, split: int, seed: int, area_m2: float, hall_share: float) -> None:
+    The homes are those of a split; the floor has at least the given area, `hall_share` of it in halls.
+    """
+
+    def __init__(self, split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> None:
         self._split, self._seed = split, seed
         self._area_m2, self._hall_share = area_m2, hall_share
         # Nearly square; large ones are wider, because a wing is as deep as its deepest home.

@@ -24,7 +24,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -32,18 +32,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks import harness
-from benchmarks.heaviest import (
-    LOADS,
-    PLANS,
-    Load,
-    Stored,
-    building,
-    created_id,
-    missing_routes,
-    store_album,
-    store_venue,
-)
+from benchmarks import harness, heaviest
 from examples.truth import PLAN_PATH
 from service.security import Permission
 from service.security.keys import hash_of, key_text, new_secret
@@ -69,7 +58,7 @@ class Template:
     heavy_key: str
     light_key: str
     light_plan_id: str
-    stored: Mapping[str, Stored]
+    stored: Mapping[str, heaviest.Stored]
 
 
 @dataclass(frozen=True)
@@ -109,11 +98,11 @@ def main() -> int:
     parser.add_argument("--homes", type=int, default=100, help="homes of the venue; 10000 are accepted")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
-    if missing := missing_routes():
+    if missing := heaviest.missing_routes():
         parser.exit(1, f"no entry in benchmarks/heaviest.py for: {', '.join(missing)}\n")
     loads = [
         replace(load, title=load.title.format(homes=options.homes))
-        for load in LOADS
+        for load in heaviest.LOADS
         if any(re.search(options.rows, f"{route}, {load.title}") for route in load.routes)
     ]
     rows = []
@@ -175,38 +164,37 @@ def _template(homes: int, plans: set[str]) -> Iterator[Template]:
         settings = _SETTINGS | {"LALALOC_MAX_IMPORT_S": "600"}
         with harness.started_service(data, settings) as service:
             light, heavy = harness.Caller(service.url, keys["light"]), harness.Caller(service.url, keys["heavy"])
-            light_plan_id = created_id(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
-            venue_id, _, member_ids = store_venue(heavy, homes)
-            bodies = {name: json.dumps(building(*PLANS[name])).encode() for name in plans}
-            plan_ids = {name: created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()}
+            light_plan_id = heaviest.created_id(light.send("POST", "/floorplans", PLAN_PATH.read_bytes()))
+            venue_id, _, member_ids = heaviest.store_venue(heavy, homes)
+            bodies = {name: json.dumps(heaviest.building(*heaviest.PLANS[name])).encode() for name in plans}
+            plan_ids = {
+                name: heaviest.created_id(heavy.send("POST", "/floorplans", body)) for name, body in bodies.items()
+            }
             preparing = lambda: heavy.send("GET", "/readyz").json()["plans_preparing"]  # noqa: E731
             harness.wait_until(lambda: not preparing(), "all plans are ready", _READY_TIMEOUT_S, 0.2)
             venue = venue_id, heavy.send("GET", f"/venues/{venue_id}").etag, member_ids
-            stored = {name: Stored.of(heavy, plan_id, *venue) for name, plan_id in plan_ids.items()}
+            stored = {name: heaviest.Stored.of(heavy, plan_id, *venue) for name, plan_id in plan_ids.items()}
         yield Template(data, keys["heavy"], keys["light"], light_plan_id, stored)
 
 
 def _new_key(data: Path, tenant: str) -> str:
     secret = new_secret()
-    store = open_store(Settings(data_dir=data))
-    try:
+    with closing(open_store(Settings(data_dir=data))) as store:
         key = store.keys.create(tenant, tenant, hash_of(secret), [str(scope) for scope in Permission])
-    finally:
-        store.close()
     return key_text(key.id, secret)
 
 
-def _groups(loads: Iterable[Load]) -> Iterator[list[Load]]:
+def _groups(loads: Iterable[heaviest.Load]) -> Iterator[list[heaviest.Load]]:
     """Yield loads that share a service: neighbours in the table that only read, and each of the others alone."""
 
-    def key(load: Load) -> Load | None:
+    def key(load: heaviest.Load) -> heaviest.Load | None:
         return None if all(route.startswith("GET ") for route in load.routes) else load
 
     for _, group in itertools.groupby(loads, key):
         yield list(group)
 
 
-def _measure(loads: Sequence[Load], template: Template, seconds: float) -> Iterator[Row]:
+def _measure(loads: Sequence[heaviest.Load], template: Template, seconds: float) -> Iterator[Row]:
     """Measure loads one after the other on a fresh service with a copy of the data folder."""
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "data"
@@ -237,7 +225,7 @@ def _measure(loads: Sequence[Load], template: Template, seconds: float) -> Itera
 class _Probe:
     """Queries of the light tenant, or its albums, one after the other."""
 
-    def __init__(self, url: str, template: Template, load: Load) -> None:
+    def __init__(self, url: str, template: Template, load: heaviest.Load) -> None:
         self._pins = load.beside_albums
         self._caller = harness.Caller(url, template.light_key)
         self._plan_id = template.light_plan_id
@@ -248,7 +236,7 @@ class _Probe:
         query = harness.example_query(next(self._numbers), self._plan_id)
         begin = time.perf_counter()
         if self._pins:
-            is_answered = bool(store_album(self._caller, self._plan_id))
+            is_answered = bool(heaviest.store_album(self._caller, self._plan_id))
         else:
             is_answered = self._caller.send("POST", "/localise", *query).status == 200
         if not is_answered:
@@ -278,10 +266,10 @@ def _latency(durations_s: Sequence[float]) -> Latency:
 
 
 @contextmanager
-def _flood(url: str, template: Template, load: Load) -> Iterator[tuple[dict[str, int], Callable[[], bool]]]:
+def _flood(url: str, template: Template, load: heaviest.Load) -> Iterator[tuple[dict[str, int], Callable[[], bool]]]:
     """Repeat a load in another process."""
     # The work itself cannot be sent to a process, so its place in the table is.
-    number = [known.work for known in LOADS].index(load.work)
+    number = [known.work for known in heaviest.LOADS].index(load.work)
     arguments = (url, template.heavy_key, number, load.size, template.stored[load.plan])
     answers: dict[str, int] = {}
     with harness.child_process(_send_flood, *arguments) as pipe:
@@ -293,9 +281,9 @@ def _flood(url: str, template: Template, load: Load) -> Iterator[tuple[dict[str,
         answers |= message
 
 
-def _send_flood(url: str, key: str, number: int, size: int, stored: Stored, pipe: Connection) -> None:
+def _send_flood(url: str, key: str, number: int, size: int, stored: heaviest.Stored, pipe: Connection) -> None:
     _lower_priority()
-    load = LOADS[number]
+    load = heaviest.LOADS[number]
     counts: Counter[int] = Counter()
     lock = threading.Lock()
 

@@ -43,7 +43,7 @@ import numpy as np
 from PIL import Image
 
 from benchmarks import harness
-from benchmarks.buildings import building_of
+from benchmarks.buildings import Building
 from examples.launch import ROOT
 from examples.truth import FOLDER, PLAN_PATH, read_poses
 from lalaloc_core.evaluate.bench.service_latency import PHONE_FIELD_DEG, phone_photograph
@@ -235,7 +235,7 @@ def _plan(name: str) -> bytes:
     """Return the example flat, or a generated office of 2,000 m²."""
     if name == "flat":
         return PLAN_PATH.read_bytes()
-    return json.dumps(building_of(VALIDATION, 3, _OFFICE_M2).plan.to_dict()).encode()
+    return json.dumps(Building(VALIDATION, 3, _OFFICE_M2).plan.to_dict()).encode()
 
 
 def _photograph(client: httpx.Client, checkout: Checkout) -> httpx.Response:

@@ -63,8 +63,8 @@ SERVICE_LAYERS = (
     # Programs of worker processes, which do not import their supervisors.
     "workers plan_files.plan_mesh",
     "decoding.decode_worker plan_files.renditions",
-    "plan_files.convert_worker",
-    "pools storage",
+    "plan_files.convert_worker storage.migrations",
+    "pools storage storage.migrations.versions",
     "grids security decoding plan_files",
     "http venues",
     "query http.middleware",

@@ -80,16 +80,12 @@ class Reproduce:
 
 def _bench(arguments: Bench) -> None:
     check_range(arguments, 1, "homes")
+    from lalaloc_core.bundle import Bundle
     from lalaloc_core.evaluate.bench.bench_groups import run_bench
+    from lalaloc_core.evaluate.bench.measured import Setting
 
-    report = run_bench(
-        arguments.bundle,
-        arguments.only,
-        homes=arguments.homes,
-        textures=arguments.textures,
-        data=arguments.data,
-        rooms=arguments.rooms,
-    )
+    folders = arguments.textures, arguments.data, arguments.rooms
+    report = run_bench(Setting(Bundle.open(arguments.bundle), arguments.homes, *folders), arguments.only)
     if arguments.out is not None:
         keep = bool(arguments.only) and arguments.out.exists()
         before = json.loads(arguments.out.read_text(encoding="utf-8")) if keep else {}

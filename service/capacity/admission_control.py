@@ -18,22 +18,14 @@ from typing import Any, Literal, TypeVar
 
 from cachetools import LRUCache
 
+from service import errors
 from service.capacity.cpu_accounts import CpuAccounts
 from service.capacity.fair_share import MAX_RATIO, FairSemaphore, Shares
-from service.errors import (
-    BytesInFlightError,
-    DeadlineExceededError,
-    ExpectedTooLateError,
-    OverloadedError,
-    ShareExceededError,
-    StoppingError,
-    UploadTooLargeError,
-)
 from service.settings import Settings
 from service.telemetry import Telemetry
 
 # Errors of every request that is no probe.
-REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
+REFUSALS = (errors.OverloadedError, errors.StoppingError, errors.DeadlineExceededError)
 _READS_AT_A_TIME = 4
 # Weight of the newest request in the running mean of durations, which sets Retry-After.
 _NEWEST = 0.1
@@ -123,7 +115,7 @@ class Slots:
         """
         begin, others = monotonic(), self._others(client)
         if others and (others + 1) * self._paces.get(client, 0.0) > 1.0:
-            raise ExpectedTooLateError(others, retry_after_s=self._retry_after_s())
+            raise errors.ExpectedTooLateError(others, retry_after_s=self._retry_after_s())
         _AWAY_S.set(0.0)
         try:
             await self._wait(client, deadline)
@@ -183,10 +175,12 @@ class Slots:
         rounds = 1.0 + self.waiting / max(self._limit, 1)
         return min(max(math.ceil(rounds * self._held_s), 1), _MAX_RETRY_AFTER_S)
 
-    def _refusal(self, client: str) -> OverloadedError:
+    def _refusal(self, client: str) -> errors.OverloadedError:
         if self.in_use < self._limit:
-            return ShareExceededError(self._slots.held_by(client), self._limit, retry_after_s=self._retry_after_s())
-        return OverloadedError(self._limit, retry_after_s=self._retry_after_s())
+            return errors.ShareExceededError(
+                self._slots.held_by(client), self._limit, retry_after_s=self._retry_after_s()
+            )
+        return errors.OverloadedError(self._limit, retry_after_s=self._retry_after_s())
 
 
 class BytesInFlight(Shares):
@@ -204,12 +198,12 @@ class BytesInFlight(Shares):
         """Take some bytes for a client, or refuse the request."""
         held, limit = self.held_by(client), self.limit_of(client)
         if count > limit:
-            raise UploadTooLargeError("upload_tenant_bytes", limit, count)
+            raise errors.UploadTooLargeError("upload_tenant_bytes", limit, count)
         if held + count > limit:
-            raise BytesInFlightError(count, "your uploads", held, limit, "LALALOC_UPLOAD_TENANT_BYTES")
+            raise errors.BytesInFlightError(count, "your uploads", held, limit, "LALALOC_UPLOAD_TENANT_BYTES")
         left = self.limit - self.in_use - count
         if left < 0 or (held and held + count > MAX_RATIO * left):
-            raise BytesInFlightError(count, "all uploads", self.in_use, self.limit, "LALALOC_UPLOAD_TOTAL_BYTES")
+            raise errors.BytesInFlightError(count, "all uploads", self.in_use, self.limit, "LALALOC_UPLOAD_TOTAL_BYTES")
         super().take(client, count)
 
 
@@ -294,7 +288,7 @@ class Admission:
     def slot_for(self, client: str, route_class: RouteClass) -> Iterator[None]:
         """Hold a slot for a request whose head has arrived, or refuse it."""
         if self.stopping:
-            raise StoppingError()
+            raise errors.StoppingError()
         if route_class.is_query:
             # Refuse before the body is read.
             self.queries.check(client)

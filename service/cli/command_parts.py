@@ -7,8 +7,8 @@ import getpass
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from datetime import timedelta
 
 from service.schemas.admin import TENANT
@@ -20,14 +20,9 @@ _UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
 _DURATION = re.compile(r"([0-9]{1,9})([dhms])", re.ASCII)
 
 
-@contextmanager
-def configured_store() -> Iterator[Store]:
+def configured_store() -> closing[Store]:
     """Open the store of the settings in the environment."""
-    store = open_store(Settings.load())
-    try:
-        yield store
-    finally:
-        store.close()
+    return closing(open_store(Settings.load()))
 
 
 def audit(store: Store, tenant: str, action: str, resource: str, **facts: object) -> None:

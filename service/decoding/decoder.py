@@ -6,7 +6,6 @@ affected. No client keeps all workers busy.
 
 from __future__ import annotations
 
-import threading
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -73,7 +72,7 @@ class Decoder:
         # Films take so long that photographs must not wait for them.
         self._film_stall_s = settings.photographs.max_film_cpu_s + _FILM_MARGIN_S
         self._films = pool("film", self._film_stall_s, settings.decode.film_workers, _FILM_QUEUE)
-        self._films_started, self._long_jobs, self._lock = False, 0, threading.Lock()
+        self._long_jobs = 0
         telemetry.gauge(
             "lalaloc_decode_queue_depth", "Photographs waiting for a decoding worker.", lambda: self._pool.waiting
         )
@@ -87,7 +86,7 @@ class Decoder:
         )
 
     def start(self) -> None:
-        """Start all workers and return at once."""
+        """Start all workers but those of films, and return at once."""
         self._pool.start()
 
     @property
@@ -151,10 +150,9 @@ class Decoder:
         # Photographs of a turn also go where films are read, on another core, if that is idle.
         is_idle = not self._long_jobs and self._films.state.ready > 0
         is_long = _is_long(job) or (is_idle and job.task == "photograph" and job.arguments[2] == "turn")
-        pool = self._started_films() if is_long else self._pool
         self._long_jobs += is_long
         try:
-            return await pool.run_job(job, max(context.left_s, 0.0), context.client)
+            return await (self._films if is_long else self._pool).run_job(job, max(context.left_s, 0.0), context.client)
         except JobLostError as error:
             raise self._error(error, job, is_long, context) from error
         except (InvalidPhotographError, InvalidFilmError) as error:
@@ -162,21 +160,10 @@ class Decoder:
         finally:
             self._long_jobs -= is_long
 
-    def _started_films(self) -> WorkerPool[DecodeJob, Any]:
-        """Return the pool of films, whose workers the first long job starts."""
-        with self._lock:
-            if not self._films_started:
-                self._films.start()
-                self._films_started = True
-        return self._films
-
     def close(self) -> None:
         """End all workers and wait for them."""
         self._pool.close()
-        with self._lock:
-            if self._films_started:
-                self._films.close()
-            self._films_started = True
+        self._films.close()
 
     def _error(self, lost: JobLostError, job: DecodeJob, is_long: bool, context: QueryContext) -> Exception:
         """Return the service's error for a lost job."""

@@ -12,16 +12,9 @@ from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import PoseGrid
+from service import errors
 from service.bounded_cache import BoundedCache
 from service.capacity.fair_share import FairSemaphore
-from service.errors import (
-    PlanFailedError,
-    PlanNotReadyError,
-    StoppingError,
-    StorageQuotaError,
-    StoreUnavailableError,
-    UnknownFloorPlanError,
-)
 from service.grids.embedding import check_size, embed, grid_bytes
 from service.grids.grid_jobs import GridJob, GridJobs
 from service.settings import Settings
@@ -76,7 +69,12 @@ class GridCache(BoundedCache[GridKey, PoseGrid]):
 # Duration and interval (s) of retries to store a finished grid.
 _KEEP_TRYING_S, _TRY_EVERY_S = 60.0, 1.0
 # Not failures of the plan.
-_ABANDONED = (UnknownFloorPlanError, PlanNotReadyError, StoppingError, StoreUnavailableError)
+_ABANDONED = (
+    errors.UnknownFloorPlanError,
+    errors.PlanNotReadyError,
+    errors.StoppingError,
+    errors.StoreUnavailableError,
+)
 # Renewals, with the progress, per length of a lease.
 _HEARTBEATS = 8.0
 # Maximum number of unfinished attempts, by any replicas, before a grid counts as failed.
@@ -146,7 +144,7 @@ class GridBuilder:
             raise self._why_cancelled(job)
         record = self._store.plans.get_by_revision(job.key.revision_id)
         if record is None:
-            raise UnknownFloorPlanError(job.plan_id)
+            raise errors.UnknownFloorPlanError(job.plan_id)
         check_size(record.plan, self._settings)
         attempts = self._store.leases.claim(job.key, self._owner, self._settings.grids.grid_lease_s)
         if attempts is None:
@@ -158,7 +156,7 @@ class GridBuilder:
             return grid
         if attempts > _MAX_ATTEMPTS:
             reason = f"its pose grid was begun {_MAX_ATTEMPTS} times and never finished"
-            raise PlanFailedError(job.plan_id, reason)
+            raise errors.PlanFailedError(job.plan_id, reason)
         # Small grids that interrupt this one are charged to the same client.
         with self._telemetry.cpu_accounts.charged(record.tenant):
             with self._telemetry.grid_seconds.time():
@@ -167,8 +165,8 @@ class GridBuilder:
                 prototypes = SortedPrototypes.of_grid(grid, record.plan)
         try:
             if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
-                raise UnknownFloorPlanError(job.plan_id)
-        except StorageQuotaError:
+                raise errors.UnknownFloorPlanError(job.plan_id)
+        except errors.StorageQuotaError:
             if not job.on_demand:
                 raise
             # Queries can use the grid without its being stored.
@@ -212,16 +210,16 @@ class GridBuilder:
 
     def _why_cancelled(self, job: GridJob) -> Exception:
         if self.jobs.closing.is_set():
-            return StoppingError()
+            return errors.StoppingError()
         if not self._store.plans.has_revision(job.key.revision_id):
-            return UnknownFloorPlanError(job.plan_id)
+            return errors.UnknownFloorPlanError(job.plan_id)
         # The plan has a new revision, which the next query finds.
-        return PlanNotReadyError(job.plan_id, 0.0, 0.0)
+        return errors.PlanNotReadyError(job.plan_id, 0.0, 0.0)
 
     def _renew(self, job: GridJob) -> bool:
         try:
             return self._store.leases.renew(job.key, self._owner, self._settings.grids.grid_lease_s, job.progress)
-        except StoreUnavailableError:
+        except errors.StoreUnavailableError:
             # No other replica can take the lease during the outage either.
             return True
 
@@ -233,7 +231,7 @@ class GridBuilder:
                 return self._store.grids.put(
                     job.key, grid, keep=_MAX_GRIDS_PER_PLAN, always_keep_mm=always_keep_mm, prototypes=prototypes
                 )
-            except StoreUnavailableError:
+            except errors.StoreUnavailableError:
                 if monotonic() > give_up_at or job.cancelled.wait(_TRY_EVERY_S):
                     raise
 
@@ -254,6 +252,6 @@ class GridBuilder:
 
 def _reason(error: Exception) -> str:
     """Return the error of a failed grid as a text for users; unexpected errors are not disclosed."""
-    if isinstance(error, PlanFailedError):
+    if isinstance(error, errors.PlanFailedError):
         return error.reason
     return str(error) if isinstance(error, LaLaLocError) else "internal error"

@@ -10,20 +10,13 @@ jobs hold cores like queries.
 from __future__ import annotations
 
 import asyncio
-import threading
 from concurrent.futures import Future, wait
 from typing import NoReturn
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, OnStep
-from service.errors import (
-    ConverterNotReadyError,
-    DamagedDataError,
-    DeadlineExceededError,
-    OverloadedError,
-    StoppingError,
-)
+from service import errors
 from service.plan_documents import LARGE, PREDICTIONS, PackedPlan, PlanDocument, Rendition, RenditionJob, RenditionKind
 from service.plan_files.convert_worker import (
     ConversionJob,
@@ -55,26 +48,38 @@ class Converter:
     """Pool of conversion workers with a bounded queue. Thread-safe."""
 
     def __init__(self, settings: Settings, telemetry: Telemetry) -> None:
-        self._settings, self._telemetry = settings, telemetry
-        self._pool: _Pool | None = None
-        self._predicting: _Pool | None = None
-        self._lock, self._closed = threading.Lock(), False
+        self._settings = settings
+
+        def pool(name: str, workers: int, stall_s: float, nice: int = 0) -> _Pool:
+            arguments = (settings.plans.import_limits, settings.imports.memory_bytes)
+            return WorkerPool(
+                WorkerSpec(name, run_converter, arguments, stall_s=stall_s, nice=nice),
+                workers=workers,
+                queue_limit=_QUEUE,
+                keep_spare=name == "import",
+                accounts=telemetry.cpu_accounts,
+                on_restart=lambda _reason: telemetry.pool_restarts.labels(name).inc(),
+            )
+
+        stall_s = settings.plans.max_import_s + _STALL_MARGIN_S
+        self._importing = pool("import", settings.imports.workers, stall_s, _NICE)
+        self._predicting = pool("prediction", 1, _PREDICTION_S)
+        self._pools = self._importing, self._predicting
         telemetry.gauge(
-            "lalaloc_import_queue_depth", "Plan files waiting for a worker.", lambda: self._count("waiting")
+            "lalaloc_import_queue_depth",
+            "Plan files waiting for a worker.",
+            lambda: sum(pool.waiting for pool in self._pools),
         )
         telemetry.gauge(
             "lalaloc_import_workers_resident_bytes",
             "Memory of all import workers.",
-            lambda: self._count("resident_bytes"),
+            lambda: sum(pool.resident_bytes for pool in self._pools),
         )
 
     @property
     def state(self) -> PoolState:
         """Number of workers wanted and ready; no worker is ready before the first file."""
-        pool = self._pool
-        if pool is None:
-            return PoolState(workers=self._settings.imports.workers, ready=0, warmed_up=False, fault=None)
-        return pool.state
+        return self._importing.state
 
     def read(
         self,
@@ -108,7 +113,7 @@ class Converter:
             result = self._run(ParseJob(document), _PARSE_S)
         except JobLostError:
             return document.plan()
-        except (DamagedDataError, InvalidFloorPlanError):
+        except (errors.DamagedDataError, InvalidFloorPlanError):
             return None
         assert isinstance(result, PackedPlan)
         return result.plan()
@@ -117,8 +122,8 @@ class Converter:
         """Queue a file that is made from a stored plan. Blocks while the plan is copied."""
         try:
             if job.kind in PREDICTIONS:
-                return self._running_pool(predicts=True).submit(job, _PREDICTION_S, client)
-            return self._running_pool().submit(job, self._settings.plans.import_deadline_s, client)
+                return self._predicting.submit(job, _PREDICTION_S, client)
+            return self._importing.submit(job, self._settings.plans.import_deadline_s, client)
         except JobLostError as error:
             self._raise_lost(error)
 
@@ -131,61 +136,26 @@ class Converter:
         except (TimeoutError, JobLostError) as error:
             lost = error if isinstance(error, JobLostError) else JobLostError("deadline")
             if predicts and lost.reason not in ("not-ready", "closing"):
-                raise DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
+                raise errors.DeadlineExceededError(_PREDICTION_S, "the localisability was not predicted") from error
             self._raise_lost(lost)
         assert isinstance(result, Rendition)
         return result
 
     def close(self) -> None:
         """Stop all workers and wait for them."""
-        with self._lock:
-            self._closed = True
-        for pool in (self._pool, self._predicting):
-            if pool is not None:
-                pool.close()
+        for pool in self._pools:
+            pool.close()
 
     def _run(
         self, job: ConversionJob, limit_s: float, client: str = "", on_step: OnStep | None = None
     ) -> ConversionResult:
         """Run a job of the imports, and wait for it; `on_step` is called with its news."""
-        future = self._running_pool().submit(job, limit_s, client, on_step or (lambda _step: None))
+        future = self._importing.submit(job, limit_s, client, on_step or (lambda _step: None))
         done, _ = wait([future], limit_s)
         if not done:
             future.cancel()
             raise JobLostError("deadline")
         return future.result()
-
-    def _running_pool(self, *, predicts: bool = False) -> _Pool:
-        """Return the pool of imports or predictions; the first call starts it."""
-        with self._lock:
-            if self._closed:
-                raise JobLostError("closing")
-            settings = self._settings
-            if predicts:
-                if self._predicting is None:
-                    self._predicting = self._started("prediction", workers=1, stall_s=_PREDICTION_S)
-                return self._predicting
-            if self._pool is None:
-                stall_s = settings.plans.max_import_s + _STALL_MARGIN_S
-                self._pool = self._started("import", workers=settings.imports.workers, stall_s=stall_s, nice=_NICE)
-            return self._pool
-
-    def _started(self, name: str, *, workers: int, stall_s: float, nice: int = 0) -> _Pool:
-        settings = self._settings
-        arguments = (settings.plans.import_limits, settings.imports.memory_bytes)
-        pool: _Pool = WorkerPool(
-            WorkerSpec(name, run_converter, arguments, stall_s=stall_s, nice=nice),
-            workers=workers,
-            queue_limit=_QUEUE,
-            keep_spare=name == "import",
-            accounts=self._telemetry.cpu_accounts,
-            on_restart=lambda _reason: self._telemetry.pool_restarts.labels(name).inc(),
-        )
-        pool.start()
-        return pool
-
-    def _count(self, name: str) -> float:
-        return sum(getattr(pool, name) for pool in (self._pool, self._predicting) if pool is not None)
 
     def _raise_lost(self, error: JobLostError) -> NoReturn:
         settings = self._settings
@@ -205,12 +175,12 @@ class Converter:
                     "the file is damaged or has an unsupported structure; save it again, or in another format"
                 ) from error
             case "queue-full":
-                raise OverloadedError(_QUEUE) from error
+                raise errors.OverloadedError(_QUEUE) from error
             case "not-ready" | "stopped":
-                raise ConverterNotReadyError from error
+                raise errors.ConverterNotReadyError from error
             case "closing":
-                raise StoppingError from error
+                raise errors.StoppingError from error
             case "deadline" | "died":
-                raise DeadlineExceededError(
+                raise errors.DeadlineExceededError(
                     settings.plans.import_deadline_s, "the plan file was not read or written"
                 ) from error

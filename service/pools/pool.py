@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import pickle
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
@@ -50,7 +51,7 @@ class _Parts:
 
 
 class WorkerPool(Generic[Job, Result]):
-    """Bounded queue in front of supervised workers; safe to use from any thread.
+    """Bounded queue in front of supervised workers, which the first job starts; safe to use from any thread.
 
     Args:
         spec: program of the workers.
@@ -79,11 +80,16 @@ class WorkerPool(Generic[Job, Result]):
         self._cores = cores
         self._supervisors = [Supervisor(spec, index, self._queue, on_restart) for index in range(workers)]
         self._submitting = ThreadPoolExecutor(_SUBMITTING_THREADS, thread_name_prefix=f"{spec.name}-submit")
+        self._begun, self._lock = False, threading.Lock()
 
     def start(self) -> None:
-        """Start all workers and return at once; `state` tells when they are warm."""
-        for supervisor in self._supervisors:
-            supervisor.start()
+        """Start all workers, if that was not done, and return at once; `state` tells when they are warm."""
+        with self._lock:
+            if self._begun or self._queue.closed:
+                return
+            self._begun = True
+            for supervisor in self._supervisors:
+                supervisor.start()
 
     @property
     def state(self) -> PoolState:
@@ -116,6 +122,7 @@ class WorkerPool(Generic[Job, Result]):
         The future has the result, the error of the job, or a `JobLostError`, and can be done later than the deadline. A
         job that cannot be run in time raises that error.
         """
+        self.start()
         content = _Parts()
         pickle.Pickler(content, protocol=pickle.HIGHEST_PROTOCOL).dump(job)
         pending = PendingJob(content.parts, content.digest.digest(), monotonic() + timeout_s, client, on_news)
@@ -146,7 +153,9 @@ class WorkerPool(Generic[Job, Result]):
         """End all workers and wait for them: running jobs have `drain_s` (s) to finish, waiting jobs are lost."""
         self._queue.close()
         deadline = monotonic() + drain_s
-        for supervisor in self._supervisors:
+        with self._lock:
+            begun = self._supervisors if self._begun else []
+        for supervisor in begun:
             supervisor.stop(deadline)
         self._submitting.shutdown()
 

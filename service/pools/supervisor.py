@@ -78,6 +78,7 @@ class Supervisor:
 
     def start(self) -> None:
         """Start the thread, and with it the worker."""
+        self._starts_at = monotonic()
         self._thread.start()
 
     @property

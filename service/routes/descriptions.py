@@ -8,15 +8,7 @@ from fastapi import Response, status
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
-from lalaloc_core.errors import (
-    ForeignFeaturesError,
-    InvalidFeaturesError,
-    InvalidFloorPlanError,
-    InvalidPhotographError,
-    InvalidPoseError,
-    MissingExtraError,
-    SeveralLevelsError,
-)
+from lalaloc_core import errors as core
 from service import errors
 from service.http.events import EventStream
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
@@ -41,9 +33,9 @@ STORE_ERRORS: Errors = (errors.StoreUnavailableError, errors.StoreFullError, err
 IDEMPOTENCY_ERRORS: Errors = (errors.IdempotencyKeyReusedError, errors.IdempotencyInProgressError)
 # Errors of uploading a plan file.
 UPLOAD_ERRORS: Errors = (
-    InvalidFloorPlanError,
-    SeveralLevelsError,
-    MissingExtraError,
+    core.InvalidFloorPlanError,
+    core.SeveralLevelsError,
+    core.MissingExtraError,
     errors.InvalidRequestError,
     errors.PlanTooLargeError,
     *BODY_ERRORS,
@@ -58,11 +50,11 @@ PLACE_ERRORS: Errors = (
     errors.UnknownFloorPlanError,
 )
 QUERY_ERRORS: Errors = (
-    InvalidPhotographError,
-    InvalidFeaturesError,
-    ForeignFeaturesError,
+    core.InvalidPhotographError,
+    core.InvalidFeaturesError,
+    core.ForeignFeaturesError,
     errors.FeaturesRequiredError,
-    InvalidPoseError,
+    core.InvalidPoseError,
     errors.InvalidRequestError,
     errors.PlanFailedError,
     errors.PlanNotReadyError,
@@ -76,7 +68,7 @@ QUERY_ERRORS: Errors = (
 
 # Errors of beginning something that lasts, such as a session, in a plan or venue.
 BEGIN_ERRORS: Errors = (
-    InvalidPoseError,
+    core.InvalidPoseError,
     errors.InvalidRequestError,
     *BODY_ERRORS,
     *STORE_ERRORS,

@@ -13,25 +13,16 @@ from service.capacity.fair_share import max_per_client
 from service.errors import StoreUnavailableError
 from service.http.problems import problem_responses
 from service.routes.dependencies import Call, Running
-from service.schemas.service_state import (
-    BytesInFlightAnswer,
-    HealthAnswer,
-    LimitsAnswer,
-    PoolAnswer,
-    ReadyAnswer,
-    StoredBytesAnswer,
-    StoredBytesByKind,
-    UsageAnswer,
-)
+from service.schemas import service_state as schemas
 
 router = APIRouter(tags=["operations"])
 
 
 @router.get("/healthz", summary="Check liveness")
 @admitted_as(PROBE)
-async def get_health() -> HealthAnswer:
+async def get_health() -> schemas.HealthAnswer:
     """Return `ok` while the process runs."""
-    return HealthAnswer(status="ok")
+    return schemas.HealthAnswer(status="ok")
 
 
 @router.get(
@@ -39,13 +30,13 @@ async def get_health() -> HealthAnswer:
     summary="Check readiness",
     responses={
         503: {
-            "model": ReadyAnswer,
+            "model": schemas.ReadyAnswer,
             "description": "LPO or decoder processes are still starting, or the service is stopping.",
         }
     },
 )
 @admitted_as(PROBE)
-async def get_readiness(runtime: Running, response: Response) -> ReadyAnswer:
+async def get_readiness(runtime: Running, response: Response) -> schemas.ReadyAnswer:
     """Return 200 once the model and all workers are ready, and 503 before that and while the service stops.
 
     Replacing a worker later does not make the service unready: queries wait, or keep the VDR pose.
@@ -53,12 +44,12 @@ async def get_readiness(runtime: Running, response: Response) -> ReadyAnswer:
     if not runtime.ready:
         response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
         response.headers["Retry-After"] = "1"
-    return ReadyAnswer(
+    return schemas.ReadyAnswer(
         ready=runtime.ready,
         model=runtime.localiser.model,
-        lpo_pool=PoolAnswer(**asdict(runtime.optimiser.state)),
-        decode_pool=PoolAnswer(**asdict(runtime.decoder.state)),
-        import_pool=PoolAnswer(**asdict(runtime.converter.state)),
+        lpo_pool=schemas.PoolAnswer(**asdict(runtime.optimiser.state)),
+        decode_pool=schemas.PoolAnswer(**asdict(runtime.decoder.state)),
+        import_pool=schemas.PoolAnswer(**asdict(runtime.converter.state)),
         database=runtime.store.database.state,
         plans_preparing=runtime.grids.preparing,
     )
@@ -78,7 +69,7 @@ async def get_metrics(runtime: Running) -> Response:
 
 
 @router.get("/limits", summary="Get the limits")
-async def get_limits(runtime: Running) -> LimitsAnswer:
+async def get_limits(runtime: Running) -> schemas.LimitsAnswer:
     """Return the limits of this service; an error about a limit names it."""
     settings = runtime.settings
     # Resolved, because 0 leaves these numbers to the service.
@@ -87,20 +78,20 @@ async def get_limits(runtime: Running) -> LimitsAnswer:
         "max_queries_per_tenant": max_per_client(settings.query_limit),
         "max_pending_requests": settings.pending_limit,
     }
-    named = {name: settings.value(name) for name in LimitsAnswer.model_fields.keys() - resolved.keys()}
-    return LimitsAnswer(**named, **resolved)
+    named = {name: settings.value(name) for name in schemas.LimitsAnswer.model_fields.keys() - resolved.keys()}
+    return schemas.LimitsAnswer(**named, **resolved)
 
 
 @router.get("/usage", summary="Get the tenant's usage", responses=problem_responses(StoreUnavailableError))
-def get_usage(call: Call) -> UsageAnswer:
+def get_usage(call: Call) -> schemas.UsageAnswer:
     """Return what the tenant of the API key uses, with its limits."""
     account = call.store.quota.account(call.tenant)
-    stored = StoredBytesAnswer(
-        used=account.used.total, limit=account.limit, by_kind=StoredBytesByKind(**asdict(account.used))
+    stored = schemas.StoredBytesAnswer(
+        used=account.used.total, limit=account.limit, by_kind=schemas.StoredBytesByKind(**asdict(account.used))
     )
     admission, client = call.runtime.admission, call.client
-    in_flight = BytesInFlightAnswer(
+    in_flight = schemas.BytesInFlightAnswer(
         used=admission.bytes_in_flight.held_by(client), limit=admission.bytes_in_flight.limit_of(client)
     )
     cpu_s = round(admission.cpu_accounts.total_s(client), 3)
-    return UsageAnswer(tenant=call.tenant, stored_bytes=stored, bytes_in_flight=in_flight, cpu_seconds=cpu_s)
+    return schemas.UsageAnswer(tenant=call.tenant, stored_bytes=stored, bytes_in_flight=in_flight, cpu_seconds=cpu_s)

@@ -30,25 +30,14 @@ from service.routes.descriptions import (
     stores,
 )
 from service.routes.plan_uploads import LEVELS_FORM, PlanUpload, answer_import, prepare_levels, read_upload
+from service.schemas import venues as schemas
 from service.schemas.plan_import import LevelsForm
-from service.schemas.venues import (
-    VenueAnchorAnswer,
-    VenueAnchorDocument,
-    VenueAnswer,
-    VenueChangeDocument,
-    VenueDocument,
-    VenueList,
-    VenuePlanAnswer,
-    VenuePlanDocument,
-    VenuePlanList,
-    VenueSummary,
-)
 from service.storage.records import NewPlan, PlanRecord, VenueMember, VenuePlace, VenueRecord
 from service.uploaded_file import UploadedFile
 
 router = APIRouter(prefix="/venues", tags=["venues"])
 
-DocumentT = TypeVar("DocumentT", VenueDocument, VenueChangeDocument)
+DocumentT = TypeVar("DocumentT", schemas.VenueDocument, schemas.VenueChangeDocument)
 # Name of a venue of levels, if neither its file nor the request has one.
 _DEFAULT_NAME = "venue"
 # Lists, objects and further items of a venue document, besides those of its plans.
@@ -59,12 +48,12 @@ _FURTHER_VALUES = 1000
     "",
     summary="Create a venue",
     **stores(
-        VenueAnswer,
-        json_body(VenueDocument, **{MULTIPART: LEVELS_FORM}),
+        schemas.VenueAnswer,
+        json_body(schemas.VenueDocument, **{MULTIPART: LEVELS_FORM}),
         *UPLOAD_ERRORS,
         errors.TooManyFloorPlansError,
         errors.TooManyVenuesError,
-        lines=import_lines(VenueAnswer),
+        lines=import_lines(schemas.VenueAnswer),
     ),
 )
 async def create_venue(call: Call) -> Response:
@@ -81,7 +70,7 @@ async def create_venue(call: Call) -> Response:
     content = await call.read_json()
 
     def store(token: str) -> Response:
-        document = _document(VenueDocument, content.read(), call)
+        document = _document(schemas.VenueDocument, content.read(), call)
         members, anchor = _members(document.plans, call), _anchor(document.anchor)
         add = call.store.venues.add
         record = add(call.tenant, token, document.name, anchor, members, limit=limits.max_venues)
@@ -102,13 +91,13 @@ def _create_of_levels(call: ApiCall, uploaded: PlanUpload, token: str, on_step: 
 
 
 @router.get("", summary="List venues", responses=problem_responses(*READ_ERRORS))
-def list_venues(call: Call, page: Page, name: Name = None) -> VenueList:
+def list_venues(call: Call, page: Page, name: Name = None) -> schemas.VenueList:
     """List stored venues, newest first."""
     found, more = page.read(partial(call.store.venues.list_venues, call.tenant, name=name))
-    return VenueList(venues=[_summary(record) for record in found], next_cursor=more)
+    return schemas.VenueList(venues=[_summary(record) for record in found], next_cursor=more)
 
 
-@router.get("/{venue_id}", summary="Get a venue", **reads(VenueAnswer, errors.UnknownVenueError))
+@router.get("/{venue_id}", summary="Get a venue", **reads(schemas.VenueAnswer, errors.UnknownVenueError))
 def get_venue(venue_id: str, call: Call) -> Response:
     """Return a stored venue with the number of plans that are ready."""
     return call.representation(*json_with_etag(_answer(call.venue(venue_id), call)))
@@ -126,22 +115,22 @@ def list_venue_plans(
     level: Annotated[
         float | None, Query(ge=-1000, le=1000, allow_inf_nan=False, description="Level of the plans.")
     ] = None,
-) -> VenuePlanList:
+) -> schemas.VenuePlanList:
     """List the plans of a venue from the lowest level up, with the state of their pose grids.
 
     Paging returns every plan that stays in the venue on the same level exactly once.
     """
     find = partial(call.store.venues.plans, call.venue(venue_id).id, level=level)
     found, more = page.read(find, lambda member: VenuePlace(member.level, member.plan_id), parse_venue_cursor)
-    return VenuePlanList(plans=_plan_entries(found, call), next_cursor=more)
+    return schemas.VenuePlanList(plans=_plan_entries(found, call), next_cursor=more)
 
 
 @router.put(
     "/{venue_id}",
     summary="Replace a venue",
     **changes(
-        VenueAnswer,
-        json_body(VenueDocument),
+        schemas.VenueAnswer,
+        json_body(schemas.VenueDocument),
         errors.InvalidRequestError,
         *BODY_ERRORS,
         *STORE_ERRORS,
@@ -151,18 +140,18 @@ def list_venue_plans(
 async def replace_venue(venue_id: str, call: Call) -> Response:
     """Replace the name, anchor and plans of a venue; fields that are left out are reset."""
 
-    def values(document: VenueDocument) -> dict[str, Any]:
+    def values(document: schemas.VenueDocument) -> dict[str, Any]:
         return {"name": document.name, "drop_anchor": document.anchor is None, "replace_members": True}
 
-    return await call.upload(_change, venue_id, call, await call.read_json(), VenueDocument, values)
+    return await call.upload(_change, venue_id, call, await call.read_json(), schemas.VenueDocument, values)
 
 
 @router.patch(
     "/{venue_id}",
     summary="Change a venue",
     **changes(
-        VenueAnswer,
-        json_body(VenueChangeDocument, **{MULTIPART: LEVELS_FORM}),
+        schemas.VenueAnswer,
+        json_body(schemas.VenueChangeDocument, **{MULTIPART: LEVELS_FORM}),
         *UPLOAD_ERRORS,
         errors.UnknownVenueError,
         errors.TooManyFloorPlansError,
@@ -178,7 +167,7 @@ async def change_venue(venue_id: str, call: Call) -> Response:
     if media_type(call.request, (JSON, MULTIPART)) == MULTIPART:
         return await _add_levels(venue_id, call)
 
-    def values(document: VenueChangeDocument) -> dict[str, Any]:
+    def values(document: schemas.VenueChangeDocument) -> dict[str, Any]:
         given = document.model_fields_set
         if not given:
             raise errors.InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
@@ -188,7 +177,7 @@ async def change_venue(venue_id: str, call: Call) -> Response:
             "removed": _removed(document),
         }
 
-    return await call.upload(_change, venue_id, call, await call.read_json(), VenueChangeDocument, values)
+    return await call.upload(_change, venue_id, call, await call.read_json(), schemas.VenueChangeDocument, values)
 
 
 def _change(
@@ -257,11 +246,11 @@ def _document(model: type[Model], content: bytes, call: ApiCall) -> Model:
     return parse_document(model, content, 5 * call.settings.plans.max_venue_plans + _FURTHER_VALUES)
 
 
-def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
+def _anchor(document: schemas.VenueAnchorDocument | None) -> Anchor | None:
     return None if document is None else Anchor(**document.model_dump())
 
 
-def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
+def _members(documents: list[schemas.VenuePlanDocument], call: ApiCall) -> list[VenueMember]:
     limit = call.settings.plans.max_venue_plans
     if len(documents) > limit:
         fault = f"has {len(documents)} floor plans; the limit is {limit} (LALALOC_MAX_VENUE_PLANS)"
@@ -276,7 +265,7 @@ def _members(documents: list[VenuePlanDocument], call: ApiCall) -> list[VenueMem
     return [VenueMember(document.floorplan_id, document.level, document.name) for document in documents]
 
 
-def _removed(document: VenueChangeDocument) -> set[str]:
+def _removed(document: schemas.VenueChangeDocument) -> set[str]:
     removed = set(document.remove)
     if both := removed & {plan.floorplan_id for plan in document.plans}:
         fault = f"has floor plan '{min(both)[:64]}', which is also in plans; give it in one of them"
@@ -290,21 +279,21 @@ def _change_answer(call: ApiCall, record: VenueRecord, *, created: bool) -> Resp
     return call.change_answer(*json_with_etag(_answer(record, call)), path, created=created)
 
 
-def _summary(record: VenueRecord) -> VenueSummary:
-    return VenueSummary(
+def _summary(record: VenueRecord) -> schemas.VenueSummary:
+    return schemas.VenueSummary(
         id=record.id,
         revision=record.revision_id,
         name=record.name,
-        anchor=None if record.anchor is None else VenueAnchorAnswer(**asdict(record.anchor)),
+        anchor=None if record.anchor is None else schemas.VenueAnchorAnswer(**asdict(record.anchor)),
         plans=record.plans,
         created_at=record.created_at,
         updated_at=record.updated_at,
     )
 
 
-def _answer(record: VenueRecord, call: ApiCall) -> VenueAnswer:
+def _answer(record: VenueRecord, call: ApiCall) -> schemas.VenueAnswer:
     counts = call.runtime.venue_plans.counts(record.tenant, record.id)
-    return VenueAnswer(
+    return schemas.VenueAnswer(
         **_summary(record).model_dump(),
         revision_number=record.revision,
         plans_ready=counts.ready,
@@ -312,13 +301,13 @@ def _answer(record: VenueRecord, call: ApiCall) -> VenueAnswer:
     )
 
 
-def _plan_entries(members: list[VenueMember], call: ApiCall) -> list[VenuePlanAnswer]:
+def _plan_entries(members: list[VenueMember], call: ApiCall) -> list[schemas.VenuePlanAnswer]:
     """Return the plans of a venue; a plan that was just deleted is left out."""
     summaries = call.store.plans.summaries([member.plan_id for member in members])
     states = dict(zip([summary.id for summary in summaries], call.runtime.grids.states(summaries), strict=True))
     by_id = {summary.id: summary for summary in summaries}
     return [
-        VenuePlanAnswer(
+        schemas.VenuePlanAnswer(
             floorplan_id=member.plan_id,
             revision=by_id[member.plan_id].revision_id,
             level=member.level,

@@ -14,22 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any, Literal, TypeVar
 
-from sqlalchemy import (
-    Column,
-    ColumnElement,
-    Connection,
-    Double,
-    Engine,
-    Row,
-    and_,
-    cast,
-    create_engine,
-    event,
-    extract,
-    func,
-    literal,
-    or_,
-)
+import sqlalchemy as sa
+from sqlalchemy import event
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
@@ -70,7 +56,7 @@ class Database:
     def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0) -> None:
         parsed = _parsed(url)
         self.is_postgresql = parsed.get_backend_name() == "postgresql"
-        self._engine = create_engine(
+        self._engine = sa.create_engine(
             parsed,
             pool_size=connections,
             max_overflow=0,
@@ -89,10 +75,10 @@ class Database:
             event.listen(self._engine, "connect", _prepare_sqlite)
             event.listen(self._engine, "connect", self._note_file)
             event.listen(self._engine, "begin", _begin_sqlite)
-        self.engine_for_writing: Engine = self._engine.execution_options(**{_WRITER: True})
+        self.engine_for_writing: sa.Engine = self._engine.execution_options(**{_WRITER: True})
         # Reads in one transaction see one snapshot; on SQLite they do so anyway.
         snapshot = {"isolation_level": "REPEATABLE READ"} if self.is_postgresql else {}
-        self._engine_for_reading: Engine = self._engine.execution_options(**snapshot)
+        self._engine_for_reading: sa.Engine = self._engine.execution_options(**snapshot)
         self._answered_s = self._failed_s = -float("inf")
         self._is_damaged = False
 
@@ -108,17 +94,17 @@ class Database:
         self._engine.dispose()
 
     @contextmanager
-    def reading(self) -> Iterator[Connection]:
+    def reading(self) -> Iterator[sa.Connection]:
         """Run a read-only transaction, which sees the database as of its first statement."""
         with self._transaction(self._engine_for_reading) as connection:
             yield connection
 
-    def rows(self, query: Any) -> Sequence[Row[Any]]:
+    def rows(self, query: Any) -> Sequence[sa.Row[Any]]:
         """Return the rows of a query, in a transaction of its own."""
         with self.reading() as connection:
             return connection.execute(query).all()
 
-    def row(self, query: Any) -> Row[Any] | None:
+    def row(self, query: Any) -> sa.Row[Any] | None:
         """Return the only row of a query, or None; as `rows`."""
         with self.reading() as connection:
             return connection.execute(query).one_or_none()
@@ -129,7 +115,7 @@ class Database:
             return connection.scalar(query)
 
     @contextmanager
-    def writing(self, *, grows_by: int = 0) -> Iterator[Connection]:
+    def writing(self, *, grows_by: int = 0) -> Iterator[sa.Connection]:
         """Run a writing transaction; on SQLite it waits for other writers when it begins, not half-way through.
 
         `grows_by` is about the size of the stored data; 0 for changes that store little.
@@ -146,7 +132,7 @@ class Database:
                 self._disk.check(connection, grows_by)
             yield connection
 
-    def freeing(self, work: Callable[[Connection], Result]) -> Result:
+    def freeing(self, work: Callable[[sa.Connection], Result]) -> Result:
         """Run a transaction that deletes data; on a full disk it uses the reserve.
 
         `work` is called again after a failure for lack of space.
@@ -188,19 +174,19 @@ class Database:
         with self._driver_cursor() as cursor:
             cursor.execute("VACUUM")
 
-    def now_s(self) -> ColumnElement[float]:
+    def now_s(self) -> sa.ColumnElement[float]:
         """Return the seconds since 1970 by the clock that all replicas share: PostgreSQL's, or this machine's."""
         if self.is_postgresql:
-            return cast(extract("epoch", func.clock_timestamp()), Double)
-        return literal(time.time())
+            return sa.cast(sa.extract("epoch", sa.func.clock_timestamp()), sa.Double)
+        return sa.literal(time.time())
 
-    def is_live(self, until_s: Column[float], length_s: Column[float]) -> ColumnElement[bool]:
+    def is_live(self, until_s: sa.Column[float], length_s: sa.Column[float]) -> sa.ColumnElement[bool]:
         """Return the condition that a lease holds; an end too far in the future comes from a clock that was ahead.
 
         The end is by `now_s`; where the length (s) is NULL, no end is too far.
         """
         now_s = self.now_s()
-        return and_(until_s > now_s, or_(length_s.is_(None), until_s <= now_s + length_s + _CLOCK_SLACK_S))
+        return sa.and_(until_s > now_s, sa.or_(length_s.is_(None), until_s <= now_s + length_s + _CLOCK_SLACK_S))
 
     def answered_since(self, moment_s: float) -> bool:
         """Tell whether a transaction was completed after a moment (`monotonic`)."""
@@ -233,7 +219,7 @@ class Database:
             raise StoreUnavailableError("the database file was removed or replaced: restart the service")
 
     @contextmanager
-    def _transaction(self, engine: Engine) -> Iterator[Connection]:
+    def _transaction(self, engine: sa.Engine) -> Iterator[sa.Connection]:
         begin_s = time.monotonic()
         self._check_file()
         try:
@@ -337,7 +323,7 @@ def _set_pragma(cursor: sqlite3.Cursor, pragma: str) -> None:
         time.sleep(_PRAGMA_PAUSE_S)
 
 
-def _begin_sqlite(connection: Connection) -> None:
+def _begin_sqlite(connection: sa.Connection) -> None:
     # A reader that becomes a writer fails if another was faster; a transaction that begins as a writer waits its turn.
     writer = connection.get_execution_options().get(_WRITER, False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writer else "BEGIN")

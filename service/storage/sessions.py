@@ -12,13 +12,7 @@ from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import Connection, Row, and_, delete, select, update
 
-from service.errors import (
-    PhotographOutOfOrderError,
-    SessionBusyError,
-    SessionOutdatedError,
-    TooManySessionsError,
-    UnknownSessionError,
-)
+from service import errors
 from service.storage.database import Database
 from service.storage.records import PlanRecord, VenueRecord
 from service.storage.statements import count_rows, lock_place
@@ -89,7 +83,7 @@ class Sessions:
                 return _record(row)
             freed = deleted_bytes(connection, delete(SESSIONS).where(own, _COLUMNS.expires_at < now))
             if count_rows(connection, SESSIONS, own) >= limit:
-                raise TooManySessionsError(limit)
+                raise errors.TooManySessionsError(limit)
             row = connection.execute(SESSIONS.insert().values(values).returning(SESSIONS)).one()
             self._quota.settle(connection, tenant, StoredBytes(sessions=size - freed))
         return _record(row)
@@ -122,10 +116,10 @@ class Sessions:
             row = taken.one_or_none()
             if row is None:
                 self._find(connection, tenant, session_id)
-                raise SessionBusyError(session_id)
+                raise errors.SessionBusyError(session_id)
             if number is not None and number != row.photographs + 1:
                 # Rolls the claim back.
-                raise PhotographOutOfOrderError(session_id, number, row.photographs + 1)
+                raise errors.PhotographOutOfOrderError(session_id, number, row.photographs + 1)
             return _record(row)
 
     def finish(self, record: SessionRecord, token: str, state: bytes, pose: str, *, ttl_s: float) -> SessionRecord:
@@ -135,9 +129,11 @@ class Sessions:
         with self._database.writing(grows_by=size) as connection:
             row = connection.execute(select(SESSIONS).where(*own).with_for_update()).one_or_none()
             if row is None:
-                raise UnknownSessionError(record.id)
+                raise errors.UnknownSessionError(record.id)
             if row.claim != record.claim:
-                raise SessionOutdatedError(record.id, "the photograph took too long, and another one was answered")
+                raise errors.SessionOutdatedError(
+                    record.id, "the photograph took too long, and another one was answered"
+                )
             values = {
                 "state": state,
                 "pose": pose,
@@ -170,7 +166,7 @@ class Sessions:
         wanted = _COLUMNS.tenant == tenant, _COLUMNS.id == session_id, _COLUMNS.expires_at >= datetime.now(UTC)
         row = connection.execute(select(SESSIONS).where(*wanted)).one_or_none()
         if row is None:
-            raise UnknownSessionError(session_id)
+            raise errors.UnknownSessionError(session_id)
         return row
 
 

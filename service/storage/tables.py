@@ -4,374 +4,316 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from sqlalchemy import (
-    BigInteger,
-    Column,
-    DateTime,
-    Dialect,
-    Double,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    Text,
-    UniqueConstraint,
-)
+import sqlalchemy as sa
 from sqlalchemy.types import TypeDecorator
 
-METADATA = MetaData()
+from service.storage.migrations import chunk, counter, optional, owned, part_of, required
+
+METADATA = sa.MetaData()
 
 
 class UtcDateTime(TypeDecorator[datetime]):
     """Time in UTC; SQLite drops the time zone, and PostgreSQL can return another one."""
 
-    impl = DateTime(timezone=True)
+    impl = sa.DateTime(timezone=True)
     cache_ok = True
 
-    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+    def process_bind_param(self, value: datetime | None, dialect: sa.Dialect) -> datetime | None:
         """Convert a time for the database."""
         return None if value is None else value.astimezone(UTC)
 
-    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+    def process_result_value(self, value: datetime | None, dialect: sa.Dialect) -> datetime | None:
         """Convert a time from the database."""
         if value is None:
             return None
         return value.astimezone(UTC) if value.tzinfo else value.replace(tzinfo=UTC)
 
 
-def _stored_bytes() -> Column[int]:
-    """Return the column of a row's stored bytes (`stored_bytes.py`); 0 if an earlier version wrote the row."""
-    return Column("stored_bytes", BigInteger, nullable=False, server_default="0")
-
-
-def _of_revision(*, primary_key: bool = False) -> Column[str]:
-    owner = ForeignKey("revisions.id", ondelete="CASCADE")
-    return Column("revision_id", String(32), owner, primary_key=primary_key, nullable=False)
-
-
-FLOORPLANS = Table(
+FLOORPLANS = sa.Table(
     "floorplans",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("name", Text, nullable=False),
+    *owned(),
+    sa.Column("name", sa.Text, nullable=False),
     # Case-folded name for searches, because databases fold cases differently.
-    Column("folded_name", Text, nullable=False),
+    sa.Column("folded_name", sa.Text, nullable=False),
     # Current revision; no foreign key, because revisions already refer to their plan.
-    Column("revision_id", String(32), nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("updated_at", UtcDateTime, nullable=False),
+    sa.Column("revision_id", sa.String(32), nullable=False),
+    *required(UtcDateTime, "created_at", "updated_at"),
     # Circle around the plan, in its own frame; NULL if an earlier version stored a plan that cannot be read.
-    Column("centre_x_m", Double),
-    Column("centre_y_m", Double),
-    Column("reach_m", Double),
+    *optional(sa.Double, "centre_x_m", "centre_y_m", "reach_m"),
     # Centre of the circle on Earth; NULL for a plan without an anchor.
-    Column("latitude", Double),
-    Column("longitude", Double),
+    *optional(sa.Double, "latitude", "longitude"),
     # Number of the tenant's change (`tenants.changes`) that last changed what queries of venues read of this plan; 0
     # before the first one.
-    Column("changed", BigInteger, nullable=False, server_default="0"),
-    Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
-    Index("floorplans_by_place", "tenant", "latitude"),
-    Index("floorplans_by_revision", "revision_id"),
-    Index("floorplans_by_change", "tenant", "changed"),
+    counter("changed"),
+    sa.Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
+    sa.Index("floorplans_by_place", "tenant", "latitude"),
+    sa.Index("floorplans_by_revision", "revision_id"),
+    sa.Index("floorplans_by_change", "tenant", "changed"),
 )
 
-REVISIONS = Table(
+REVISIONS = sa.Table(
     "revisions",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
-    Column("number", Integer, nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("document", Text, nullable=False),
+    sa.Column("id", sa.String(32), primary_key=True),
+    part_of("floorplans", "plan_id", nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcDateTime, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),
     # NULL in rows of earlier versions of the service.
-    Column("document_sha256", String(64)),
-    Column("warnings", Text),
-    Column("original_sha256", String(64), nullable=False),
+    sa.Column("document_sha256", sa.String(64)),
+    sa.Column("warnings", sa.Text),
+    sa.Column("original_sha256", sa.String(64), nullable=False),
     # NULL in rows of earlier versions of the service: JSON in the native format, without a report.
-    Column("original_media_type", String(64)),
-    Column("report", Text),
-    Column("room_count", Integer, nullable=False),
-    Column("area_m2", Double, nullable=False),
-    Column("camera_height_m", Double, nullable=False),
+    sa.Column("original_media_type", sa.String(64)),
+    sa.Column("report", sa.Text),
+    sa.Column("room_count", sa.Integer, nullable=False),
+    *required(sa.Double, "area_m2", "camera_height_m"),
     # NULL for an unknown camera height, and in rows of earlier versions of the service.
-    Column("camera_height_std_m", Double),
-    Column("failure", Text),
-    _stored_bytes(),
-    UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
+    sa.Column("camera_height_std_m", sa.Double),
+    sa.Column("failure", sa.Text),
+    counter("stored_bytes"),
+    sa.UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
 )
 
-ORIGINAL_CHUNKS = Table(
-    "original_chunks",
-    METADATA,
-    _of_revision(primary_key=True),
-    Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("content", LargeBinary, nullable=False),
-)
+ORIGINAL_CHUNKS = sa.Table("original_chunks", METADATA, part_of("revisions", "revision_id", primary_key=True), *chunk())
 
-LATENT_GRIDS = Table(
+LATENT_GRIDS = sa.Table(
     "latent_grids",
     METADATA,
-    Column("id", Integer, primary_key=True, autoincrement=True),
-    _of_revision(),
-    Column("model_sha256", String(64), nullable=False),
-    Column("step_m", Double, nullable=False),
-    Column("camera_height_mm", Integer, nullable=False),
-    Column("poses", Integer, nullable=False),
-    Column("size_bytes", Integer, nullable=False),
+    sa.Column("id", sa.Integer, primary_key=True, autoincrement=True),
+    part_of("revisions", "revision_id", nullable=False),
+    sa.Column("model_sha256", sa.String(64), nullable=False),
+    sa.Column("step_m", sa.Double, nullable=False),
+    *required(sa.Integer, "camera_height_mm", "poses", "size_bytes"),
     # NULL in rows of earlier versions of the service, which do not count as stored.
-    Column("sha256", String(64)),
+    sa.Column("sha256", sa.String(64)),
     # Input of the choice among a venue's plans; NULL in rows of earlier versions of the service.
-    Column("prototypes", LargeBinary),
-    _stored_bytes(),
-    UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
+    sa.Column("prototypes", sa.LargeBinary),
+    counter("stored_bytes"),
+    sa.UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
 )
 
-GRID_CHUNKS = Table(
+GRID_CHUNKS = sa.Table(
     "grid_chunks",
     METADATA,
-    Column("grid_id", Integer, ForeignKey("latent_grids.id", ondelete="CASCADE"), primary_key=True),
-    Column("number", Integer, primary_key=True, autoincrement=False),
-    Column("content", LargeBinary, nullable=False),
+    sa.Column("grid_id", sa.Integer, sa.ForeignKey("latent_grids.id", ondelete="CASCADE"), primary_key=True),
+    *chunk(),
 )
 
-GRID_LEASES = Table(
+GRID_LEASES = sa.Table(
     "grid_leases",
     METADATA,
-    _of_revision(primary_key=True),
-    Column("model_sha256", String(64), primary_key=True),
-    Column("step_m", Double, primary_key=True),
-    Column("camera_height_mm", Integer, primary_key=True, autoincrement=False),
-    Column("owner", String(32), nullable=False),
+    part_of("revisions", "revision_id", primary_key=True),
+    sa.Column("model_sha256", sa.String(64), primary_key=True),
+    sa.Column("step_m", sa.Double, primary_key=True),
+    sa.Column("camera_height_mm", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("owner", sa.String(32), nullable=False),
     # Seconds since 1970 by `Database.now_s`, the clock that all owners share.
-    Column("lease_until_s", Double, nullable=False),
+    sa.Column("lease_until_s", sa.Double, nullable=False),
     # NULL in rows of earlier versions of the service.
-    Column("length_s", Double),
-    Column("progress", Double, nullable=False),
+    sa.Column("length_s", sa.Double),
+    sa.Column("progress", sa.Double, nullable=False),
     # Number of attempts since the grid was last finished or abandoned.
-    Column("attempts", Integer, nullable=False, server_default="1"),
+    sa.Column("attempts", sa.Integer, nullable=False, server_default="1"),
 )
 
-VENUES = Table(
+VENUES = sa.Table(
     "venues",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("name", Text, nullable=False),
-    Column("folded_name", Text, nullable=False),
-    Column("revision_id", String(32), nullable=False),
-    Column("number", Integer, nullable=False),
+    *owned(),
+    *required(sa.Text, "name", "folded_name"),
+    sa.Column("revision_id", sa.String(32), nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),
     # Anchor; all columns are NULL without one, and `altitude_m` is optional.
-    Column("latitude", Double),
-    Column("longitude", Double),
-    Column("altitude_m", Double),
-    Column("north_deg", Double),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("updated_at", UtcDateTime, nullable=False),
-    Index("venues_by_tenant_and_age", "tenant", "created_at", "id"),
+    *optional(sa.Double, "latitude", "longitude", "altitude_m", "north_deg"),
+    *required(UtcDateTime, "created_at", "updated_at"),
+    sa.Index("venues_by_tenant_and_age", "tenant", "created_at", "id"),
 )
 
-VENUE_PLANS = Table(
+VENUE_PLANS = sa.Table(
     "venue_plans",
     METADATA,
-    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE"), primary_key=True),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), primary_key=True),
-    Column("level", Double, nullable=False),
-    Column("name", Text),
-    Index("venue_plans_by_plan", "plan_id"),
-    Index("venue_plans_by_level", "venue_id", "level", "plan_id"),
+    part_of("venues", "venue_id", primary_key=True),
+    part_of("floorplans", "plan_id", primary_key=True),
+    sa.Column("level", sa.Double, nullable=False),
+    sa.Column("name", sa.Text),
+    sa.Index("venue_plans_by_plan", "plan_id"),
+    sa.Index("venue_plans_by_level", "venue_id", "level", "plan_id"),
 )
 
-TENANTS = Table(
+TENANTS = sa.Table(
     "tenants",
     METADATA,
-    Column("tenant", String(64), primary_key=True),
+    sa.Column("tenant", sa.String(64), primary_key=True),
     # Limits set by the operator; NULL for the limit in the settings.
-    Column("max_stored_bytes", BigInteger),
-    Column("max_bytes_in_flight", BigInteger),
+    *optional(sa.BigInteger, "max_stored_bytes", "max_bytes_in_flight"),
     # Weight of the tenant's CPU seconds in queues; NULL counts as 1.
-    Column("cpu_share", Double),
+    sa.Column("cpu_share", sa.Double),
     # Counters of stored bytes by kind, see `stored_bytes.py`.
     *(
-        Column(f"{kind}_bytes", BigInteger, nullable=False, server_default="0")
+        counter(f"{kind}_bytes")
         for kind in ("plans", "grids", "venues", "answers", "sessions", "albums", "idempotency")
     ),
     # Number of changes of plans, grids and venues, and the stored bytes that these changes added. Earlier versions of
     # the service, running beside, count their bytes alone.
-    Column("changes", BigInteger, nullable=False, server_default="0"),
-    Column("counted_bytes", BigInteger, nullable=False, server_default="0"),
+    counter("changes"),
+    counter("counted_bytes"),
 )
 
-API_KEYS = Table(
+API_KEYS = sa.Table(
     "api_keys",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("name", Text, nullable=False),
-    Column("hash", String(64), nullable=False, unique=True),
-    Column("scopes", Text, nullable=False),
-    Column("rate_per_minute", Integer),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("revoked_at", UtcDateTime),
-    Column("last_used_at", UtcDateTime),
-    Column("expires_at", UtcDateTime),
+    *owned(),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("hash", sa.String(64), nullable=False, unique=True),
+    sa.Column("scopes", sa.Text, nullable=False),
+    sa.Column("rate_per_minute", sa.Integer),
+    sa.Column("created_at", UtcDateTime, nullable=False),
+    *optional(UtcDateTime, "revoked_at", "last_used_at", "expires_at"),
     # Lifetime that a successor inherits; rotation shortens `expires_at`.
-    Column("lifetime_s", Double),
-    Column("replaces", String(32)),
-    Index("api_keys_by_age", "created_at", "id"),
+    sa.Column("lifetime_s", sa.Double),
+    sa.Column("replaces", sa.String(32)),
+    sa.Index("api_keys_by_age", "created_at", "id"),
 )
 
 # Append-only: a trigger refuses updates. No foreign keys, because entries outlive the rows that they are about.
-AUDIT_LOG = Table(
+AUDIT_LOG = sa.Table(
     "audit_log",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("actor", String(300), nullable=False),
+    sa.Column("id", sa.String(32), primary_key=True),
+    sa.Column("created_at", UtcDateTime, nullable=False),
+    sa.Column("actor", sa.String(300), nullable=False),
     # Tenant of the actor, or for operators the tenant that they changed; empty for unknown callers.
-    Column("tenant", String(64), nullable=False),
-    Column("address", String(64), nullable=False),
-    Column("action", String(100), nullable=False),
-    Column("resource", String(300), nullable=False),
-    Column("status", Integer),
-    Column("result", String(64), nullable=False),
-    Column("count", Integer, nullable=False),
-    Column("request_id", String(64)),
-    Column("detail", Text),
-    Index("audit_log_by_age", "created_at", "id"),
-    Index("audit_log_by_tenant", "tenant", "created_at", "id"),
-    Index("audit_log_by_actor", "actor", "created_at", "id"),
+    *required(sa.String(64), "tenant", "address"),
+    sa.Column("action", sa.String(100), nullable=False),
+    sa.Column("resource", sa.String(300), nullable=False),
+    sa.Column("status", sa.Integer),
+    sa.Column("result", sa.String(64), nullable=False),
+    sa.Column("count", sa.Integer, nullable=False),
+    sa.Column("request_id", sa.String(64)),
+    sa.Column("detail", sa.Text),
+    sa.Index("audit_log_by_age", "created_at", "id"),
+    sa.Index("audit_log_by_tenant", "tenant", "created_at", "id"),
+    sa.Index("audit_log_by_actor", "actor", "created_at", "id"),
 )
 
-KEPT_ANSWERS = Table(
+KEPT_ANSWERS = sa.Table(
     "kept_answers",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("content", Text, nullable=False),
-    _stored_bytes(),
-    Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
-    Index("kept_answers_by_age", "created_at"),
-    Index("kept_answers_by_plan", "plan_id"),
+    *owned(),
+    part_of("floorplans", "plan_id", nullable=False),
+    sa.Column("created_at", UtcDateTime, nullable=False),
+    sa.Column("content", sa.Text, nullable=False),
+    counter("stored_bytes"),
+    sa.Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
+    sa.Index("kept_answers_by_age", "created_at"),
+    sa.Index("kept_answers_by_plan", "plan_id"),
 )
 
-SESSIONS = Table(
+SESSIONS = sa.Table(
     "sessions",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
+    *owned(),
     # Either a plan or a venue, and the revision at which the session began.
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
-    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
-    Column("revision_id", String(32), nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("expires_at", UtcDateTime, nullable=False),
+    part_of("floorplans", "plan_id"),
+    part_of("venues", "venue_id"),
+    sa.Column("revision_id", sa.String(32), nullable=False),
+    *required(UtcDateTime, "created_at", "expires_at"),
     # The request that began the session, as JSON.
-    Column("options", Text, nullable=False),
-    Column("photographs", Integer, nullable=False),
+    sa.Column("options", sa.Text, nullable=False),
+    sa.Column("photographs", sa.Integer, nullable=False),
     # State and last pose; NULL before the first photograph.
-    Column("state", LargeBinary),
-    Column("pose", Text),
+    sa.Column("state", sa.LargeBinary),
+    sa.Column("pose", sa.Text),
     # Claim of the photograph that is computed: seconds since 1970 by `Database.now_s`, 0 without one.
-    Column("claim", String(32), nullable=False),
-    Column("claimed_until_s", Double, nullable=False),
-    Column("claim_s", Double),
-    _stored_bytes(),
-    Index("sessions_by_tenant_and_age", "tenant", "expires_at"),
-    Index("sessions_by_age", "expires_at"),
-    Index("sessions_by_plan", "plan_id"),
-    Index("sessions_by_venue", "venue_id"),
+    sa.Column("claim", sa.String(32), nullable=False),
+    sa.Column("claimed_until_s", sa.Double, nullable=False),
+    sa.Column("claim_s", sa.Double),
+    counter("stored_bytes"),
+    sa.Index("sessions_by_tenant_and_age", "tenant", "expires_at"),
+    sa.Index("sessions_by_age", "expires_at"),
+    sa.Index("sessions_by_plan", "plan_id"),
+    sa.Index("sessions_by_venue", "venue_id"),
 )
 
-ALBUMS = Table(
+ALBUMS = sa.Table(
     "albums",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("tenant", String(64), nullable=False),
-    Column("name", Text, nullable=False),
-    Column("folded_name", Text, nullable=False),
+    *owned(),
+    *required(sa.Text, "name", "folded_name"),
     # Either a plan or a venue.
-    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE")),
-    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE")),
+    part_of("floorplans", "plan_id"),
+    part_of("venues", "venue_id"),
     # The request that created the album, as JSON.
-    Column("options", Text, nullable=False),
-    Column("model_sha256", String(64), nullable=False),
+    sa.Column("options", sa.Text, nullable=False),
+    sa.Column("model_sha256", sa.String(64), nullable=False),
     # Revision, which changes with the photographs and their corrections.
-    Column("revision_id", String(32), nullable=False),
-    Column("number", Integer, nullable=False),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("updated_at", UtcDateTime, nullable=False),
-    Column("expires_at", UtcDateTime, nullable=False),
-    Column("photographs", Integer, nullable=False),
+    sa.Column("revision_id", sa.String(32), nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),
+    *required(UtcDateTime, "created_at", "updated_at", "expires_at"),
+    sa.Column("photographs", sa.Integer, nullable=False),
     # State that was solved last: number of the album's revision (0: none), revision of the plan or venue, and the
     # highest number of a change of the venue's plans (`floorplans.changed`).
-    Column("solved_number", Integer, nullable=False),
-    Column("place_revision_id", String(32)),
-    Column("place_change", BigInteger, nullable=False),
+    sa.Column("solved_number", sa.Integer, nullable=False),
+    sa.Column("place_revision_id", sa.String(32)),
+    sa.Column("place_change", sa.BigInteger, nullable=False),
     # Common part of the solution as JSON, or the reason why there is none.
-    Column("solution", Text),
-    Column("failure", Text),
+    *optional(sa.Text, "solution", "failure"),
     # Lease of the replica that solves it: seconds since 1970 by `Database.now_s`, 0 without one.
-    Column("owner", String(32), nullable=False),
-    Column("lease_until_s", Double, nullable=False),
-    Column("lease_s", Double),
-    Column("progress", Double, nullable=False),
+    sa.Column("owner", sa.String(32), nullable=False),
+    sa.Column("lease_until_s", sa.Double, nullable=False),
+    sa.Column("lease_s", sa.Double),
+    sa.Column("progress", sa.Double, nullable=False),
     # Number of attempts since it was last solved or changed.
-    Column("attempts", Integer, nullable=False),
-    _stored_bytes(),
-    Index("albums_by_tenant_and_age", "tenant", "created_at", "id"),
-    Index("albums_by_age", "expires_at"),
-    Index("albums_by_plan", "plan_id"),
-    Index("albums_by_venue", "venue_id"),
+    sa.Column("attempts", sa.Integer, nullable=False),
+    counter("stored_bytes"),
+    sa.Index("albums_by_tenant_and_age", "tenant", "created_at", "id"),
+    sa.Index("albums_by_age", "expires_at"),
+    sa.Index("albums_by_plan", "plan_id"),
+    sa.Index("albums_by_venue", "venue_id"),
 )
 
-ALBUM_PHOTOGRAPHS = Table(
+ALBUM_PHOTOGRAPHS = sa.Table(
     "album_photographs",
     METADATA,
-    Column("id", String(32), primary_key=True),
-    Column("album_id", String(32), ForeignKey("albums.id", ondelete="CASCADE"), nullable=False),
+    sa.Column("id", sa.String(32), primary_key=True),
+    part_of("albums", "album_id", nullable=False),
     # Position in the album, in the order of uploads.
-    Column("number", Integer, nullable=False),
-    Column("sha256", String(64), nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False),
     # Revision, which changes with the correction.
-    Column("revision_id", String(32), nullable=False),
-    Column("name", Text),
-    Column("created_at", UtcDateTime, nullable=False),
+    sa.Column("revision_id", sa.String(32), nullable=False),
+    sa.Column("name", sa.Text),
+    sa.Column("created_at", UtcDateTime, nullable=False),
     # Size, time and camera as JSON.
-    Column("facts", Text, nullable=False),
+    sa.Column("facts", sa.Text, nullable=False),
     # Features; pictures are not stored.
-    Column("entry", LargeBinary, nullable=False),
-    Column("correction", Text),
-    Column("pin", Text),
+    sa.Column("entry", sa.LargeBinary, nullable=False),
+    *optional(sa.Text, "correction", "pin"),
     # What an attempt to solve the album found about it, until one ends.
-    Column("evidence", LargeBinary),
-    _stored_bytes(),
-    UniqueConstraint("album_id", "sha256", name="photographs_of_album"),
-    Index("album_photographs_by_number", "album_id", "number"),
+    sa.Column("evidence", sa.LargeBinary),
+    counter("stored_bytes"),
+    sa.UniqueConstraint("album_id", "sha256", name="photographs_of_album"),
+    sa.Index("album_photographs_by_number", "album_id", "number"),
 )
 
-IDEMPOTENCY = Table(
+IDEMPOTENCY = sa.Table(
     "idempotency",
     METADATA,
-    Column("tenant", String(64), primary_key=True),
-    Column("route", String(64), primary_key=True),
-    Column("key", String(255), primary_key=True),
-    Column("body_sha256", String(64), nullable=False),
-    Column("token", String(32), nullable=False),
-    Column("lease_until_s", Double, nullable=False),
+    sa.Column("tenant", sa.String(64), primary_key=True),
+    sa.Column("route", sa.String(64), primary_key=True),
+    sa.Column("key", sa.String(255), primary_key=True),
+    sa.Column("body_sha256", sa.String(64), nullable=False),
+    sa.Column("token", sa.String(32), nullable=False),
+    sa.Column("lease_until_s", sa.Double, nullable=False),
     # NULL in rows of earlier versions of the service.
-    Column("lease_s", Double),
-    Column("created_at", UtcDateTime, nullable=False),
-    Column("status", Integer),
-    Column("headers", Text),
-    Column("body", LargeBinary),
-    _stored_bytes(),
-    Index("idempotency_by_age", "created_at"),
-    Index("idempotency_by_tenant_and_age", "tenant", "created_at"),
+    sa.Column("lease_s", sa.Double),
+    sa.Column("created_at", UtcDateTime, nullable=False),
+    sa.Column("status", sa.Integer),
+    sa.Column("headers", sa.Text),
+    sa.Column("body", sa.LargeBinary),
+    counter("stored_bytes"),
+    sa.Index("idempotency_by_age", "created_at"),
+    sa.Index("idempotency_by_tenant_and_age", "tenant", "created_at"),
 )

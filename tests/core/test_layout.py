@@ -13,7 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.buildings import building_of
+from benchmarks.buildings import Building
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, WALL_CODE, WINDOW_CODE, column_azimuths
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.plans import VALIDATION, generate_home
@@ -158,7 +158,7 @@ def test_sweep_matches_cast_in_rows_of_rooms(plan: FloorPlan, seed: int) -> None
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_sweep_matches_cast_in_a_building(turned: bool) -> None:
-    plan = building_of(VALIDATION, 0, 2300.0, hall_share=0.8).plan
+    plan = Building(VALIDATION, 0, 2300.0, hall_share=0.8).plan
     assert max(len(room.walls_m) for room in plan.rooms) > 100
     every = pose_grid(plan, 1.0)
     rng = np.random.default_rng(0)

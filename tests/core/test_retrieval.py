@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
-from benchmarks.buildings import Building, building_of
+from benchmarks.buildings import Building
 from lalaloc_core.bundle import Manifest, MatchingWeights
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
@@ -290,7 +290,7 @@ WEIGHTS, CONFIG = MatchingWeights(temperature=40.0, openings=0.4), MatchingConfi
 
 @pytest.fixture(scope="module")
 def building() -> Building:
-    return building_of(VALIDATION, 3, 350.0, hall_share=0.0)
+    return Building(VALIDATION, 3, 350.0, hall_share=0.0)
 
 
 @pytest.fixture(scope="module")

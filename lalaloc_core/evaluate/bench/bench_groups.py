@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.evaluate.bench.accuracy import (
     GROUPS,
@@ -42,21 +40,12 @@ _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
 _ON_REQUEST = ("album_weights",)
 
 
-def run_bench(
-    bundle_folder: Path,
-    groups: Sequence[str],
-    *,
-    homes: int,
-    textures: Path | None = None,
-    data: Path | None = None,
-    rooms: Path | None = None,
-) -> dict[str, Any]:
-    """Measure groups of figures, by default all but those on request, with one bundle; see `Setting`."""
+def run_bench(setting: Setting, groups: Sequence[str]) -> dict[str, Any]:
+    """Measure groups of figures, by default all but those on request."""
     for number, group in enumerate(groups):
         if group not in _BENCHMARKS:
             raise ConfigError(f"only[{number}] is '{group}'; the groups are {', '.join(_BENCHMARKS)}")
-    bundle = Bundle.open(bundle_folder)
-    setting = Setting(bundle, homes, textures, data, rooms)
-    machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
+    manifest = setting.bundle.manifest
+    machine = {"bundle": manifest.name, "version": manifest.version, "cores": os.cpu_count()}
     chosen = groups or [group for group in _BENCHMARKS if group not in _ON_REQUEST]
     return machine | {group: _BENCHMARKS[group](setting) for group in chosen}

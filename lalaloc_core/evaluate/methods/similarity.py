@@ -206,11 +206,9 @@ class EdgeGrid(LayoutGrid):
 
 def layout_grid(metric: LayoutMetric, plan: FloorPlan, poses: PoseSet, camera_height_m: float) -> LayoutGrid:
     """Return the grid that compares the poses of a plan with queries by a metric."""
-    if metric == "chamfer":
-        return ChamferGrid(plan, poses, camera_height_m)
-    if metric == "edges":
-        return EdgeGrid(plan, poses, camera_height_m)
-    return DepthGrid(plan, poses, camera_height_m, relative=metric == "relative-depth")
+    if metric in ("depth", "relative-depth"):
+        return DepthGrid(plan, poses, camera_height_m, relative=metric == "relative-depth")
+    return (ChamferGrid if metric == "chamfer" else EdgeGrid)(plan, poses, camera_height_m)
 
 
 def edge_image(

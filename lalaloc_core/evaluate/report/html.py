@@ -24,20 +24,7 @@ from lalaloc_core.files import atomic_write
 MUTED, PAPER = "#59626d", "#ffffff"
 SERIES = ("#0b63b5", "#c2410c", "#0f7b53", "#a3297a", "#8a6d00", "#0e7c86", "#6d4ed1", "#7a4a2a")
 _DASHES = ("-", "--", ":", "-.")
-_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "lalaloc",
-    # Names of runs can contain dollar signs.
-    "text.parse_math": False,
-    "font.size": 9.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#d5dbe1",
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-}
+_STYLE = Path(__file__).parent / "template/charts.mplstyle"
 CURVE_LIMITS_M = (0.001, 20.0)
 _TICKS = {0.001: "0.1 cm", 0.01: "1 cm", 0.1: "10 cm", 1.0: "1 m", 10.0: "10 m"}
 _WIDTH_INCHES = 5.6
@@ -129,7 +116,7 @@ def draw_charts(runs: Sequence[Run]) -> dict[str, Chart]:
     """Draw the charts for which the runs have data, by name."""
     answered = [run for run in runs if run.predictions]
     confident = [run for run in answered if run.scores is not None and run.scores.reliability]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(fname=_STYLE):
         charts = [draw(chosen) for draw, chosen in ((_error_curves, answered), (_calibration, confident)) if chosen]
     return {chart.name: chart for chart in charts}
 

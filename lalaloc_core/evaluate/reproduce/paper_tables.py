@@ -24,24 +24,13 @@ Budget = Literal["small", "full"]
 # ("seconds:vdr") or of all stages ("seconds").
 Column = str
 
-_CONTENT = tomllib.loads(Path(__file__).with_name("paper_tables.toml").read_text(encoding="utf-8"))
-COLUMN_TITLES: Mapping[Column, str] = _CONTENT["titles"]
+_PATH = Path(__file__).with_name("paper_tables.toml")
+_PAPER: Mapping[str, Any] = tomllib.loads(_PATH.read_text(encoding="utf-8"))
+COLUMN_TITLES: Mapping[Column, str] = _PAPER["columns"]
 SHARES = frozenset({"layout_recall", "pose_recall", "correct_room", *(c for c in COLUMN_TITLES if c[:6] == "within")})
-
 # Name of the bundle that ships; other models are the variants in `reproduce.ablations`.
 SHIPPED = "ring"
-
-
-# The paper's plans have walls only and exact camera heights and headings. Structured3D's annotation also has openings
-# and room types, which our search would use.
-PAPER_SETTING: Mapping[str, Any] = {
-    "openings": False,
-    "see_through": False,
-    "ceiling": False,
-    "room_type": False,
-    "heading_doubt": 0.0,
-    "camera_height_std_m": 0.0,
-}
+PAPER_SETTING: Mapping[str, Any] = _PAPER["setting"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,10 +84,10 @@ def _table(values: dict[str, Any]) -> Table:
     for row in values["rows"]:
         figures = zip(values["columns"], row.get("paper", ()), strict="paper" in row)
         row["paper"] = {column: figure for column, figure in figures if not math.isnan(figure)}
-    return build_config(Table, values, path="paper_tables.toml")
+    return build_config(Table, values, path=_PATH.name)
 
 
-TABLES = tuple(map(_table, _CONTENT["tables"]))
+TABLES = tuple(map(_table, _PAPER["tables"]))
 
 
 @dataclass(frozen=True, kw_only=True)

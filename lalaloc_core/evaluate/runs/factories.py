@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -98,17 +99,16 @@ def _spheres(info: RunInfo) -> Dataset:
     return AlteredScenes(homes, generator) if generator in CHANGES else homes
 
 
+_WITHOUT_MODEL: dict[str, Callable[[], Method]] = {"oracle": SimilarityRetrieval, "pose-oracle": PoseOracle, "icp": Icp}
+
+
 def build_method(info: RunInfo) -> Method:
     """Return the method of a run, on one thread."""
     if info.method == "similarity":
         return SimilarityRetrieval(_settings(SimilaritySettings, info).metric)
     settings = _settings(LaLaLocSettings if info.method == "lalaloc" else NoSettings, info)
-    if info.method == "oracle":
-        return SimilarityRetrieval()
-    if info.method == "pose-oracle":
-        return PoseOracle()
-    if info.method == "icp":
-        return Icp()
+    if info.method in _WITHOUT_MODEL:
+        return _WITHOUT_MODEL[info.method]()
     bundle = require_bundle(info)
     encoders = PhotographEncoder(bundle, threads=1)
     # Tensors of a few poses are too small for several threads.

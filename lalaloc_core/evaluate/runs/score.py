@@ -306,8 +306,7 @@ class Outcome(StrEnum):
 
 def outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> list[Outcome]:
     """Return the outcome of each query, for the final pose or the pose after a stage."""
-    errors_m = position_errors_m(predictions, stage)
-    pairs = zip(predictions, errors_m, strict=True)
+    pairs = zip(predictions, position_errors_m(predictions, stage), strict=True)
     return [_outcome(prediction, stage, float(error_m)) for prediction, error_m in pairs]
 
 

@@ -24,14 +24,7 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
-from lalaloc_core.learn.data.assembly import (
-    OpenRingError,
-    RoomOutline,
-    assemble_plan,
-    chain_rings,
-    is_number,
-    read_json,
-)
+from lalaloc_core.learn.data import assembly
 from lalaloc_core.learn.data.drawn_rooms import DrawnOpening
 
 _MM_PER_M = 1000.0
@@ -66,7 +59,7 @@ class Annotation:
 
 def read_annotation(path: Path, scene: str) -> Annotation:
     """Read the rooms of a scene."""
-    return _Reader(read_json(path, scene=scene), scene, path).annotation()
+    return _Reader(assembly.read_json(path, scene=scene), scene, path).annotation()
 
 
 class _Reader:
@@ -79,7 +72,7 @@ class _Reader:
                 raise self._error(f"'{key}' must be a list" if key in document else f"'{key}' is missing")
 
     def annotation(self) -> Annotation:
-        outlines: list[RoomOutline] = []
+        outlines: list[assembly.RoomOutline] = []
         heights: list[tuple[str, float]] = []
         seen: Counter[str] = Counter()
         for number, semantic in enumerate(self._document["semantics"]):
@@ -94,7 +87,7 @@ class _Reader:
                 outlines.append(outline)
                 heights.append((identity, floor_z_m))
         openings, faults = self._openings(outlines, [z_m for _, z_m in heights])
-        plan = assemble_plan(
+        plan = assembly.assemble_plan(
             self._scene,
             outlines,
             path=self._path,
@@ -111,7 +104,7 @@ class _Reader:
             floors[identity] = (*floors.get(identity, ()), *kept)
         return Annotation(plan, floors)
 
-    def _outlines(self, room: str, planes: list[Any]) -> list[tuple[RoomOutline, float]]:
+    def _outlines(self, room: str, planes: list[Any]) -> list[tuple[assembly.RoomOutline, float]]:
         """Return the outline and floor height of each of a room's floors."""
         by_kind: dict[str, list[int]] = {"floor": [], "ceiling": []}
         for plane in planes:
@@ -129,7 +122,7 @@ class _Reader:
         for plane in by_kind["floor"]:
             corners_m, holes_m = self._floor_m(plane, room)
             floor_z_m, floor_warnings = _level(corners_m[:, 2], "floor", room)
-            outline = RoomOutline(
+            outline = assembly.RoomOutline(
                 name=room,
                 polygon_m=corners_m[:, :2],
                 ceiling_height_m=ceiling_z_m - floor_z_m,
@@ -141,7 +134,7 @@ class _Reader:
         return found
 
     def _openings(
-        self, outlines: list[RoomOutline], floors_z_m: list[float]
+        self, outlines: list[assembly.RoomOutline], floors_z_m: list[float]
     ) -> tuple[list[DrawnOpening], tuple[str, ...]]:
         """Return doors and windows (boxes between two walls, or single faces), and warnings about unreadable ones."""
         shapes = [shapely.Polygon(outline.polygon_m) for outline in outlines]
@@ -187,10 +180,10 @@ class _Reader:
         outer = int(np.argmax([shapely.Polygon(corners).area for corners in corners_m]))
         return corners_m[outer], tuple(corners[:, :2] for k, corners in enumerate(corners_m) if k != outer)
 
-    def _chained(self, lines: list[int], room: str) -> tuple[list[list[int]], OpenRingError | None]:
+    def _chained(self, lines: list[int], room: str) -> tuple[list[list[int]], assembly.OpenRingError | None]:
         try:
-            return chain_rings([self._ends(line, room) for line in lines]), None
-        except OpenRingError as error:
+            return assembly.chain_rings([self._ends(line, room) for line in lines]), None
+        except assembly.OpenRingError as error:
             return [], error
 
     @cached_property
@@ -232,7 +225,7 @@ class _Reader:
     def _junction_mm(self, junction: int, room: str) -> list[float]:
         entry = self._entry("junctions", junction, room)
         point = entry.get("coordinate") if isinstance(entry, dict) else None
-        if not isinstance(point, list) or len(point) != 3 or not all(is_number(value) for value in point):
+        if not isinstance(point, list) or len(point) != 3 or not all(assembly.is_number(value) for value in point):
             raise self._error(f"junction {junction} has coordinate {str(point)[:80]}; three numbers are required", room)
         return [float(value) for value in point]
 

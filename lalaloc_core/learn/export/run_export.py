@@ -15,18 +15,9 @@ from lalaloc_core.learn.export.bundle_export import (
     replace_image_encoder,
     slim_weights,
 )
+from lalaloc_core.learn.training import warm_start
 from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.stages import build_image_encoder
-from lalaloc_core.learn.training.warm_start import (
-    JOINT,
-    bundle_weights,
-    check_same_networks,
-    find_checkpoint,
-    sphere_count,
-    trained_decoder,
-    trained_layout_encoder,
-    training_totals,
-)
 from lalaloc_core.nets import ImageEncoder, ViewNetwork, load_layout_encoder
 
 
@@ -50,21 +41,21 @@ def export_run(
     """
     teacher = layout_from or folder
     # Branches trained together are exported from the same step.
-    last_layout = last and (layout_only or (teacher / f"{JOINT}.pt").exists())
-    layout = find_checkpoint("layout", teacher, last=last_layout)
-    image = None if layout_only else find_checkpoint("image", folder, last=last)
+    last_layout = last and (layout_only or (teacher / f"{warm_start.JOINT}.pt").exists())
+    layout = warm_start.find_checkpoint("layout", teacher, last=last_layout)
+    image = None if layout_only else warm_start.find_checkpoint("image", folder, last=last)
     training: dict[str, Any] = {layout.stage: _summary(layout, teacher, last=last_layout)}
     image_encoder = None
     if image is not None:
-        check_same_networks("layout", image.config, layout.config, str(teacher))
+        warm_start.check_same_networks("layout", image.config, layout.config, str(teacher))
         image_encoder = _image_encoder(image)
-        training[image.stage] = {**_summary(image, folder, last=last), "spheres": sphere_count(image)}
+        training[image.stage] = {**_summary(image, folder, last=last), "spheres": warm_start.sphere_count(image)}
     return export_bundle(
         out,
         (image or layout).config,
-        trained_layout_encoder(layout),
+        warm_start.trained_layout_encoder(layout),
         image_encoder,
-        trained_decoder(layout),
+        warm_start.trained_decoder(layout),
         name=name,
         version=version,
         training={**training, **(notes or {})},
@@ -82,10 +73,10 @@ def export_into(
     if not stages:
         raise CheckpointError(f"'{folder}' has no checkpoint of stage 'image' or 'view'")
     origin = Bundle.open(bundle)
-    layout = bundle_weights(origin, "layout").checkpoint.config
-    checkpoints = [find_checkpoint(stage, folder, last=last) for stage in stages]
+    layout = warm_start.bundle_weights(origin, "layout").checkpoint.config
+    checkpoints = [warm_start.find_checkpoint(stage, folder, last=last) for stage in stages]
     for checkpoint in checkpoints:
-        check_same_networks("layout", checkpoint.config, layout, str(bundle))
+        warm_start.check_same_networks("layout", checkpoint.config, layout, str(bundle))
     out.mkdir(parents=True, exist_ok=True)
     for name in origin.manifest.files:
         content = origin.read(name)
@@ -101,7 +92,7 @@ def export_into(
             view_encoder.load_state_dict(checkpoint.inference_weights["view_encoder"])
             made = add_view_encoder(made, config, view_encoder, summary)
         else:
-            summary["spheres"] = sphere_count(checkpoint)
+            summary["spheres"] = warm_start.sphere_count(checkpoint)
             made = replace_image_encoder(made, config, _image_encoder(checkpoint), summary)
     return made
 
@@ -112,7 +103,7 @@ def reexport_bundle(folder: Path) -> Bundle:
     bundle.check()
     manifest, image_encoder = bundle.manifest, None
     stage = "image" if IMAGE_WEIGHTS in manifest.files else "layout"
-    start = bundle_weights(bundle, stage)
+    start = warm_start.bundle_weights(bundle, stage)
     if stage == "image":
         image_encoder = build_image_encoder(start.checkpoint.config)
         start.load_into({"image_encoder": image_encoder})
@@ -137,5 +128,5 @@ def _summary(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, A
     if checkpoint.data:
         summary["data"] = checkpoint.data
     if checkpoint.begun_from:
-        summary |= {"begun_from": checkpoint.begun_from, **training_totals(checkpoint)}
+        summary |= {"begun_from": checkpoint.begun_from, **warm_start.training_totals(checkpoint)}
     return summary

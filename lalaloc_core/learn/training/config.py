@@ -6,6 +6,7 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -205,35 +206,33 @@ class TrainConfig:
                 )
         if not self.layout.log_ratio_weight and not self.layout.decode_weight:
             raise ConfigError("config.layout: log_ratio_weight and decode_weight are both 0; set one above 0")
-        image, turned = self.image, self.layout.turned_share
+        image, rays, turned = self.image, self.image.supersample, self.layout.turned_share
         if not any((image.l2_weight, image.log_ratio_weight, image.kd_weight, image.ring_weight)):
             raise ConfigError(
                 "config.image: l2_weight, log_ratio_weight, kd_weight and ring_weight are all 0; set one above 0"
             )
-        rays = image.supersample
-        _check(
-            "image.supersample",
-            rays,
-            len(rays) == 2 and all(1 <= count <= _MAX_RAYS for count in rays),
-            f"it must be two numbers from 1 to {_MAX_RAYS}",
-        )
+        are_rays = len(rays) == 2 and all(1 <= count <= _MAX_RAYS for count in rays)
+        self._check("image.supersample", are_rays, f"it must be two numbers from 1 to {_MAX_RAYS}")
         for name in ("uses_per_sphere", "replay_spheres", "photographs_per_batch"):
-            _check(f"image.{name}", getattr(image, name), getattr(image, name) >= 1, "the minimum is 1")
+            self._check(f"image.{name}", getattr(image, name) >= 1, "the minimum is 1")
         for name in ("photometric", "optics", "opening_balance"):
-            share = getattr(image, name)
-            _check(f"image.{name}", share, 0.0 <= share <= 1.0, "it must lie between 0 and 1")
+            self._check(f"image.{name}", 0.0 <= getattr(image, name) <= 1.0, "it must lie between 0 and 1")
         for name in _TRUNK_ONLY:
-            is_possible = self.architecture == "trunk" or not getattr(image, name)
             limit = f"only architecture 'trunk' supports it, not '{self.architecture}'"
-            _check(f"image.{name}", getattr(image, name), is_possible, limit)
-        height_m, limit = image.camera_height_error_m, f"it must lie between 0 and {_MAX_HEIGHT_ERROR_M:g} m"
-        _check("image.camera_height_error_m", height_m, 0.0 <= height_m <= _MAX_HEIGHT_ERROR_M, limit)
-        for part in ("layout", "image"):
-            optimiser = getattr(self, part).optimiser
+            self._check(f"image.{name}", self.architecture == "trunk" or not getattr(image, name), limit)
+        is_small = 0.0 <= image.camera_height_error_m <= _MAX_HEIGHT_ERROR_M
+        limit = f"it must lie between 0 and {_MAX_HEIGHT_ERROR_M:g} m"
+        self._check("image.camera_height_error_m", is_small, limit)
+        for part, optimiser in (("layout", self.layout.optimiser), ("image", image.optimiser)):
             rest = 1.0 - optimiser.warmup
             limit = f"it must be above 0 and at most 1 - warmup, {rest:g}"
-            _check(f"{part}.optimiser.decay", optimiser.decay, 0.0 < optimiser.decay <= rest, limit)
-        _check("layout.turned_share", turned, not turned or self.turns == "any", "it must be 0 unless turns is 'any'")
+            self._check(f"{part}.optimiser.decay", 0.0 < optimiser.decay <= rest, limit)
+        self._check("layout.turned_share", not turned or self.turns == "any", "it must be 0 unless turns is 'any'")
+
+    def _check(self, path: str, is_valid: bool, limit: str) -> None:
+        if not is_valid:
+            value = attrgetter(path)(self)
+            raise ConfigError(f"config.{path} is {f'{value:g}' if isinstance(value, float) else value}; {limit}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for checkpoints and manifests."""
@@ -292,12 +291,6 @@ class TrainConfig:
 
 _EARLIER_NAMES = {"uses_per_panorama": "uses_per_sphere", "replay_panoramas": "replay_spheres"}
 _EARLIER_SETTINGS = {"hidden_share"}
-
-
-def _check(name: str, value: Any, is_valid: bool, limit: str) -> None:
-    if not is_valid:
-        shown = f"{value:g}" if isinstance(value, float) else value
-        raise ConfigError(f"config.{name} is {shown}; {limit}")
 
 
 def _presets() -> dict[str, TrainConfig]:

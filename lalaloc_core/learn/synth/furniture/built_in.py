@@ -11,17 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.learn.synth.furniture.catalogue import (
-    COUNTER_DEPTH_M,
-    bathtub,
-    counter_run,
-    fridge,
-    shelf_run,
-    shower,
-    toilet,
-    wardrobe_run,
-    washbasin,
-)
+from lalaloc_core.learn.synth.furniture import catalogue
 from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box
 
 _MIN_RUN_M = 1.2
@@ -83,7 +73,7 @@ def kitchen(
     placed = []
     if fitted and length > _MIN_RUN_M + _FRIDGE_M:
         at_start = rng.random() < 0.5
-        placed.append(Placed(fridge(rng), main.wall, start + 0.46 if at_start else start + length - 0.46))
+        placed.append(Placed(catalogue.fridge(rng), main.wall, start + 0.46 if at_start else start + length - 0.46))
         start, length = start + (_FRIDGE_M if at_start else 0.0), length - _FRIDGE_M
     if length > _MIN_RUN_M + _TALL_UNIT_M and rng.random() < 0.5 and not main.has_window:
         # A tall unit or a fridge closes the run on one side.
@@ -92,7 +82,9 @@ def kitchen(
         at_start = rng.random() < 0.5
         placed.append(Placed(tall, main.wall, start + 0.3 if at_start else start + length - 0.3))
         start, length = start + (_TALL_UNIT_M if at_start else 0.0), length - _TALL_UNIT_M
-    run = counter_run(rng, length, height, body, wall_units=has_wall_units, ceiling_m=ceiling_m if fitted else None)
+    run = catalogue.counter_run(
+        rng, length, height, body, wall_units=has_wall_units, ceiling_m=ceiling_m if fitted else None
+    )
     placed.append(Placed(run, main.wall, start + 0.5 * length))
     placed += _around_the_corner(stretches, lengths_m, main, (start, start + length), height, body, rng)
     kind = rng.random()
@@ -100,11 +92,13 @@ def kitchen(
         # A peninsula: its back to the run, its end to the room.
         reach = rng.uniform(0.9, 2.0)
         end = start + 0.32 if rng.random() < 0.5 else start + length - 0.32
-        placed.append(Placed(_block(0.6, reach, height, body), main.wall, end, COUNTER_DEPTH_M + 0.01))
+        placed.append(Placed(_block(0.6, reach, height, body), main.wall, end, catalogue.COUNTER_DEPTH_M + 0.01))
     elif kind < 0.55:
         width = min(rng.uniform(1.0, 2.6), length)
         island = _block(width, rng.uniform(0.55, 1.05), height, body)
-        placed.append(Placed(island, main.wall, start + 0.5 * length, COUNTER_DEPTH_M + rng.uniform(0.85, 1.3)))
+        placed.append(
+            Placed(island, main.wall, start + 0.5 * length, catalogue.COUNTER_DEPTH_M + rng.uniform(0.85, 1.3))
+        )
     return placed
 
 
@@ -117,7 +111,7 @@ def wardrobes(stretches: list[Stretch], ceiling_m: float, rng: np.random.Generat
     height = ceiling_m - 0.005 if rng.random() < 0.6 else min(rng.uniform(2.0, 2.4), ceiling_m - 0.02)
     width = chosen.length_m if rng.random() < 0.75 else rng.uniform(0.9, chosen.length_m)
     start = chosen.start_m if rng.random() < 0.5 else chosen.end_m - width
-    return [Placed(wardrobe_run(rng, width - 0.01, height), chosen.wall, start + 0.5 * width)]
+    return [Placed(catalogue.wardrobe_run(rng, width - 0.01, height), chosen.wall, start + 0.5 * width)]
 
 
 def closet_shelves(stretches: list[Stretch], ceiling_m: float, rng: np.random.Generator) -> list[Placed]:
@@ -131,14 +125,14 @@ def closet_shelves(stretches: list[Stretch], ceiling_m: float, rng: np.random.Ge
         length = stretch.length_m - 2 * margin - 0.01
         if length > 0.5:
             middle = 0.5 * (stretch.start_m + stretch.end_m)
-            placed.append(Placed(shelf_run(rng, length, depth, height), stretch.wall, middle))
+            placed.append(Placed(catalogue.shelf_run(rng, length, depth, height), stretch.wall, middle))
     return placed
 
 
 def sanitary(rng: np.random.Generator) -> list[Piece]:
     """Return the sanitary ware of a bathroom."""
-    pieces = [washbasin(rng), toilet(rng)]
-    return [*pieces, bathtub(rng) if rng.random() < 0.5 else shower(rng)]
+    pieces = [catalogue.washbasin(rng), catalogue.toilet(rng)]
+    return [*pieces, catalogue.bathtub(rng) if rng.random() < 0.5 else catalogue.shower(rng)]
 
 
 def _around_the_corner(
@@ -157,11 +151,11 @@ def _around_the_corner(
     beside = [s for s in stretches if s.wall == following and s.start_m < 0.1]
     if not beside:
         return []
-    start = COUNTER_DEPTH_M + 0.01
+    start = catalogue.COUNTER_DEPTH_M + 0.01
     length = min(rng.uniform(0.6, 3.0), beside[0].end_m - start)
     if length < 0.6:
         return []
-    return [Placed(counter_run(rng, length, height, body, wall_units=False), following, start + 0.5 * length)]
+    return [Placed(catalogue.counter_run(rng, length, height, body, wall_units=False), following, start + 0.5 * length)]
 
 
 def _tall_unit(body: Finish, height: float) -> Piece:

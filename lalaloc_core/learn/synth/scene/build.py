@@ -13,19 +13,11 @@ from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel, furnish
 from lalaloc_core.learn.synth.furniture.pieces import Finish
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.records import Row
+from lalaloc_core.learn.synth.scene import shells
 from lalaloc_core.learn.synth.scene.doors import add_door
 from lalaloc_core.learn.synth.scene.lighting import Lighting, light_room, relit, sample_backdrop
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import Fact, Lights, Prisms, RenderScene, SceneTables, VisibleRooms
-from lalaloc_core.learn.synth.scene.shells import (
-    ScenePart,
-    Shells,
-    Streams,
-    add_curtains,
-    add_radiator,
-    add_window,
-    ceiling_boxes,
-)
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.synth.scene.surfaces import HouseStyle, SurfaceTable, sample_style
 
@@ -45,7 +37,7 @@ class _Builder:
         self._openings = self._openings_of(shot.room_index)
         seen = [opening.neighbour for opening in self._openings if opening.is_see_through]
         self._slot_rooms = [shot.room_index, *dict.fromkeys(seen)]
-        self._streams = Streams(shot.seed, is_staged=shot.lighting is not None)
+        self._streams = shells.Streams(shot.seed, is_staged=shot.lighting is not None)
         self._rng = self._streams.shapes
         self._is_bare = shot.furniture == "empty"
         # Homes for sale: bare, pale, in daylight.
@@ -55,14 +47,14 @@ class _Builder:
         self._style = sample_style(surfaces, self._rng)
         if shot.is_night:
             surfaces.darken_outdoors(self._style.outdoors)
-        self._shells = Shells(
+        self._shells = shells.Shells(
             self._tables, self._style, self._streams, is_bright=self._is_bright, is_bare=self._is_bare
         )
         self._facts: set[Fact] = set()
 
     def build(self) -> RenderScene:
         streams, tables, rng = self._streams, self._tables, self._rng
-        streams.begin(ScenePart.MOOD)
+        streams.begin(shells.ScenePart.MOOD)
         lighting = Lighting(rng, neutral=streams.is_staged, bright=self._is_bright)
         if self._shot.is_night:
             lighting.daylight, lighting.lamps_on = 0.0, True
@@ -70,7 +62,7 @@ class _Builder:
         in_room = list(tables.prisms)
         for slot, room_index in enumerate(self._slot_rooms[1:], start=1):
             self._add_room(slot, room_index, lighting)
-        streams.begin(ScenePart.LAMPS, self._shot.room_index)
+        streams.begin(shells.ScenePart.LAMPS, self._shot.room_index)
         lights, lamps, sun = light_room(self._room, self._openings, tables.camera_m, lighting, rng)
         before_lamps = len(tables.prisms)
         for lamp in lamps:
@@ -84,7 +76,7 @@ class _Builder:
         tables.add_jambs()
         if self._is_bright and any(opening.kind == "window" for opening in self._openings):
             self._facts.add("bare_bright")
-        streams.begin(ScenePart.CAMERA, self._shot.room_index)
+        streams.begin(shells.ScenePart.CAMERA, self._shot.room_index)
         backdrop = sample_backdrop(rng)
         exposure = sample_staged_exposure(rng) if streams.is_staged else sample_exposure(rng, bright=self._is_bright)
         return tables.to_scene(
@@ -111,7 +103,7 @@ class _Builder:
     def _lower_ceiling(self) -> None:
         tables = self._tables
         surfaces: dict[Finish, int] = {"paint": int(VisibleRooms.stacked(tables.rooms).ceiling_surface[0])}
-        for box in ceiling_boxes(self._room, self._openings, self._shot.camera_height_m, self._rng):
+        for box in shells.ceiling_boxes(self._room, self._openings, self._shot.camera_height_m, self._rng):
             if box.finish not in surfaces:
                 surfaces[box.finish] = tables.surfaces.add_finish(box.finish)
             tables.add_prism(box, surfaces[box.finish])
@@ -120,19 +112,19 @@ class _Builder:
         """Add a window, or a door that is see-through in the camera's own room."""
         tables, style, rng = self._tables, self._style, self._rng
         number = self._home.openings.index(opening)
-        self._streams.begin(ScenePart.OPENING, number)
+        self._streams.begin(shells.ScenePart.OPENING, number)
         if opening.kind != "window":
             slot_behind = self._slot_rooms.index(opening.neighbour) if is_own and opening.is_see_through else None
             add_door(tables, style, self._home, opening, wall=wall, slot_behind=slot_behind, rng=rng)
             return
-        add_window(tables, style, wall, opening, rng)
+        shells.add_window(tables, style, wall, opening, rng)
         if is_own:
-            add_curtains(tables, self._room, opening, rng, is_bare=self._is_bare)
-            self._streams.begin(ScenePart.RADIATOR, number)
-            add_radiator(tables, style, self._room, opening, rng)
+            shells.add_curtains(tables, self._room, opening, rng, is_bare=self._is_bare)
+            self._streams.begin(shells.ScenePart.RADIATOR, number)
+            shells.add_radiator(tables, style, self._room, opening, rng)
 
     def _furnish(self, room_index: int, *, is_own: bool) -> None:
-        self._streams.begin(ScenePart.FURNITURE, room_index)
+        self._streams.begin(shells.ScenePart.FURNITURE, room_index)
         level: FurnitureLevel = self._shot.furniture if is_own or self._is_bare else "simple"
         camera = self._tables.camera_m if is_own else None
         # The empty rooms of a staged home are bare; others keep what is built in.

@@ -12,21 +12,16 @@ import uuid
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.migrations import chunk, optional, owned, part_of, required
+
 revision = "0001"
 down_revision = None
 
 _CHUNK_BYTES = 2**20
 _MOMENT = sa.DateTime(timezone=True)
-_OLD_PLANS = sa.table(
-    "old_floorplans",
-    sa.column("id", sa.String),
-    sa.column("created_at", _MOMENT),
-    sa.column("name", sa.Text),
-    sa.column("document", sa.Text),
-    sa.column("room_count", sa.Integer),
-    sa.column("area_m2", sa.Double),
-    sa.column("camera_height_m", sa.Double),
-)
+# Columns that move to the first revision of a plan as they are.
+_MOVED = ("created_at", "document", "room_count", "area_m2", "camera_height_m")
+_OLD_PLANS = sa.table("old_floorplans", sa.column("created_at", _MOMENT), *map(sa.column, ("id", "name", *_MOVED[1:])))
 _OLD_ORIGINALS = sa.table("old_originals", sa.column("plan_id", sa.String), sa.column("content", sa.LargeBinary))
 
 
@@ -52,72 +47,57 @@ def _create() -> dict[str, sa.Table]:
     made = [
         op.create_table(
             "floorplans",
-            sa.Column("id", sa.String(32), primary_key=True),
-            sa.Column("tenant", sa.String(64), nullable=False),
-            sa.Column("name", sa.Text, nullable=False),
-            sa.Column("folded_name", sa.Text, nullable=False),
+            *owned(),
+            *required(sa.Text, "name", "folded_name"),
             sa.Column("revision_id", sa.String(32), nullable=False),
-            sa.Column("created_at", _MOMENT, nullable=False),
-            sa.Column("updated_at", _MOMENT, nullable=False),
+            *required(_MOMENT, "created_at", "updated_at"),
         ),
         op.create_table(
             "revisions",
             sa.Column("id", sa.String(32), primary_key=True),
-            sa.Column("plan_id", sa.String(32), sa.ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+            part_of("floorplans", "plan_id", nullable=False),
             sa.Column("number", sa.Integer, nullable=False),
             sa.Column("created_at", _MOMENT, nullable=False),
             sa.Column("document", sa.Text, nullable=False),
             sa.Column("original_sha256", sa.String(64), nullable=False),
             sa.Column("room_count", sa.Integer, nullable=False),
-            sa.Column("area_m2", sa.Double, nullable=False),
-            sa.Column("camera_height_m", sa.Double, nullable=False),
+            *required(sa.Double, "area_m2", "camera_height_m"),
             sa.Column("failure", sa.Text),
             sa.UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
         ),
-        op.create_table(
-            "original_chunks",
-            _of_revision(primary_key=True),
-            sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
-            sa.Column("content", sa.LargeBinary, nullable=False),
-        ),
+        op.create_table("original_chunks", part_of("revisions", "revision_id", primary_key=True), *chunk()),
         op.create_table(
             "latent_grids",
             sa.Column("id", sa.Integer, primary_key=True, autoincrement=True),
-            _of_revision(),
+            part_of("revisions", "revision_id", nullable=False),
             sa.Column("model_sha256", sa.String(64), nullable=False),
             sa.Column("step_m", sa.Double, nullable=False),
-            sa.Column("camera_height_mm", sa.Integer, nullable=False),
-            sa.Column("poses", sa.Integer, nullable=False),
-            sa.Column("size_bytes", sa.Integer, nullable=False),
+            *required(sa.Integer, "camera_height_mm", "poses", "size_bytes"),
             sa.UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
         ),
         op.create_table(
             "grid_chunks",
             sa.Column("grid_id", sa.Integer, sa.ForeignKey("latent_grids.id", ondelete="CASCADE"), primary_key=True),
-            sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
-            sa.Column("content", sa.LargeBinary, nullable=False),
+            *chunk(),
         ),
         op.create_table(
             "grid_leases",
-            _of_revision(primary_key=True),
+            part_of("revisions", "revision_id", primary_key=True),
             sa.Column("model_sha256", sa.String(64), primary_key=True),
             sa.Column("step_m", sa.Double, primary_key=True),
             sa.Column("camera_height_mm", sa.Integer, primary_key=True, autoincrement=False),
             sa.Column("owner", sa.String(32), nullable=False),
-            sa.Column("lease_until_s", sa.Double, nullable=False),
-            sa.Column("progress", sa.Double, nullable=False),
+            *required(sa.Double, "lease_until_s", "progress"),
         ),
         op.create_table(
             "api_keys",
-            sa.Column("id", sa.String(32), primary_key=True),
-            sa.Column("tenant", sa.String(64), nullable=False),
+            *owned(),
             sa.Column("name", sa.Text, nullable=False),
             sa.Column("hash", sa.String(64), nullable=False, unique=True),
             sa.Column("scopes", sa.Text, nullable=False),
             sa.Column("rate_per_minute", sa.Integer),
             sa.Column("created_at", _MOMENT, nullable=False),
-            sa.Column("revoked_at", _MOMENT),
-            sa.Column("last_used_at", _MOMENT),
+            *optional(_MOMENT, "revoked_at", "last_used_at"),
         ),
         op.create_table(
             "idempotency",
@@ -139,18 +119,12 @@ def _create() -> dict[str, sa.Table]:
     return {table.name: table for table in made}
 
 
-def _of_revision(*, primary_key: bool = False) -> sa.Column[str]:
-    owner = sa.ForeignKey("revisions.id", ondelete="CASCADE")
-    return sa.Column("revision_id", sa.String(32), owner, primary_key=primary_key, nullable=False)
-
-
 def _take_over(connection: sa.Connection, tables: dict[str, sa.Table]) -> None:
     # One plan at a time, so that memory does not grow with their number.
     for plan_id in connection.scalars(sa.select(_OLD_PLANS.c.id)).all():
         plan = connection.execute(sa.select(_OLD_PLANS).where(_OLD_PLANS.c.id == plan_id)).one()
         content = connection.scalar(sa.select(_OLD_ORIGINALS.c.content).where(_OLD_ORIGINALS.c.plan_id == plan_id))
-        original = content or b""
-        revision_id = uuid.uuid4().hex
+        original, revision = content or b"", uuid.uuid4().hex
         connection.execute(
             tables["floorplans"].insert(),
             {
@@ -158,7 +132,7 @@ def _take_over(connection: sa.Connection, tables: dict[str, sa.Table]) -> None:
                 "tenant": "default",
                 "name": plan.name,
                 "folded_name": plan.name.casefold(),
-                "revision_id": revision_id,
+                "revision_id": revision,
                 "created_at": plan.created_at,
                 "updated_at": plan.created_at,
             },
@@ -166,17 +140,13 @@ def _take_over(connection: sa.Connection, tables: dict[str, sa.Table]) -> None:
         connection.execute(
             tables["revisions"].insert(),
             {
-                "id": revision_id,
+                "id": revision,
                 "plan_id": plan.id,
                 "number": 1,
-                "created_at": plan.created_at,
-                "document": plan.document,
                 "original_sha256": hashlib.sha256(original).hexdigest(),
-                "room_count": plan.room_count,
-                "area_m2": plan.area_m2,
-                "camera_height_m": plan.camera_height_m,
+                **{name: getattr(plan, name) for name in _MOVED},
             },
         )
         for number, first in enumerate(range(0, len(original), _CHUNK_BYTES)):
-            chunk = {"number": number, "content": original[first : first + _CHUNK_BYTES]}
-            connection.execute(tables["original_chunks"].insert(), {"revision_id": revision_id, **chunk})
+            part = {"number": number, "content": original[first : first + _CHUNK_BYTES]}
+            connection.execute(tables["original_chunks"].insert(), {"revision_id": revision, **part})

@@ -9,33 +9,28 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.migrations import optional, owned, part_of, required
+
 revision = "0003"
 down_revision = "0002"
 
 
 def upgrade() -> None:
     """Add the tables and the columns."""
-    moment = sa.DateTime(timezone=True)
     op.create_table(
         "venues",
-        sa.Column("id", sa.String(32), primary_key=True),
-        sa.Column("tenant", sa.String(64), nullable=False),
-        sa.Column("name", sa.Text, nullable=False),
-        sa.Column("folded_name", sa.Text, nullable=False),
+        *owned(),
+        *required(sa.Text, "name", "folded_name"),
         sa.Column("revision_id", sa.String(32), nullable=False),
         sa.Column("number", sa.Integer, nullable=False),
-        sa.Column("latitude", sa.Double),
-        sa.Column("longitude", sa.Double),
-        sa.Column("altitude_m", sa.Double),
-        sa.Column("north_deg", sa.Double),
-        sa.Column("created_at", moment, nullable=False),
-        sa.Column("updated_at", moment, nullable=False),
+        *optional(sa.Double, "latitude", "longitude", "altitude_m", "north_deg"),
+        *required(sa.DateTime(timezone=True), "created_at", "updated_at"),
     )
     op.create_index("venues_by_tenant_and_age", "venues", ["tenant", "created_at", "id"])
     op.create_table(
         "venue_plans",
-        sa.Column("venue_id", sa.String(32), sa.ForeignKey("venues.id", ondelete="CASCADE"), primary_key=True),
-        sa.Column("plan_id", sa.String(32), sa.ForeignKey("floorplans.id", ondelete="CASCADE"), primary_key=True),
+        part_of("venues", "venue_id", primary_key=True),
+        part_of("floorplans", "plan_id", primary_key=True),
         sa.Column("level", sa.Double, nullable=False),
         sa.Column("name", sa.Text),
     )

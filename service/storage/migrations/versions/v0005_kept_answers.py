@@ -5,6 +5,8 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.migrations import owned, part_of
+
 revision = "0005"
 down_revision = "0004"
 
@@ -13,9 +15,8 @@ def upgrade() -> None:
     """Add the table."""
     op.create_table(
         "kept_answers",
-        sa.Column("id", sa.String(32), primary_key=True),
-        sa.Column("tenant", sa.String(64), nullable=False),
-        sa.Column("plan_id", sa.String(32), sa.ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+        *owned(),
+        part_of("floorplans", "plan_id", nullable=False),
         sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
         sa.Column("content", sa.Text, nullable=False),
     )

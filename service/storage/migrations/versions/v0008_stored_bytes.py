@@ -5,6 +5,8 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
+from service.storage.migrations import counter
+
 revision = "0008"
 down_revision = "0007"
 
@@ -34,11 +36,11 @@ def upgrade() -> None:
     """Add the columns, and fill them."""
     connection = op.get_bind()
     for table, size in _SIZES.items():
-        op.add_column(table, sa.Column("stored_bytes", sa.BigInteger, nullable=False, server_default="0"))
+        op.add_column(table, counter("stored_bytes"))
         connection.execute(sa.text(f"UPDATE {table} SET stored_bytes = {size}"))
     op.create_index("idempotency_by_tenant_and_age", "idempotency", ["tenant", "created_at"])
     for kind, rows in _KINDS.items():
-        op.add_column("tenants", sa.Column(f"{kind}_bytes", sa.BigInteger, nullable=False, server_default="0"))
+        op.add_column("tenants", counter(f"{kind}_bytes"))
         connection.execute(
             sa.text(
                 f"INSERT INTO tenants (tenant, {kind}_bytes) SELECT tenant, sum(stored_bytes) FROM ({rows}) AS counted "
