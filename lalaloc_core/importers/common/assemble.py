@@ -197,8 +197,9 @@ def _clean(
 ) -> list[SketchedRoom]:
     label = _label(room)
     shape = room.shape
-    if len(inside := np.sort(obstacles.query(shape, predicate="intersects"))):
-        shape = shapely.difference(shape, shapely.union_all(obstacles.geometries[inside]))
+    near = obstacles.geometries[np.sort(obstacles.query(shape))]
+    if inside := [obstacle for obstacle in near if obstacle.intersects(shape)]:
+        shape = shapely.difference(shape, shapely.union_all(inside))
     floors = [
         simple
         for floor in polygons_from_geometry(shape)
