@@ -202,15 +202,13 @@ def import_plans(
                 "known_distance or scale), crop it to one storey (crop), or save it in another size"
             ) from error
         raise
-    building = options.name or building
-    if building is not None:
-        several = len(plans) > 1
-        plans = [
-            plan if "name" in plan.document and (format.name == "native" or not several)
-            else _rename(plan, building, by_level=several)
-            for plan in plans
-        ]  # fmt: skip
-    return tuple(_with_option_warnings(plan, format, options) for plan in plans)
+    several, building = len(plans) > 1, options.name or building
+    named = plans if building is None else [
+        plan if "name" in plan.document and (format.name == "native" or not several)
+        else _rename(plan, building, by_level=several)
+        for plan in plans
+    ]  # fmt: skip
+    return tuple(_with_option_warnings(plan, format, options) for plan in named)
 
 
 def import_plan(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
-from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
+from lalaloc_core.importers.common.sketch import Level, Point, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
 from lalaloc_core.importers.common.vocabulary import is_roof
 
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
@@ -92,10 +92,10 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
             + "; "
             + "; ".join([*list(dict.fromkeys(builder.warnings))[:_MAX_NAMED], "check layers, level and the scale"])
         )
-    rooms = without_areas(rooms, builder)
-    rooms, shift = _near_origin(rooms, builder)
-    openings = [_shift_opening(opening, shift) for opening in sketch.openings]
-    openings, off_wall, overlapping = place_openings(openings, [room.shape for room in rooms])
+    # Coordinates on Earth have no unit that could be mistaken.
+    is_certain, metres_per_unit = sketch.anchor is not None, builder.metres_per_unit
+    sketch = _near_origin(replace(sketch, rooms=without_areas(rooms, builder)), builder)
+    openings, off_wall, overlapping = place_openings(sketch.openings, [room.shape for room in sketch.rooms])
     if off_wall:
         places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in off_wall[:_MAX_NAMED])
         builder.warnings.append(f"{len(off_wall)} openings lie on no wall and were left out, for example at {places}")
@@ -103,31 +103,27 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
         builder.notes.append(f"{overlapping} openings that overlap other openings were left out")
     name = options.name or clean_name(sketch.name)
     document: dict[str, Any] = {} if name is None else {"name": name}
-    if sketch.north_deg is not None:
-        document["north_deg"] = round(sketch.north_deg % 360.0, 6)
-    anchor = _shift_anchor(sketch.anchor, shift, builder)
-    if anchor is not None:
-        document["north_deg"] = round(anchor.north_deg % 360.0, 6)
-        document["anchor"] = anchor_document(anchor)
-    drawn = [replace(fixture, shape=affinity.translate(fixture.shape, *shift)) for fixture in sketch.fixtures]
-    fixtures = place_fixtures(drawn, rooms, builder)
-    rooms = type_rooms(rooms, fixtures, builder)
+    north_deg = sketch.north_deg if sketch.anchor is None else sketch.anchor.north_deg
+    if north_deg is not None:
+        document["north_deg"] = round(north_deg % 360.0, 6)
+    if sketch.anchor is not None:
+        document["anchor"] = anchor_document(sketch.anchor)
+    fixtures = place_fixtures(sketch.fixtures, sketch.rooms, builder)
+    rooms = type_rooms(sketch.rooms, fixtures, builder)
     ceiling_m = _usual_ceiling(rooms, options, builder)
     if ceiling_m is not None:
         document["ceiling_height_m"] = ceiling_m
-    document["rooms"] = [_room(room, ceiling_m, sketch, shift) for room in rooms]
+    document["rooms"] = [_room(room, ceiling_m, sketch.inner_walls) for room in rooms]
     if openings:
         document["openings"] = [_opening(opening) for opening in openings]
     if fixtures:
         document["fixtures"] = [{"kind": item.kind, "outline": _ring(item.shape.exterior)} for _, item in fixtures]
     _add_trust(document, sketch, builder)
-    # Coordinates on Earth have no unit that could be mistaken.
-    is_certain, metres_per_unit = sketch.anchor is not None, builder.metres_per_unit
     builder.warnings += check_document(document, is_scale_certain=is_certain, metres_per_unit=metres_per_unit)
     # Validate now, while the error can still refer to the file.
     plan = FloorPlan.from_dict(document, limits)
     builder.warnings += [f"{line}; draw each area once" for line in plan.warnings if " overlap" in line]
-    return ImportedPlan(document, builder.build(), sketch.level, anchor, (limits, plan))
+    return ImportedPlan(document, builder.build(), sketch.level, sketch.anchor, (limits, plan))
 
 
 def _add_trust(document: dict[str, Any], sketch: Sketch, builder: ReportBuilder) -> None:
@@ -176,15 +172,13 @@ def assemble_levels(
             raise InvalidFloorPlanError(f"level '{level.name}': {error}") from error
     if not plans:
         raise next(iter(empty.values()))
-    left_out = tuple(f"level '{name}' was left out: {reason}" for name, reason in list(empty.items())[:_MAX_NAMED])
-    roofs = [plan for plan in plans if plan.level is not None and is_roof(plan.level.name)]
-    if len(chosen) > 1 and 0 < len(roofs) < len(plans):
-        plans = [plan for plan in plans if plan not in roofs]
-        left_out += tuple(
-            f"level '{plan.level.name}' was left out: it is a roof (set level to read it)"
-            for plan in roofs[:_MAX_NAMED]
-            if plan.level is not None
-        )
+    reasons = [(name, str(error)) for name, error in empty.items()][:_MAX_NAMED]
+    below = [plan for plan in plans if plan.level is None or not is_roof(plan.level.name)]
+    if len(chosen) > 1 and below:
+        roofs = [plan.level.name for plan in plans if plan.level is not None and plan not in below]
+        reasons += [(name, "it is a roof (set level to read it)") for name in roofs[:_MAX_NAMED]]
+        plans = below
+    left_out = [f"level '{name}' was left out: {reason}" for name, reason in reasons]
     return tuple(
         replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *left_out))) for plan in plans
     )
@@ -292,9 +286,8 @@ def _simplify(floor: shapely.Polygon, label: str, limits: PlanLimits, builder: R
 
 
 def _vertices(shape: BaseGeometry) -> int:
-    return sum(
-        len(ring.coords) - 1 for part in polygons_from_geometry(shape) for ring in (part.exterior, *part.interiors)
-    )
+    # Rings repeat their first vertex.
+    return int(shapely.count_coordinates(shape)) - len(shapely.get_rings(shapely.get_parts(shape)))
 
 
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
@@ -309,33 +302,32 @@ def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
     return found
 
 
-def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[list[SketchedRoom], tuple[float, float]]:
-    """Move a plan in coordinates of a national grid to the origin; return the rooms and the shift."""
-    x0, y0, x1, y1 = shapely.total_bounds([room.shape for room in rooms])
+def _near_origin(sketch: Sketch, builder: ReportBuilder) -> Sketch:
+    """Move a sketch in coordinates of a national grid to the origin; it keeps an anchor that stays accurate."""
+    x0, y0, x1, y1 = shapely.total_bounds([room.shape for room in sketch.rooms])
     if max(abs(x0), abs(y0), abs(x1), abs(y1)) <= _FAR_M:
-        return rooms, (0.0, 0.0)
-    dx, dy = -math.floor(x0), -math.floor(y0)
-    builder.notes.append(f"the plan was moved by ({dx}, {dy}) m to lie near its origin")
-    return [replace(room, shape=affinity.translate(room.shape, dx, dy)) for room in rooms], (float(dx), float(dy))
-
-
-def _shift_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
-    """Return the anchor of the moved plan, None if it was moved too far for an accurate place."""
-    if anchor is None or shift == (0.0, 0.0):
-        return anchor
-    distance_m = math.hypot(*shift)
-    if distance_m > _MAX_ANCHOR_SHIFT_M:
+        return sketch
+    dx, dy = float(-math.floor(x0)), float(-math.floor(y0))
+    builder.notes.append(f"the plan was moved by ({dx:.0f}, {dy:.0f}) m to lie near its origin")
+    anchor, distance_m = sketch.anchor, math.hypot(dx, dy)
+    if anchor is not None and distance_m > _MAX_ANCHOR_SHIFT_M:
         builder.warnings.append(
             f"the anchor was left out: the file's origin is {distance_m / 1000.0:.0f} km from the plan; the limit is "
             f"{_MAX_ANCHOR_SHIFT_M / 1000.0:g} km"
         )
-        return None
-    return anchor.moved((-shift[0], -shift[1]))
+        anchor = None
 
+    def moved(point: Point) -> Point:
+        return point[0] + dx, point[1] + dy
 
-def _shift_opening(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
-    (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
-    return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
+    return replace(
+        sketch,
+        rooms=[replace(room, shape=affinity.translate(room.shape, dx, dy)) for room in sketch.rooms],
+        openings=[replace(part, start=moved(part.start), end=moved(part.end)) for part in sketch.openings],
+        inner_walls=[affinity.translate(wall, dx, dy) for wall in sketch.inner_walls],
+        fixtures=[replace(fixture, shape=affinity.translate(fixture.shape, dx, dy)) for fixture in sketch.fixtures],
+        anchor=None if anchor is None else anchor.moved((-dx, -dy)),
+    )
 
 
 def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float | None:
@@ -343,30 +335,23 @@ def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: R
     known = [room.ceiling_height_m for room in rooms if room.ceiling_height_m is not None]
     if options.ceiling_height_m is not None:
         return options.ceiling_height_m
-    if known:
-        usual_m = round(float(np.median(known)), 4)
-        if len(known) < len(rooms):
-            builder.unsure.append(
-                f"{len(rooms) - len(known)} of {len(rooms)} rooms give no ceiling height; {usual_m:g} m, the median of "
-                "the others, is assumed (set ceiling_height_m)"
-            )
-        return usual_m
-    builder.unsure.append(
-        f"no ceiling height is given; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"
-    )
-    return None
+    usual_m = round(float(np.median(known)), 4) if known else None
+    if usual_m is None:
+        assumed = f"no ceiling height is given; {DEFAULT_CEILING_HEIGHT_M:g} m"
+    else:
+        without = f"{len(rooms) - len(known)} of {len(rooms)}"
+        assumed = f"{without} rooms give no ceiling height; {usual_m:g} m, the median of the others,"
+    if len(known) < len(rooms):
+        builder.unsure.append(f"{assumed} is assumed (set ceiling_height_m)")
+    return usual_m
 
 
-def _room(room: SketchedRoom, ceiling_m: float | None, sketch: Sketch, shift: tuple[float, float]) -> dict[str, Any]:
-    entry: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
-    if room.name:
-        entry = {"name": room.name} | entry
-    entry |= type_fields(room.types)
+def _room(room: SketchedRoom, ceiling_m: float | None, walls: Sequence[shapely.LineString]) -> dict[str, Any]:
+    entry: dict[str, Any] = {"name": room.name} if room.name else {}
+    entry |= {"polygon": _ring(room.shape.exterior)} | type_fields(room.types)
     if room.shape.interiors:
         entry["holes"] = [_ring(ring) for ring in room.shape.interiors]
-    walls = [affinity.translate(wall, *shift) for wall in sketch.inner_walls]
-    inner_walls = [wall for wall in walls if room.shape.contains(wall)]
-    if inner_walls:
+    if inner_walls := [wall for wall in walls if room.shape.contains(wall)]:
         entry["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
     if room.ceiling_height_m is not None and ceiling_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
         entry["ceiling_height_m"] = round(room.ceiling_height_m, 4)
@@ -375,8 +360,7 @@ def _room(room: SketchedRoom, ceiling_m: float | None, sketch: Sketch, shift: tu
 
 def _opening(opening: SketchedOpening) -> dict[str, Any]:
     entry: dict[str, Any] = {"kind": opening.kind, "line": [_xy(opening.start), _xy(opening.end)]}
-    name = clean_name(opening.name)
-    if name:
+    if name := clean_name(opening.name):
         entry["name"] = name
     # A sill needs a head above it.
     sill, head = opening.sill_m, opening.head_m

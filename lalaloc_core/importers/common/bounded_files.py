@@ -109,17 +109,10 @@ def _with_entities(content: bytes) -> bytes:
     if not 0 < len(values) <= _MAX_ENTITIES or b"<!ENTITY" in _ENTITY.sub(b"", subset[1]):
         return content
     quoted = {name: value.replace(b'"', b"&quot;").replace(b"'", b"&apos;") for name, value in values.items()}
-    grown = 0
-
-    def value_of(found: re.Match[bytes]) -> bytes:
-        nonlocal grown
-        value = quoted.get(found[1])
-        grown += 0 if value is None else len(value)
-        return found[0] if value is None or grown > _MAX_GROWN else value
-
-    body = _REFERENCE.sub(value_of, content[subset.end() :])
-    if grown > _MAX_GROWN:
+    rest = content[subset.end() :]
+    if sum(len(quoted.get(found[1], b"")) for found in _REFERENCE.finditer(rest)) > _MAX_GROWN:
         return content
+    body = _REFERENCE.sub(lambda found: quoted.get(found[1], found[0]), rest)
     return content[: subset.start(1)] + _ENTITY.sub(b"", subset[1]) + content[subset.end(1) : subset.end()] + body
 
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
-import numpy as np
 import shapely
 
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words, types_by_fixtures
@@ -36,9 +35,8 @@ def fixture_from_name(*names: str | None) -> str | None:
         if found:
             return min(found, key=_ORDER.index)
         text = unicodedata.normalize("NFKC", name or "")
-        for word, kind in _JAPANESE.items():
-            if word in text:
-                return kind
+        if kinds := [kind for word, kind in _JAPANESE.items() if word in text]:
+            return kinds[0]
     return None
 
 
@@ -50,17 +48,15 @@ def place_fixtures(
         return []
     tree = shapely.STRtree([room.shape for room in rooms])
     points = [fixture.shape.representative_point() for fixture in fixtures]
-    number, room = tree.query(points, predicate="within")
-    first = np.full(len(fixtures), -1)
-    first[number[::-1]] = room[::-1]
+    room_of = dict(tree.query(points, predicate="within").T[::-1].tolist())
     placed, unusual = [], []
-    for index, fixture in zip(first.tolist(), fixtures, strict=True):
+    for number, fixture in enumerate(fixtures):
         low, high = _SIDES_M[fixture.kind]
         _, longer = side_lengths(fixture.shape)
         if not low <= longer <= high:
             unusual.append(f"a {fixture.kind} of {longer:.2f} m (usual: {low:g} to {high:g} m)")
-        elif index >= 0:
-            placed.append((index, fixture))
+        elif number in room_of:
+            placed.append((room_of[number], fixture))
     outside = len(fixtures) - len(placed) - len(unusual)
     if outside:
         builder.notes.append(f"{outside} fixtures that lie in no room were left out")
@@ -75,13 +71,12 @@ def type_rooms(
     rooms: Sequence[SketchedRoom], placed: Sequence[tuple[int, SketchedFixture]], builder: ReportBuilder
 ) -> list[SketchedRoom]:
     """Return the rooms with the types that their fixtures add."""
-    by_room: dict[int, list[SketchedFixture]] = {}
+    sizes_of: dict[int, list[tuple[str, float]]] = {}
     for index, fixture in placed:
-        by_room.setdefault(index, []).append(fixture)
+        sizes_of.setdefault(index, []).append((fixture.kind, fixture.shape.area))
     typed, lines = list(rooms), []
-    for index, fixtures in by_room.items():
+    for index, sizes in sizes_of.items():
         room = rooms[index]
-        sizes = [(fixture.kind, fixture.shape.area) for fixture in fixtures]
         types = types_by_fixtures(room.types, sizes, room.shape.area)
         if types != room.types:
             typed[index] = replace(room, types=types)

@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 
 from lalaloc_core.errors import InvalidFloorPlanError
 
 METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-_SCALE = re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)")
+# Options that are written in a form of their own, with its description.
+_WRITTEN: Mapping[str, tuple[re.Pattern[str], str, Callable[[str], object]]] = {
+    "scale": (re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)"), "look like 1:100", float),
+    "page": (re.compile(r"([0-9]{1,9})"), "be a whole number from 1", int),
+    "plan": (re.compile(r"(true|false)", re.IGNORECASE), "be true or false", lambda text: text.casefold() == "true"),
+}
 _MAX_LENGTH, _MAX_LAYERS = 200, 100
 _RANGES: Mapping[str, tuple[float, float]] = {
     "scale": (1.0, 10_000.0), "metres_per_pixel": (1e-6, 10.0), "multiply": (1e-3, 1e3), "page": (1.0, 10_000.0),
@@ -137,11 +142,11 @@ def check_y_axis(y_axis: object) -> None:
 
 
 def _parse(name: str, text: str) -> object:
-    if name == "scale":
-        match = _SCALE.fullmatch(text)
-        if match is None:
-            raise InvalidFloorPlanError(f"scale is '{text[:50]}'; it must look like 1:100")
-        return float(match[1])
+    if name in _WRITTEN:
+        pattern, expected, convert = _WRITTEN[name]
+        if (match := pattern.fullmatch(text)) is None:
+            raise InvalidFloorPlanError(f"{name} is '{text[:50]}'; it must {expected}")
+        return convert(match[1])
     if name in _NUMBERS:
         numbers, (count, meaning) = [_number(name, part) for part in re.split(r"[,;\s]+", text)], _NUMBERS[name]
         if len(numbers) != count:
@@ -150,17 +155,7 @@ def _parse(name: str, text: str) -> object:
         return KnownDistance((x0, y0), (x1, y1), *distance_m) if distance_m else (x0, y0, x1, y1)
     if name == "layers":
         return tuple(part.strip() for part in text.split(",") if part.strip())
-    if name == "page":
-        if not text.isascii() or not text.isdigit() or len(text) > 9:
-            raise InvalidFloorPlanError(f"page is '{text[:50]}'; it must be a whole number from 1")
-        return int(text)
-    if name == "plan":
-        if text.casefold() not in ("true", "false"):
-            raise InvalidFloorPlanError(f"plan is '{text[:50]}'; it must be true or false")
-        return text.casefold() == "true"
-    if name in ("metres_per_pixel", "multiply", "ceiling_height_m"):
-        return _number(name, text)
-    return text
+    return _number(name, text) if name in _RANGES else text
 
 
 def _ordered_crop(crop: tuple[float, float, float, float]) -> tuple[float, float, float, float]:

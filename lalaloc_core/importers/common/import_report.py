@@ -134,8 +134,9 @@ class ReportBuilder:
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
         facts: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "uses"}
         facts |= {name: _limit_lines(facts[name]) for name in ("notes", "warnings", "unsure", "rejected_texts")}
-        outlines = tuple(_outline(area) for area in self.no_room[:_MAX_AREAS])
-        return ImportReport(**facts | {"layers": tuple(layers[:_MAX_LINES]), "no_room": outlines})
+        outlines = [area.exterior.simplify(_COARSE_M).coords[:-1] for area in self.no_room[:_MAX_AREAS]]
+        facts["no_room"] = tuple(tuple((round(x, 2), round(y, 2)) for x, y in outline) for outline in outlines)
+        return ImportReport(**facts, layers=tuple(layers[:_MAX_LINES]))
 
 
 @dataclass
@@ -153,10 +154,5 @@ class Trace:
 
 def _limit_lines(lines: list[str]) -> tuple[str, ...]:
     distinct = list(dict.fromkeys(lines))
-    if len(distinct) <= _MAX_LINES:
-        return tuple(distinct)
-    return (*distinct[:_MAX_LINES], f"and {len(distinct) - _MAX_LINES} more")
-
-
-def _outline(area: shapely.Polygon) -> Outline:
-    return tuple((round(x, 2), round(y, 2)) for x, y in area.exterior.simplify(_COARSE_M).coords[:-1])
+    more = [f"and {len(distinct) - _MAX_LINES} more"] if len(distinct) > _MAX_LINES else []
+    return (*distinct[:_MAX_LINES], *more)

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.importers.common.geometry import cross, lines_of, point_xy, polygons_from_geometry, segments_of
+from lalaloc_core.importers.common.geometry import lines_of, point_xy, polygons_from_geometry, segments_of
 from lalaloc_core.importers.common.sketch import Point, SketchedOpening
 
 # Limits of wall thickness (m), of the sine between opening and wall, and of the length of an opening (m).
@@ -65,16 +65,11 @@ class WallLines:
     def line_at(self, point: shapely.Point, width_m: float) -> tuple[Point, Point] | None:
         """Return the ends of an opening of a width on the longest of the walls nearest to a point, None if none is."""
         near = self._tree.query(point, predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
-        segments = self._tree.geometries[near]
-        apart = [segment.distance(point) for segment in segments]
-        nearest = min(apart, default=0.0) + _ON_WALL_M
-        wall = max(
-            (s for s, away in zip(segments, apart, strict=True) if away <= nearest),
-            key=lambda s: s.length,
-            default=None,
-        )
-        if wall is None:
+        if not len(near):
             return None
+        segments = self._tree.geometries[near]
+        apart = shapely.distance(segments, point)
+        wall = max(segments[apart <= apart.min() + _ON_WALL_M], key=lambda segment: segment.length)
         half = 0.5 * min(width_m, wall.length)
         middle = min(max(wall.project(point), half), wall.length - half)
         start, end = wall.interpolate(middle - half), wall.interpolate(middle + half)
@@ -88,46 +83,33 @@ def _edges(rooms: Sequence[shapely.Polygon]) -> Float[np.ndarray, "n 4"]:
 def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shapely.STRtree) -> SketchedOpening | None:
     """Return the opening on the line of its wall, None if no wall runs along it."""
     start, end = np.array(opening.start), np.array(opening.end)
-    length = float(np.linalg.norm(end - start))
+    length = math.dist(start, end)
     if length < 1e-6:
         return None
     along = (end - start) / length
-    near = tree.query(opening.line, predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)
-    beside: list[tuple[float, float]] = []
-    for edge in edges[near]:
-        first, second = edge[:2], edge[2:]
-        direction = second - first
-        size = float(np.linalg.norm(direction))
-        if size < 1e-6 or abs(cross(along, direction / size)) > _STRAIGHT:
-            continue
-        a, b = sorted((float((first - start) @ along), float((second - start) @ along)))
-        shared = min(b, length) - max(a, 0.0)
-        if shared < min(0.5 * length, 0.5):
-            continue
-        offset = cross(along, 0.5 * (first + second) - start)
-        if abs(offset) <= _MAX_WALL_THICKNESS_M:
-            # Rings are counter-clockwise: the room lies to the left of its edges.
-            side = 1.0 if direction @ along > 0.0 else -1.0
-            beside.append((offset, side))
-    shift = _offset_of_wall(beside)
-    if shift is None:
+    left = np.array([-along[1], along[0]])
+    beside = edges[tree.query(opening.line, predicate="dwithin", distance=_MAX_WALL_THICKNESS_M)].reshape(-1, 2, 2)
+    steps = beside[:, 1] - beside[:, 0]
+    places = np.sort((beside - start) @ along, axis=1)
+    offsets = (beside.mean(axis=1) - start) @ left
+    is_wall = np.abs(steps @ left) <= _STRAIGHT * np.linalg.norm(steps, axis=1)
+    is_wall &= places[:, 1].clip(max=length) - places[:, 0].clip(min=0.0) >= min(0.5 * length, 0.5)
+    is_wall &= np.abs(offsets) <= _MAX_WALL_THICKNESS_M
+    if not is_wall.any():
         return None
-    normal = np.array([-along[1], along[0]])
-    return replace(opening, start=point_xy(start + shift * normal), end=point_xy(end + shift * normal))
+    # Rings are counter-clockwise: the room lies to the left of its edges.
+    is_left = steps @ along > 0.0
+    shift = _offset_of_wall(offsets[is_wall & is_left], offsets[is_wall & ~is_left])
+    return replace(opening, start=point_xy(start + shift * left), end=point_xy(end + shift * left))
 
 
-def _offset_of_wall(beside: list[tuple[float, float]]) -> float | None:
-    """Return the offset (m, to the left) from an opening to the middle of its wall."""
-    if not beside:
-        return None
-    left = [offset for offset, side in beside if side > 0.0]
-    right = [offset for offset, side in beside if side < 0.0]
-    # The wall lies between the nearest pair of a room to its right and a room to its left.
-    pairs = [(a, b) for a in left for b in right if -1e-6 <= a - b <= _MAX_WALL_THICKNESS_M]
-    if pairs:
-        a, b = min(pairs, key=lambda pair: abs(pair[0] + pair[1]))
-        return 0.5 * (a + b)
-    return min((offset for offset, _ in beside), key=abs)
+def _offset_of_wall(left: Float[np.ndarray, "n"], right: Float[np.ndarray, "m"]) -> float:
+    """Return the offset (m, to the left) from an opening to the middle of its wall, by those of rooms to either side.
+
+    The wall lies between the nearest pair of a room to its right and a room to its left.
+    """
+    pairs = [0.5 * (a + b) for a in left for b in right if -1e-6 <= a - b <= _MAX_WALL_THICKNESS_M]
+    return float(min(pairs or [*left, *right], key=abs))
 
 
 def _free_part(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> SketchedOpening | None:
@@ -143,10 +125,9 @@ def _free_part(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> Ske
     free = [(0.0, length)]
     for low, high in places[overlaps].tolist():
         free = [piece for lo, hi in free for piece in ((lo, min(hi, low)), (max(lo, high), hi)) if piece[1] > piece[0]]
-    longest = max(free, key=lambda piece: piece[1] - piece[0], default=(0.0, 0.0))
-    if longest[1] - longest[0] < max(_MIN_LENGTH_M, 0.5 * length):
+    low, high = max(free, key=lambda piece: piece[1] - piece[0], default=(0.0, 0.0))
+    if high - low < max(_MIN_LENGTH_M, 0.5 * length):
         return None
-    low, high = longest
     return replace(opening, start=point_xy(start + low * along), end=point_xy(start + high * along))
 
 

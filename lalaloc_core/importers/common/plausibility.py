@@ -28,7 +28,7 @@ from lalaloc_core.importers.common.import_options import METRES_PER_UNIT
 # Usual ranges; a value outside gives a warning with the unit that would make it usual.
 USUAL_CEILING_M = (1.9, 6.0)
 _USUAL_DOOR_M = (0.5, 3.0)
-_USUAL_ROOM_M2 = (0.64, 1600.0)
+_USUAL_SIDE_M = (0.8, 40.0)
 # Largest distance of two rooms that share a wall, reach of an opening to either side, and shortest outer wall (m).
 _WALL_M, _REACH_M, _OUTER_M = 0.6, 0.65, 1.5
 # Doors of one drawing are alike within this share, and so few other arcs are as wide as their leaves (m) by chance.
@@ -64,13 +64,12 @@ def check_document(
     names = [room.get("name", f"room {index + 1}") for index, room in enumerate(document["rooms"])]
     warnings = _ceiling_warnings(document, names)
     if not is_scale_certain:
-        warnings += _door_warnings(document, metres_per_unit) + _size_warnings(rooms, metres_per_unit)
+        warnings += _size_warnings(document, rooms, metres_per_unit)
     duplicates = [name for name, count in Counter(names).items() if count > 1]
     if duplicates:
         warnings.append(f"rooms share a name: {_list_names(duplicates)}; answers distinguish them by id only")
     if len(rooms) <= _MAX_ROOMS_COMPARED:
-        warnings += _isolated_rooms(rooms, names)
-        warnings += _unreachable_rooms(rooms, names, document.get("openings", []))
+        warnings += _isolated_rooms(rooms, names) + _unreachable_rooms(document, rooms, names)
     return warnings
 
 
@@ -122,44 +121,38 @@ def _ceiling_warnings(document: Mapping[str, Any], names: Sequence[str]) -> list
     return list(chain.from_iterable(hints))[:_MAX_NAMED]
 
 
-def _door_warnings(document: Mapping[str, Any], metres_per_unit: float) -> list[str]:
+def _size_warnings(document: Mapping[str, Any], rooms: Sequence[shapely.Polygon], metres_per_unit: float) -> list[str]:
+    """Detect a wrong unit by the width of doors, and by the size of rooms, which works without doors."""
     widths = [line.length for line in _lines(document, "door")]
-    if not widths:
-        return []
-    return unit_hints("the median width of doors", round(float(np.median(widths)), 4), _USUAL_DOOR_M, metres_per_unit)
-
-
-def _size_warnings(rooms: Sequence[shapely.Polygon], metres_per_unit: float) -> list[str]:
-    """Detect a wrong unit by the size of rooms, which works without doors."""
+    door_m = round(float(np.median(widths)), 4) if widths else _USUAL_DOOR_M[0]
     areas = np.sort([room.area for room in rooms])
     # Median weighted by area, so that closets and ducts hardly count.
-    side = float(np.sqrt(areas[np.searchsorted(np.cumsum(areas), 0.5 * areas.sum())]))
-    low, high = (float(np.sqrt(area)) for area in _USUAL_ROOM_M2)
-    return unit_hints("the side of a typical room", round(side, 3), (low, high), metres_per_unit)
+    side_m = round(math.sqrt(areas[np.searchsorted(np.cumsum(areas), 0.5 * areas.sum())]), 3)
+    return [
+        *unit_hints("the median width of doors", door_m, _USUAL_DOOR_M, metres_per_unit),
+        *unit_hints("the side of a typical room", side_m, _USUAL_SIDE_M, metres_per_unit),
+    ]
 
 
 def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:
     """Find rooms farther from all others than a wall is thick."""
     near, _ = shapely.STRtree(rooms).query(rooms, predicate="dwithin", distance=_WALL_M)
     isolated = [name for name, count in zip(names, np.bincount(near, minlength=len(rooms)), strict=True) if count < 2]
-    if len(rooms) < 2 or not isolated:
-        return []
-    return [
+    warning = (
         f"rooms farther than a wall's thickness ({_WALL_M:g} m) from every other room: {_list_names(isolated)}; "
         "check the scale and look for missing rooms"
-    ]
+    )
+    return [warning] if len(rooms) > 1 and isolated else []
 
 
 def _unreachable_rooms(
-    rooms: Sequence[shapely.Polygon], names: Sequence[str], openings: Sequence[Mapping[str, Any]]
+    document: Mapping[str, Any], rooms: Sequence[shapely.Polygon], names: Sequence[str]
 ) -> list[str]:
     """Find rooms without a door or passage, in a plan that has any."""
-    entries = [shapely.LineString(opening["line"]) for opening in openings if opening["kind"] in ("door", "passage")]
-    if not entries:
-        return []
+    entries = _lines(document, "door") + _lines(document, "passage")
     reached = set(_reached(rooms, entries))
     unreachable = [name for index, name in enumerate(names) if index not in reached]
-    return [f"no door or passage reaches {_list_names(unreachable)}"] if unreachable else []
+    return [f"no door or passage reaches {_list_names(unreachable)}"] if entries and unreachable else []
 
 
 def _list_names(names: Sequence[str]) -> str:
@@ -250,8 +243,8 @@ def _lit_rooms(
         shape, kind = shapes[index], document["rooms"][index].get("type")
         if shape.area < _MIN_LIT_M2 or kind in _UNLIT_TYPES:
             continue
-        near = [other for other in tree.query(shape, predicate="dwithin", distance=_WALL_M) if other != index]
-        around = shapely.union_all([shapes[other] for other in near]).buffer(_WALL_M)
+        near = tree.query(shape, predicate="dwithin", distance=_WALL_M)
+        around = shapely.union_all(tree.geometries[near[near != index]]).buffer(_WALL_M)
         if shape.exterior.difference(around).length >= _OUTER_M:
             found.append(shape)
     return found

@@ -79,9 +79,8 @@ def _hinges(swings: Sequence[Swing]) -> shapely.STRtree:
 
 def _is_leaf(shape: shapely.Polygon, swing: Swing) -> bool:
     thin, long = side_lengths(shape)
-    tip = min(shapely.distance(shape, shapely.Point(end)) for end in (swing.first, swing.last))
-    has_size = thin <= _THICK_LEAF_M and abs(long - swing.radius) <= 0.1 * swing.radius
-    return has_size and bool(tip <= 5 * _TOUCH_M)
+    is_at_tip = shapely.dwithin(shape, shapely.points([swing.first, swing.last]), 5 * _TOUCH_M).any()
+    return thin <= _THICK_LEAF_M and abs(long - swing.radius) <= 0.1 * swing.radius and bool(is_at_tip)
 
 
 def _arc(stroke: Stroke) -> Swing | None:
@@ -92,9 +91,8 @@ def _arc(stroke: Stroke) -> Swing | None:
 def _axis(lines: Sequence[shapely.LineString]) -> float:
     """Return the direction (radians, modulo a quarter turn) of most lines."""
     segments = segments_of(lines)
-    x, y = (segments[:, 2:] - segments[:, :2]).T
-    total = np.sum(np.hypot(x, y) * np.exp(4j * np.arctan2(y, x)))
-    return float(np.angle(total)) / 4.0
+    steps = (segments[:, 2:] - segments[:, :2]) @ [1.0, 1j]
+    return float(np.angle(np.sum(np.abs(steps) * np.exp(4j * np.angle(steps))))) / 4.0
 
 
 def _leaf(
@@ -103,13 +101,11 @@ def _leaf(
     points = shapely.get_coordinates(stroke.line)
     if len(points) != 2 or not LEAF_M[0] <= stroke.line.length <= LEAF_M[1]:
         return None
-    first, last = (
-        any(other != index for other in tree.query(shapely.Point(end), predicate="dwithin", distance=_TOUCH_M))
-        for end in points
-    )
-    if first == last:
+    end, other = tree.query(shapely.points(points), predicate="dwithin", distance=_TOUCH_M)
+    held = np.unique(end[other != index])
+    if len(held) != 1:
         return None
-    hinge, tip = points if first else points[::-1]
+    hinge, tip = points[held[0]], points[1 - held[0]]
     x, y = tip - hinge
     off_axis = abs((math.atan2(y, x) - axis + 0.25 * math.pi) % (0.5 * math.pi) - 0.25 * math.pi)
     arcs = [turning[k] for k in hinges.query(shapely.Point(hinge), **_NEAR)]

@@ -111,8 +111,8 @@ def drawing_scale(
     The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
     a unit has a length on paper (also "1:50 @ A1", on a page whose longer side is `paper_m`), then the dimensions of
     the first drawing that has them, then the `guess`, which is given the scales that are written if they are several.
-    `subject` names the file in the error message, and `check_time`
-    raises an exception to stop. The option `multiply` multiplies any of them.
+    `subject` names the file in the error message, and `check_time` raises an exception to stop. The option `multiply`
+    multiplies any of them.
     """
 
     def checked(metres_per_unit: float, source: str) -> tuple[float, str]:
@@ -147,8 +147,7 @@ def drawing_scale(
             return checked(*on_paper[0])
         drawn = (drawing for drawing in drawings if drawing.shapes)
         by_dimensions = (scale_by_dimensions(written_dimensions(part, check_time), part.extent) for part in drawn)
-        found = next(filter(None, by_dimensions), None) or guess(on_paper)
-        if found:
+        if found := next(filter(None, by_dimensions), None) or guess(on_paper):
             return checked(*found)
         hint = f" ({written[0][1]}, but it has no size on paper)" if written and not on_paper else ""
         hint = f" ({' and '.join(source for _, source in on_paper)})" if on_paper else hint
@@ -168,10 +167,11 @@ def drawing_scale(
 
 def _written_scales(texts: Sequence[str], paper_m: float) -> list[tuple[float, str]]:
     """Return the denominators of the scales written, for a page with the longer side `paper_m`, and their sources."""
-    texts = [
-        _INCHES.sub(lambda found: f"1:{12 * int(found[3]) * int(found[2] or 1) / int(found[1]):g}", text)
-        for text in texts
-    ]
+
+    def ratio(inches: re.Match[str]) -> str:
+        return f"1:{12 * int(inches[3]) * int(inches[2] or 1) / int(inches[1]):g}"
+
+    texts = [_INCHES.sub(ratio, text) for text in texts]
     scales = {int(match) for text in texts for match in _WRITTEN.findall(text)} & _USUAL
     # A page of no sheet's size is a part of one.
     is_sheet = any(abs(size_m / paper_m - 1.0) <= _TOLERANCE for size_m in _SHEETS_M.values())
@@ -249,7 +249,7 @@ def check_areas(
     """Compare the sizes of rooms with those written in them, `texts` of every room; `outside` are texts in no room."""
     areas = _written_areas([room.shape for room in rooms], texts)
     shares = {index: area_m2 / written_m2 for index, (written_m2, area_m2) in areas.items()}
-    middle = float(np.median(list(shares.values()))) if shares else 1.0
+    middle = float(np.median([*shares.values()] or [1.0]))
     agreeing = [index for index, share in shares.items() if abs(share / middle - 1.0) <= _AREA_TOLERANCE]
     is_sure, length = len(agreeing) >= _MIN_AREAS, math.sqrt(middle)
     # Without sizes that agree, the scale is believed.
@@ -382,7 +382,7 @@ def _lengths_at(place: shapely.Point, line: shapely.LineString, tree: shapely.ST
     whole = [line.length] if is_inside else []
     crossing = tree.geometries[tree.query(line, predicate="intersects")]
     marks = shapely.get_coordinates(shapely.intersection(crossing, line))
-    along = np.unique(np.round([line.project(shapely.Point(mark)) for mark in marks], 6))
+    along = np.unique(np.round(shapely.line_locate_point(line, shapely.points(marks)), 6))
     below, above = along[along < at], along[along > at]
     between = [float(above[0] - below[-1])] if len(below) and len(above) else []
     return [*whole, *(length for length in between if not whole or abs(length - whole[0]) > 1e-6)]
@@ -390,19 +390,14 @@ def _lengths_at(place: shapely.Point, line: shapely.LineString, tree: shapely.ST
 
 def values_m(text: str) -> tuple[float, ...]:
     """Return the lengths (m) that a text can mean."""
-    text = text.strip()
-    if match := _IMPERIAL.fullmatch(text):
+    values: list[float] = []
+    if match := _IMPERIAL.fullmatch(text.strip()):
         values = [METRES_PER_UNIT["ft"] * int(match[1]) + METRES_PER_UNIT["in"] * int(match[2] or 0)]
-    elif match := _METRIC.fullmatch(text):
+    elif match := _METRIC.fullmatch(text.strip()):
         number, unit = _number(match[1]), match[2]
-        if unit:
-            values = [number * METRES_PER_UNIT[unit]]
-        elif not match[1].isdigit():
-            values = [number]
-        else:
-            values = [0.001 * number] if number >= _SURELY_MM else [0.01 * number, 0.001 * number]
-    else:
-        values = []
+        usual = ("mm",) if number >= _SURELY_MM else ("cm", "mm")
+        units = (unit,) if unit else usual if match[1].isdigit() else ("m",)
+        values = [number * METRES_PER_UNIT[unit] for unit in units]
     return tuple(value for value in values if _LENGTH_M[0] <= value <= _LENGTH_M[1])
 
 

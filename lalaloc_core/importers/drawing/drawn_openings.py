@@ -77,18 +77,15 @@ def drawn_panes(
         area = _box(ends[index], ends[beside])
         if area is not None and _is_in_wall(area, walls):
             is_used[beside] = True
-            a, b, c, d = np.asarray(area.exterior.coords)[:4]
-            start, end = point_xy(0.5 * (a + d)), point_xy(0.5 * (b + c))
-            found.append(Gap(area, start, end, is_between_ends=True, is_pane=True))
+            start, end = np.asarray(area.exterior.coords)[[[0, 3], [1, 2]]].mean(axis=1)
+            found.append(Gap(area, point_xy(start), point_xy(end), is_between_ends=True, is_pane=True))
     return found
 
 
 def _are_beside(line: Float[np.ndarray, "2 2"], others: Float[np.ndarray, "n 2 2"]) -> Bool[np.ndarray, "n"]:
     """Return which lines are parallel to a line, given by their ends, and end beside it; a line is beside itself."""
     along = (line[1] - line[0]) / math.dist(*line)
-    places = (others - line[0]) @ along
-    is_backward = places[:, 0] > places[:, 1]
-    places = np.where(is_backward[:, None], places[:, ::-1], places)
+    places = np.sort((others - line[0]) @ along, axis=1)
     step = others[:, 1] - others[:, 0]
     turn = np.abs(step[:, 0] * along[1] - step[:, 1] * along[0]) / np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     apart = np.abs(places - [0.0, math.dist(*line)]).max(axis=1)
@@ -151,11 +148,11 @@ def cut_painted(
                 "as many; remove areas that are drawn over walls"
             )
         parts = [(k, shapely.intersection(body, patches[k].shape)) for k in over]
-        covered = [part for _, part in parts if part.area > 0.0]
-        for k, part in parts:
-            if part.area > 0.0:
-                hidden.setdefault(k, []).append(part)
-        visible += polygons_from_geometry(shapely.difference(body, shapely.union_all(covered))) if covered else [body]
+        covered = [(k, part) for k, part in parts if part.area > 0.0]
+        for k, part in covered:
+            hidden.setdefault(k, []).append(part)
+        rest = shapely.difference(body, shapely.union_all([part for _, part in covered]))
+        visible += polygons_from_geometry(rest) if covered else [body]
     walls = shapely.STRtree(visible)
     gaps: list[Gap] = []
     for k, parts in hidden.items():

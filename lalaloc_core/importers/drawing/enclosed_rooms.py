@@ -133,15 +133,11 @@ def find_gaps(
     areas = WallAreas(
         [simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))]
     )
-    ends: list[_End] = []
-    blunt: list[_End] = []
-    for part in areas.parts:
-        check_time()
-        oriented = shapely.geometry.polygon.orient(part)
-        for ring in (oriented.exterior, *oriented.interiors):
-            ends += _ends(np.asarray(ring.coords), config)
-            if config.blunt:
-                blunt += _ends(np.asarray(ring.simplify(config.blunt).coords), config)
+    rings = shapely.get_rings(shapely.orient_polygons(areas.parts))
+    ends = [end for ring in rings for end in _ends(shapely.get_coordinates(ring), config)]
+    check_time()
+    coarse = shapely.simplify(rings, config.blunt) if config.blunt else []
+    blunt = [end for ring in coarse for end in _ends(shapely.get_coordinates(ring), config)]
     usual = float(np.median([wall.thickness for wall in ends if wall.thickness <= config.thickest] or [0.0]))
     # Most ends are found twice, as they are and blunt.
     found: dict[tuple[tuple[float, float], tuple[float, float]], Gap] = {}
@@ -254,14 +250,18 @@ def _faces(
     lines: Sequence[shapely.LineString], config: WallConfig, check_time: Callable[[], None]
 ) -> tuple[list[shapely.Polygon], list[shapely.LineString]]:
     """Return the areas between the joined lines, and the lines that bound no area."""
-    network = shapely.unary_union(shapely.set_precision(shapely.multilinestrings(list(lines)), 0.001))
+    segments = _network(lines)
     check_time()
-    segments = [part for part in shapely.get_parts(network) if part.length > 0.0]
     joined = shapely.unary_union([*segments, *_joints(segments, config)])
     check_time()
     polygons, cuts, dangles, _ = shapely.polygonize_full(list(shapely.get_parts(joined)))
-    loose = [*shapely.get_parts(cuts), *shapely.get_parts(dangles)]
-    return list(shapely.get_parts(polygons)), [line for line in loose if isinstance(line, shapely.LineString)]
+    return list(shapely.get_parts(polygons)), [*shapely.get_parts(cuts), *shapely.get_parts(dangles)]
+
+
+def _network(lines: Sequence[shapely.LineString]) -> list[shapely.LineString]:
+    """Return the pieces of lines between their crossings, rounded to 1 mm."""
+    joined = shapely.unary_union(shapely.set_precision(shapely.multilinestrings(list(lines)), 0.001))
+    return [part for part in shapely.get_parts(joined) if part.length > 0.0]
 
 
 def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[shapely.LineString]:
@@ -274,14 +274,10 @@ def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[
     ends_tree = shapely.STRtree(points)
     joints = []
     for index, point in enumerate(points):
-        near = [
-            segments[k]
-            for k in tree.query(point, predicate="dwithin", distance=config.snap)
-            if shapely.distance(segments[k], point) > 1e-9
-        ]
-        if near:
-            nearest = min(near, key=lambda line: shapely.distance(line, point))
-            joints.append(shapely.shortest_line(point, nearest))
+        near = tree.geometries[tree.query(point, predicate="dwithin", distance=config.snap)]
+        apart = shapely.distance(near, point)
+        if (apart > 1e-9).any():
+            joints.append(shapely.shortest_line(point, near[np.where(apart > 1e-9, apart, np.inf).argmin()]))
             continue
         beside = _near(ends_tree, point, config.thickest)
         steps = ends[beside] - ends[index]
@@ -320,8 +316,7 @@ def _from_single_lines(
     """Find rooms between walls without thickness; gaps lie in front of loose ends."""
     if not lines:
         return Enclosed([], [], shapely.Polygon())
-    network = shapely.unary_union(shapely.set_precision(shapely.multilinestrings(list(lines)), 0.001))
-    segments = [part for part in shapely.get_parts(network) if part.length > 0.0]
+    segments = _network(lines)
     ends, outward = _loose_ends(segments)
     tree, ends_tree = shapely.STRtree(segments), shapely.STRtree(np.asarray(shapely.points(ends)))
     gaps: list[Gap] = []
@@ -340,11 +335,9 @@ def _from_single_lines(
         apart = np.linalg.norm(steps, axis=1)
         is_facing = (apart > 1e-6) & (apart <= config.widest_gap) & (steps @ direction > 0.99 * apart)
         width = min([*reached, *apart[is_facing].tolist()], default=0.0)
-        if width <= 0.0:
-            continue
-        far = end + width * direction
-        line = shapely.LineString([end, end + (width + 0.002) * direction])
-        gaps.append(Gap(line.buffer(0.001), point_xy(end), point_xy(far)))
+        if width > 0.0:
+            line = shapely.LineString([end, end + (width + 0.002) * direction])
+            gaps.append(Gap(line.buffer(0.001), point_xy(end), point_xy(end + width * direction)))
     joints = [line.buffer(0.002) for line in (*corners, *(shapely.LineString([g.start, g.end]) for g in gaps))]
     walls = shapely.unary_union([line.buffer(0.002) for line in segments])
     distinct = {tuple(sorted((gap.start, gap.end))): gap for gap in gaps if gap.width >= config.narrowest_gap}
@@ -354,23 +347,15 @@ def _from_single_lines(
 def _insides(
     pieces: Sequence[BaseGeometry], config: WallConfig, check_time: Callable[[], None]
 ) -> list[shapely.Polygon]:
-    """Return the areas enclosed by the union of some pieces that are large enough for a room."""
+    """Return the areas enclosed by the union of some pieces that are large enough for a room, the largest first."""
     parts = polygons_from_geometry(shapely.unary_union(list(pieces)))
-    tree = shapely.STRtree(parts)
+    filled = shapely.union_all([shapely.Polygon(part.exterior) for part in parts])
     rooms = []
-    for index, part in enumerate(parts):
-        for ring in part.interiors:
-            check_time()
-            hole = shapely.Polygon(ring)
-            # The walls around a hole do not reach into it, so the islands alone are taken out.
-            islands = [parts[k] for k in tree.query(hole, predicate="intersects") if k != index]
-            inside = hole.difference(shapely.union_all(islands)) if islands else hole
-            for floor in polygons_from_geometry(inside):
-                if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config.shallowest_room):
-                    rooms.append(floor.simplify(0.004))
-    # Rooms inside an island of walls are found twice.
-    rooms.sort(key=lambda room: -room.area)
-    return [rooms[index] for index in without_overlaps(rooms, 0.5)]
+    for floor in polygons_from_geometry(shapely.difference(filled, shapely.MultiPolygon(parts))):
+        check_time()
+        if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config.shallowest_room):
+            rooms.append(floor.simplify(0.004))
+    return sorted(rooms, key=lambda room: -room.area)
 
 
 def _is_thin(face: shapely.Polygon, depth_m: float) -> bool:

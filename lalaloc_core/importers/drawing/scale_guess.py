@@ -128,14 +128,11 @@ def guess_scale(sketch: Callable[[float], Measures], start: float, budget: Budge
     # The readings on the way are no steps of their own.
     (trace, budget.trace), (on_step, budget.on_step) = (budget.trace, None), (budget.on_step, None)
     end_s = budget.elapsed_s + _SHARE_OF_TIME * budget.limits.max_import_s
+    guesses = (_settle(sketch, share * start, end_s, budget) for share in _FIRST_SHARES)
     try:
-        for share in _FIRST_SHARES:
-            guess = _settle(sketch, share * start, end_s, budget)
-            if guess is not None or budget.elapsed_s > end_s:
-                return guess
+        return next((guess for guess in guesses if guess is not None or budget.elapsed_s > end_s), None)
     finally:
         budget.trace, budget.on_step = trace, on_step
-    return None
 
 
 def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, budget: Budget) -> ScaleGuess | None:
@@ -144,11 +141,10 @@ def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, bud
     for _ in range(_MAX_PASSES):
         budget.check_time()
         try:
-            measures = sketch(scale)
+            guess = combine(sketch(scale), scale)
         except InvalidFloorPlanError:
             budget.check_time()
-            measures = Measures()
-        guess = combine(measures, scale)
+            guess = None
         if guess is None or abs(math.log(guess.metres_per_unit / scale)) <= _CONVERGED or budget.elapsed_s > end_s:
             break
         scale = guess.metres_per_unit
@@ -162,14 +158,15 @@ def _settle(sketch: Callable[[float], Measures], scale: float, end_s: float, bud
 def combine(measures: Measures, around: float) -> ScaleGuess | None:
     """Return the scale by all clues near a scale, None without clues."""
     grid = math.log(around) + np.arange(-_REACH, _REACH + _STEP, _STEP)
-    prior = _normal(grid, math.log(_EXTENT[0] / measures.extent), _EXTENT[1], 0.05) if measures.extent > 0.0 else 0.0
+    prior = np.zeros(len(grid))
+    if measures.extent > 0.0:
+        prior = _or_wrong(_normal(grid, math.log(_EXTENT[0] / measures.extent), _EXTENT[1]), 0.05)
     kinds = {kind: found for kind, found in _likelihoods(measures, grid).items() if found[0]}
     if not kinds:
         return None
     bounded = [_bounded(likelihood, _MISLEADS[kind]) for kind, (_, likelihood) in kinds.items()]
-    middle, std = _middle(sum(bounded, start=prior + np.zeros(len(grid))), grid)
-    clues = []
-    agreeing = _agreeing(measures, math.exp(middle))
+    middle, std = _middle(sum(bounded, start=prior), grid)
+    clues, agreeing = [], _agreeing(measures, math.exp(middle))
     for kind, (count, likelihood) in kinds.items():
         own, own_std = _middle(likelihood + prior, grid)
         limit = min(max(_AGREE_STDS * math.hypot(own_std, std), _AGREE), max(1.8 * own_std, _CONTRADICTS))
@@ -221,8 +218,8 @@ def _likelihoods(measures: Measures, grid: Likelihood) -> dict[str, tuple[int, L
     none = np.zeros(len(grid))
 
     def usual(kind: str, sizes: Sequence[tuple[float, tuple[float, float]]]) -> tuple[int, Likelihood]:
-        terms = [_normal(grid, math.log(m / size), std, _WRONG[kind]) for size, (m, std) in sizes if size > 0.0]
-        return len(terms), sum(terms, start=none)
+        densities = [_normal(grid, math.log(m / size), std) for size, (m, std) in sizes if size > 0.0]
+        return len(densities), sum((_or_wrong(density, _WRONG[kind]) for density in densities), start=none)
 
     dimensions = [_dimension(grid, dimension) for dimension in measures.dimensions]
     # Stairs of one home are alike, so all of them tell what one does.
@@ -239,41 +236,33 @@ def _likelihoods(measures: Measures, grid: Likelihood) -> dict[str, tuple[int, L
 
 def _leaves(grid: Likelihood, leaves: Sequence[float]) -> Likelihood:
     """Return the likelihood of leaves' widths, blurred as doors of a home are alike."""
-    total = np.zeros(len(grid))
+    total, (low, high) = np.zeros(len(grid)), np.log(_LEAF_M)
     for leaf in leaves:
         size = grid + math.log(leaf)
-        low, high = (math.log(edge) for edge in _LEAF_M)
-        inside = _sigmoid((size - low) / _LEAF_EDGE) * _sigmoid((high - size) / _LEAF_EDGE) / (high - low)
-        usual = np.exp(-0.5 * ((size - math.log(_USUAL_LEAF_M)) / _LEAF_STD) ** 2) / (
-            _LEAF_STD * math.sqrt(2 * math.pi)
-        )
-        density = (1.0 - _OTHER_ARCS) * 0.5 * (inside + usual) + _OTHER_ARCS / (2.0 * _REACH)
-        total += np.log(density)
-    if not leaves:
-        return total
-    kernel_at = np.arange(-4.0 * _ALIKE_STD, 4.0 * _ALIKE_STD + _STEP, _STEP)
-    kernel = np.exp(-0.5 * (kernel_at / _ALIKE_STD) ** 2)
+        above, below = (1.0 + np.tanh(0.5 * (edge / _LEAF_EDGE)) for edge in (size - low, high - size))
+        inside = 0.25 * above * below / (high - low)
+        total += _or_wrong(0.5 * (inside + _normal(size, math.log(_USUAL_LEAF_M), _LEAF_STD)), _OTHER_ARCS)
+    kernel = _normal(np.arange(-4.0 * _ALIKE_STD, 4.0 * _ALIKE_STD + _STEP, _STEP), 0.0, _ALIKE_STD)
     blurred = np.convolve(np.exp(total - total.max()), kernel / kernel.sum(), mode="same")
     return np.log(np.maximum(blurred, 1e-300)) + float(total.max())
 
 
-def _sigmoid(values: Likelihood) -> Likelihood:
-    return 1.0 / (1.0 + np.exp(-np.clip(values, -50.0, 50.0)))
+def _normal(grid: Likelihood, middle: float, std: float) -> Likelihood:
+    """Return a normal density."""
+    return np.exp(-0.5 * ((grid - middle) / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
 
 
-def _normal(grid: Likelihood, middle: float, std: float, wrong: float) -> Likelihood:
-    """Return the logarithm of a normal density, and of a flat one for the share of parts that are `wrong`."""
-    density = np.exp(-0.5 * ((grid - middle) / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
+def _or_wrong(density: Likelihood, wrong: float) -> Likelihood:
+    """Return the logarithm of a density, and of a flat one for the share of parts that are `wrong`."""
     return np.log((1.0 - wrong) * density + wrong / (2.0 * _REACH))
 
 
 def _dimension(grid: Likelihood, dimension: Dimension) -> Likelihood:
     """Return the likelihood of a written length: one of the lines beside it is meant, or none."""
     text, lengths = dimension
-    pairs = [(value_m, length) for value_m in values_m(text) for length in lengths if length > 0.0]
-    terms = [np.exp(-0.5 * ((grid - math.log(value_m / length)) / _DIMENSION_STD) ** 2) for value_m, length in pairs]
-    density = sum(terms, start=np.zeros(len(grid))) / (_DIMENSION_STD * math.sqrt(2.0 * math.pi) * max(len(terms), 1))
-    return np.log((1.0 - _WRONG["dimension"]) * density + _WRONG["dimension"] / (2.0 * _REACH))
+    ratios = [value_m / length for value_m in values_m(text) for length in lengths if length > 0.0]
+    terms = [_normal(grid, math.log(ratio), _DIMENSION_STD) for ratio in ratios]
+    return _or_wrong(sum(terms, start=np.zeros(len(grid))) / max(len(terms), 1), _WRONG["dimension"])
 
 
 def _bounded(log_density: Likelihood, wrong: float) -> Likelihood:
@@ -309,26 +298,19 @@ def tread_spacings(lines: Iterable[shapely.LineString]) -> list[float]:
         size = round(np.log(length) / (2.0 * _FLUSH))
         unit = 2.0 * _FLUSH * np.exp(2.0 * _FLUSH * size)
         across[is_vertical, size, round((first + last) / unit)].append((level, length))
-    found = []
-    for group in across.values():
-        if len(group) >= _MIN_LINES:
-            found += _flights(sorted(group))
-    return found
+    return [spacing for group in across.values() if len(group) >= _MIN_LINES for spacing in _flights(sorted(group))]
 
 
 def _flights(lines: list[tuple[float, float]]) -> list[float]:
     """Return the spacing of each run of equally spaced lines, given as (level, length)."""
-    levels = np.array([level for level, _ in lines])
-    length = float(np.median([length for _, length in lines]))
-    levels = levels[np.concatenate([[True], np.diff(levels) > 1e-6 * length])]
+    levels, lengths = np.array(lines).T
+    length = float(np.median(lengths))
     steps = np.diff(levels)
-    found: list[float] = []
-    begin = 0
-    for end in range(1, len(steps) + 1):
-        if end < len(steps) and abs(steps[end] / steps[begin] - 1.0) <= _EVEN:
-            continue
-        spacing = float(np.mean(steps[begin:end]))
-        if end - begin >= _MIN_LINES - 1 and _WIDE[0] <= length / spacing <= _WIDE[1]:
-            found.append(spacing)
-        begin = end
-    return found
+    runs: list[list[float]] = []
+    for step in steps[steps > 1e-6 * length].tolist():
+        if runs and abs(step / runs[-1][0] - 1.0) <= _EVEN:
+            runs[-1].append(step)
+        else:
+            runs.append([step])
+    spacings = [sum(run) / len(run) for run in runs if len(run) >= _MIN_LINES - 1]
+    return [spacing for spacing in spacings if _WIDE[0] <= length / spacing <= _WIDE[1]]

@@ -68,7 +68,7 @@ def _convert(content: bytes, budget: Budget) -> bytes:
 def _run(command: list[str], folder: str, budget: Budget) -> str:
     """Run a converter until it ends, and return what it complained about."""
     limits, most_bytes = budget.limits, budget.limits.max_unpacked_bytes
-    left_s = limits.max_import_s - (budget.clock() - budget.started_s)
+    left_s = limits.max_import_s - budget.elapsed_s
     environment = {"PATH": os.environ.get("PATH", os.defpath), "HOME": folder, "QT_QPA_PLATFORM": "offscreen"}
 
     with tempfile.TemporaryFile() as output:

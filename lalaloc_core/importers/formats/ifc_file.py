@@ -67,15 +67,13 @@ def _check_placements(model: Any) -> None:
     for placement in model.by_type("IfcLocalPlacement"):
         chain: list[int] = []
         while placement is not None and placement.id() not in depths and placement.is_a("IfcLocalPlacement"):
-            if placement.id() in chain or len(chain) >= _MAX_PLACEMENTS:
-                break
+            if placement.id() in chain:
+                raise InvalidFloorPlanError(
+                    f"the IfcLocalPlacement #{placement.id()} is relative to itself; export the model again"
+                )
             chain.append(placement.id())
-            placement = placement.PlacementRelTo
+            placement = None if len(chain) >= _MAX_PLACEMENTS else placement.PlacementRelTo
         depth = 0 if placement is None else depths.get(placement.id(), 0)
-        if placement is not None and placement.id() in chain:
-            raise InvalidFloorPlanError(
-                f"the IfcLocalPlacement #{placement.id()} is relative to itself; export the model again"
-            )
         if depth + len(chain) >= _MAX_PLACEMENTS:
             raise InvalidFloorPlanError(
                 f"the IfcLocalPlacement #{chain[0]} is relative to more than {_MAX_PLACEMENTS} others in a chain, "
@@ -103,18 +101,15 @@ def find_anchor(model: Any, unit: float) -> Anchor | None:
 
     `unit` is the length of the model's unit (m).
     """
-    mapped = _map_conversion(model)
-    if mapped is not None:
+    if (mapped := _map_conversion(model)) is not None:
         return mapped
     north_deg = _true_north_deg(model)
     for site in model.by_type("IfcSite"):
-        if not site.RefLatitude or not site.RefLongitude:
-            continue
-        latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
-        if abs(latitude) > 90.0 or abs(longitude) > 180.0:
-            continue
-        altitude = None if site.RefElevation is None else float(site.RefElevation) * unit
-        return _at_origin(Anchor(latitude, longitude, altitude, north_deg), site, unit)
+        if site.RefLatitude and site.RefLongitude:
+            latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
+            altitude = None if site.RefElevation is None else float(site.RefElevation) * unit
+            if abs(latitude) <= 90.0 and abs(longitude) <= 180.0:
+                return _at_origin(Anchor(latitude, longitude, altitude, north_deg), site, unit)
     return None
 
 
@@ -127,9 +122,9 @@ def _map_conversion(model: Any) -> Anchor | None:
         east, north = float(conversion.Eastings), float(conversion.Northings)
         try:
             # A step along grid north gives the angle between grid north and true north.
-            lon_lat = to_wgs84(code, np.array([[east, north]]))
-            frame = LocalFrame(float(lon_lat[0, 0]), float(lon_lat[0, 1]))
-            step = frame.to_local(to_wgs84(code, np.array([[east, north + 100.0]])))[0]
+            lon_lat = to_wgs84(code, np.array([[east, north], [east, north + 100.0]]))
+            frame = LocalFrame(*map(float, lon_lat[0]))
+            step = frame.to_local(lon_lat[1:])[0]
         except ProjError:
             continue
         if not np.isfinite(step).all():

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
+import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
@@ -33,15 +33,13 @@ def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> 
         raise InvalidFloorPlanError(
             f"the archive has no unit.geojson, it has {found}; send an IMDF archive or one IFC model"
         )
-    features = []
-    for kind in _FEATURE_TYPES:
-        if kind in by_type:
-            document = _read_member(files, by_type[kind], budget)
-            # The standard requires the type in every feature; some tools give it in the file's name only.
-            features += [
-                replace(feature, properties={"feature_type": kind} | dict(feature.properties))
-                for feature in parse_features(document, budget)
-            ]
+    # The standard requires the type in every feature; some tools give it in the file's name only.
+    features = [
+        replace(feature, properties={"feature_type": kind} | dict(feature.properties))
+        for kind in _FEATURE_TYPES
+        if kind in by_type
+        for feature in parse_features(_read_member(files, by_type[kind], budget), budget)
+    ]
     levels = _levels(_read_member(files, by_type["level"], budget)) if "level" in by_type else {}
     return import_features(features, None, "imdf", options, budget, levels)
 
@@ -70,9 +68,10 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
         key = feature.get("id") or f"{kind}-{number}"
         own_id = str(uuid.uuid5(_NAMESPACE, f"{name}/{key}"))
         by_type[kind].append(_feature(kind, own_id, feature["geometry"], properties))
-    outline = file_rings([_bounding_box(document)], anchor)
-    context = {"venue": {"category": "unspecified", "name": {"en": name}, "address_id": None},
-               "building": {"category": "unspecified", "name": {"en": name}, "address_id": None},
+    x0, y0, x1, y1 = shapely.total_bounds([shapely.Polygon(room["polygon"]) for room in document["rooms"]])
+    outline = file_rings([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]]], anchor)
+    site = {"category": "unspecified", "name": {"en": name}, "address_id": None}
+    context = {"venue": site, "building": site,
                "footprint": {"category": "ground", "name": None, "building_ids": [ids["building"]]},
                "level": {"category": "unspecified", "ordinal": 0, "outdoor": False, "short_name": {"en": "0"},
                          "name": {"en": name}, "building_ids": [ids["building"]]}}  # fmt: skip
@@ -100,21 +99,14 @@ def _levels(document: Any) -> dict[str, Level]:
     features = document.get("features") if isinstance(document, Mapping) else None
     for feature in features if isinstance(features, list) else []:
         properties = feature.get("properties") if isinstance(feature, Mapping) else None
-        if not isinstance(properties, Mapping) or not isinstance(feature.get("id"), str):
-            continue
-        ordinal = properties.get("ordinal")
-        number = float(ordinal) if isinstance(ordinal, int | float) and abs(ordinal) < 1e6 else None
-        name = _text(properties.get("name")) or _text(properties.get("short_name")) or f"{ordinal}"
-        found[feature["id"]] = Level(name, number)
+        if isinstance(properties, Mapping) and isinstance(feature.get("id"), str):
+            ordinal = properties.get("ordinal")
+            number = float(ordinal) if isinstance(ordinal, int | float) and abs(ordinal) < 1e6 else None
+            name = _text(properties.get("name")) or _text(properties.get("short_name")) or f"{ordinal}"
+            found[feature["id"]] = Level(name, number)
     return found
 
 
 def _text(value: Any) -> str | None:
     value = in_english(value)
     return value[:200] if isinstance(value, str) and value.strip() else None
-
-
-def _bounding_box(document: Mapping[str, Any]) -> list[list[float]]:
-    corners = np.concatenate([np.asarray(room["polygon"], dtype=float) for room in document["rooms"]])
-    (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
-    return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]

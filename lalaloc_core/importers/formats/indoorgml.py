@@ -17,7 +17,6 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
@@ -61,15 +60,14 @@ class _Door:
 
 def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Read one plan per storey, lowest first."""
-    root = read_xml(content, budget)
-    srs = next((found for element in root.iter() if (found := element.get("srsName"))), "")
+    elements = list(read_xml(content, budget).iter())
+    srs = next((found for element in elements if (found := element.get("srsName"))), "")
     if _SRS_UNITS.search(srs):
         raise InvalidFloorPlanError(
             f"the coordinates of the IndoorGML file are degrees ({srs[:100]}); export it in metres, in a projected or "
             "local coordinate system"
         )
     factor = METRES_PER_UNIT[options.units or "m"]
-    elements = list(root.iter())
     read_cells = [(element, _cell(element, factor, budget)) for element in elements if local_name(element) in _CELLS]
     cells = [cell for _, cell in read_cells if cell is not None]
     without = [_text(element, "name") or _key(element) or "?" for element, cell in read_cells if cell is None]
@@ -92,12 +90,9 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             builder.warnings.append(f"{len(without)} cells have no geometry with a floor and were left out: {named}")
         for cell in members:
             builder.use(cell.kind or "CellSpace", "rooms")
-            is_usual = cell.height is not None and ROOM_HEIGHT_M[0] <= cell.height <= ROOM_HEIGHT_M[1]
+            is_usual = ROOM_HEIGHT_M[0] <= (cell.height or 0.0) <= ROOM_HEIGHT_M[1]
             height_m = cell.height if is_usual else None
-            sketch.rooms += [
-                SketchedRoom(part, cell.name, room_types_from_name(cell.name), height_m, cell.key)
-                for part in cell.floor.parts
-            ]
+            sketch.rooms += [SketchedRoom(part, cell.name, (), height_m) for part in cell.floor.parts]
             report_floor(f"cell '{cell.name or cell.key}'", cell.floor, builder)
         lowest = level.elevation_m or 0.0
         on_level = [door for door in doors if lowest - _STOREY_M < door.low < lowest + _STOREY_M]
@@ -123,9 +118,7 @@ def _doors(elements: list[Element], factor: float, budget: Budget) -> Iterator[_
     boundaries = {_key(element): element for element in elements if local_name(element) in _BOUNDARIES}
     drawn = {key for key, element in boundaries.items() if local_name(element) in _DOOR_BOUNDARIES}
     plain = []
-    for element in elements:
-        if local_name(element) != "Transition":
-            continue
+    for element in (element for element in elements if local_name(element) == "Transition"):
         dual = _reference(element, "duality")
         if dual in boundaries and next(_rings(boundaries[dual], "cellSpaceBoundaryGeometry", budget), None) is not None:
             drawn.add(dual)
@@ -223,9 +216,8 @@ def _dimension(part: Element, values: list[float]) -> int:
     stated = part.get("srsDimension")
     if stated in ("2", "3"):
         return int(stated)
-    if local_name(part) == "pos":
-        return 2 if len(values) == 2 else 3
-    return 3 if len(values) % 3 == 0 else 2
+    is_flat = len(values) == 2 if local_name(part) == "pos" else len(values) % 3 != 0
+    return 2 if is_flat else 3
 
 
 def _key(element: Element, attribute: str = "id") -> str | None:

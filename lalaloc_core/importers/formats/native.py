@@ -95,13 +95,11 @@ def _read_plan(document: Any, options: ImportOptions, budget: Budget) -> Importe
     _check_ceiling_units(plan)
     limits = budget.limits.plan
     parsed = FloorPlan.from_dict(plan, limits)
-    rooms = plan["rooms"]
-    budget.spend(len(rooms))
-    builder.use("rooms", "rooms", len(rooms))
-    for opening in plan.get("openings") or ():
-        builder.use("openings", str(opening["kind"]))
-    for fixture in plan.get("fixtures") or ():
-        builder.use("fixtures", str(fixture["kind"]))
+    budget.spend(len(plan["rooms"]))
+    builder.use("rooms", "rooms", len(plan["rooms"]))
+    for key in ("openings", "fixtures"):
+        for part in plan.get(key) or ():
+            builder.use(key, str(part["kind"]))
     builder.warnings.extend(check_document(parsed.to_dict()))
     return ImportedPlan(plan, builder.build(), anchor=parsed.anchor, checked=(limits, parsed))
 
@@ -122,7 +120,14 @@ def _convert(document: dict[str, Any], factor: float, y_factor: float) -> dict[s
         anchor = plan["anchor"] = dict(plan["anchor"])
         holders.append(anchor)
         if isinstance(points := anchor.get("control_points"), list):
-            anchor["control_points"] = [_control_point(point, factor, y_factor) for point in points]
+            # Their altitude is always in metres.
+            scales = {"x": factor, "y": y_factor}
+            anchor["control_points"] = [
+                {key: _to_metres(value, scales.get(key, 1.0)) for key, value in point.items()}
+                if isinstance(point, Mapping)
+                else point
+                for point in points
+            ]
     for holder in holders if y_factor < 0.0 else ():
         north_deg = holder.get("north_deg")
         if is_number(north_deg) and abs(north_deg) < _MAX_NUMBER:
@@ -137,24 +142,14 @@ def _part(part: Mapping[str, Any], shapes: tuple[str, ...], factor: float, y_fac
     return lengths | {key: _scale(part[key], factor, y_factor) for key in shapes if key in part}
 
 
-def _control_point(point: Any, factor: float, y_factor: float) -> Any:
-    """Convert a control point of an anchor from units of the drawing; its altitude is always in metres."""
-    if not isinstance(point, Mapping):
-        return point
-    scales = {"x": factor, "y": y_factor}
-    return {key: _to_metres(value, scales.get(key, 1.0)) for key, value in point.items()}
-
-
 def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
     plan = dict(document)
     for key in _LENGTHS:
         short = key.removesuffix("_m")
-        if short not in plan:
-            continue
-        if key in plan:
+        if short in plan and key in plan:
             raise InvalidFloorPlanError(f"'{short}' and '{key}' are both set; give only one of them")
-        value = plan.pop(short)
-        plan[key] = _to_metres(value, factor)
+        if short in plan:
+            plan[key] = _to_metres(plan.pop(short), factor)
     return plan
 
 
@@ -179,8 +174,7 @@ def _check_ceiling_units(plan: Mapping[str, Any]) -> None:
         height = holder.get("ceiling_height_m")
         if not is_number(height) or not 20.0 < height < _MAX_NUMBER:
             continue
-        unit = likely_unit(float(height), USUAL_CEILING_M)
-        if unit is not None:
+        if (unit := likely_unit(float(height), USUAL_CEILING_M)) is not None:
             raise InvalidFloorPlanError(
                 f"ceiling_height_m is {height:g} m; the limit is 20 m. It looks like {unit}: "
                 f'rename it to \'ceiling_height\' and set "units": "{unit}"'

@@ -102,9 +102,8 @@ def _position(element: Any) -> _Position | None:
 
 def _line(element: Mapping[str, Any], nodes: Mapping[Any, _Position], budget: Budget) -> list[_Position]:
     """Return the positions of a way: those of its nodes, else those that `out geom` adds."""
-    nodes_of_way, geometry = element.get("nodes"), element.get("geometry")
-    references = nodes_of_way if isinstance(nodes_of_way, list) else []
-    points = [nodes.get(key) for key in references if isinstance(key, str | int)]
+    keys, geometry = element.get("nodes"), element.get("geometry")
+    points = [nodes.get(key) for key in keys if isinstance(key, str | int)] if isinstance(keys, list) else []
     if None in points or not points:
         points = [_position(point) for point in geometry] if isinstance(geometry, list) else []
     budget.spend(len(points))
@@ -127,10 +126,9 @@ def _multipolygon(
     for member in members if isinstance(members, list) else []:
         if isinstance(member, Mapping) and member.get("type") == "way":
             points = lines.get(member.get("ref"), [])
-            if len(points) < 2 and isinstance(member.get("geometry"), list):
-                points = [point for raw in member["geometry"] if (point := _position(raw)) is not None]
             # A way can be a part of many relations.
             budget.spend(len(points))
+            points = _line(member, {}, budget) if len(points) < 2 else points
             if len(points) >= 2:
                 rings[member.get("role") == "inner"].append(shapely.LineString(points))
     for role in (False, True):

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -18,35 +17,30 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number
-from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates, point_xy, polygons_from_geometry
-from lalaloc_core.importers.common.sketch import OpeningKind, Point, SketchedFixture, SketchedOpening
+from lalaloc_core.importers.common.sketch import OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 
 _OPENINGS: Mapping[str, OpeningKind] = {"doors": "door", "windows": "window", "openings": "passage"}
 # Walls that enclose less than this share of the floors have gaps; the floors' outlines are used then.
 _ENCLOSED_SHARE = 0.8
+# Corners of a flat rectangle of unit size.
+_CORNERS = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 # A sill nearer to the floor is rounding of the scan (m).
 _MIN_SILL_M = 0.1
 # Walls beside a room have their middle within this distance of it (m).
 _BESIDE_M = 0.3
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """Upright rectangle: its ends seen from above, and the heights of its edges (m)."""
+class _Surface(NamedTuple):
+    """Upright rectangle: its line seen from above, and the heights of its edges (m)."""
 
-    start: Point
-    end: Point
+    line: shapely.LineString
     low_m: float
     high_m: float
-
-    @property
-    def line(self) -> shapely.LineString:
-        return shapely.LineString([self.start, self.end])
 
 
 def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -83,18 +77,18 @@ def _sketch(surfaces: Mapping[str, Sequence[Mapping[str, Any]]], builder: Report
     labels = _labels(rooms, surfaces["sections"])
     for index, room in enumerate(rooms):
         budget.check_time()
-        name = labels.get(index)
         around = [walls[k] for k in middles.query(room, predicate="dwithin", distance=_BESIDE_M)]
         height_m = float(np.median([wall.high_m - floor_m for wall in around])) if around else None
-        sketch.rooms.append(SketchedRoom(room, name, room_types_from_name(name), height_m))
+        sketch.rooms.append(SketchedRoom(room, labels.get(index), (), height_m))
     for index, raw in enumerate(surfaces["objects"]):
         _add_object(raw, f"object {index}", sketch, builder)
     for key, kind in _OPENINGS.items():
         for index, raw in enumerate(surfaces[key]):
-            part = _surface(raw, f"{key} {index}")
+            line, low_m, high_m = _surface(raw, f"{key} {index}")
             builder.use(key, kind)
-            sill_m = part.low_m - floor_m if part.low_m - floor_m >= _MIN_SILL_M else None
-            sketch.openings.append(SketchedOpening(kind, part.start, part.end, None, sill_m, part.high_m - floor_m))
+            sill_m = low_m - floor_m if low_m - floor_m >= _MIN_SILL_M else None
+            start, end = map(point_xy, line.coords)
+            sketch.openings.append(SketchedOpening(kind, start, end, None, sill_m, high_m - floor_m))
     return sketch
 
 
@@ -105,10 +99,8 @@ def _add_object(raw: Mapping[str, Any], where: str, sketch: Sketch, builder: Rep
     kind = fixture_from_name(name if isinstance(name, str) else None)
     builder.use(f"objects: {str(name)[:50]}", "fixtures" if kind else "ignored")
     if kind is not None:
-        width_m, _, depth_m = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}").tolist()
-        corners = [[x * width_m, 0.0, z * depth_m] for x, z in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
-        outline = shapely.Polygon(_from_above(_place(np.array(corners), raw, where)))
-        sketch.fixtures += [SketchedFixture(kind, part) for part in polygons_from_geometry(outline)]
+        corners = _CORNERS[:, [0, 2, 1]] * _numbers(raw.get("dimensions"), 3, f"dimensions of {where}")
+        sketch.fixtures += [SketchedFixture(kind, part) for part in _outlines(corners, raw, where)]
 
 
 def _objects(document: Mapping[str, Any], key: str, budget: Budget) -> Iterator[Mapping[str, Any]]:
@@ -130,8 +122,7 @@ def _surface(raw: Mapping[str, Any], where: str) -> _Surface:
     width_m, height_m, _ = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}").tolist()
     ends = _place(np.array([[-0.5 * width_m, 0.0, 0.0], [0.5 * width_m, 0.0, 0.0]]), raw, where)
     middle_m = float(ends[:, 1].mean())
-    start, end = _from_above(ends)
-    return _Surface(point_xy(start), point_xy(end), middle_m - 0.5 * height_m, middle_m + 0.5 * height_m)
+    return _Surface(shapely.LineString(_from_above(ends)), middle_m - 0.5 * height_m, middle_m + 0.5 * height_m)
 
 
 def _floor(raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
@@ -139,9 +130,12 @@ def _floor(raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
     if isinstance(corners, list) and len(corners) >= 3:
         local = np.stack([_numbers(corner, 3, f"corners of {where}") for corner in corners])
     else:
-        width_m, depth_m, _ = _numbers(raw.get("dimensions"), 3, f"dimensions of {where}")
-        local = 0.5 * np.array([[-width_m, -depth_m, 0], [width_m, -depth_m, 0], [width_m, depth_m, 0],
-                                [-width_m, depth_m, 0]])  # fmt: skip
+        local = _CORNERS * _numbers(raw.get("dimensions"), 3, f"dimensions of {where}")
+    return _outlines(local, raw, where)
+
+
+def _outlines(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
+    """Return a surface with these corners, seen from above."""
     return polygons_from_geometry(shapely.Polygon(_from_above(_place(local, raw, where))))
 
 

@@ -106,8 +106,7 @@ def _picture_alone(content: bytes, options: ImportOptions, budget: Budget) -> Oc
             "the file is a part of a ROS map; send the YAML file and the picture in one zip archive, or the PGM "
             "picture with metres_per_pixel"
         )
-    settings = {"resolution": options.metres_per_pixel, "origin": [0.0, 0.0, 0.0]}
-    return _classify(_gray(content, budget), settings)
+    return _classify(_gray(content, budget), {"resolution": options.metres_per_pixel, "origin": [0.0, 0.0, 0.0]})
 
 
 def _open(files: Mapping[str, bytes], budget: Budget) -> OccupancyGrid:
@@ -118,10 +117,10 @@ def _open(files: Mapping[str, bytes], budget: Budget) -> OccupancyGrid:
         raise InvalidFloorPlanError(f"the archive has {len(names)} YAML files; a ROS map has one, and a picture")
     settings = _settings(files[names[0]])
     image = _text(settings, "image").replace("\\", "/").rpartition("/")[2]
-    found = next((content for name, content in files.items() if name.rpartition("/")[2] == image), None)
-    if found is None:
-        raise InvalidFloorPlanError(f"the archive has no picture '{image[:100]}', which the ROS map names; add it")
-    return _classify(_gray(found, budget), settings)
+    for name, content in files.items():
+        if name.rpartition("/")[2] == image:
+            return _classify(_gray(content, budget), settings)
+    raise InvalidFloorPlanError(f"the archive has no picture '{image[:100]}', which the ROS map names; add it")
 
 
 def _settings(content: bytes) -> Mapping[str, Any]:
@@ -178,12 +177,8 @@ def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> Oc
     if str(settings.get("mode")).casefold() == "raw":
         # Occupancy in percent; others are unknown.
         occupancy = np.where(np.arange(256) <= 100, np.arange(256) / 100.0, 0.5 * (occupied_at + free_at))
-    rows, columns = gray.shape
-    return OccupancyGrid(
-        MapFrame(resolution_m, (x, y, yaw), (rows, columns)),
-        (occupancy > occupied_at)[gray],
-        (occupancy < free_at)[gray],
-    )
+    frame = MapFrame(resolution_m, (x, y, yaw), gray.shape)
+    return OccupancyGrid(frame, (occupancy > occupied_at)[gray], (occupancy < free_at)[gray])
 
 
 def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
@@ -213,17 +208,14 @@ def _draw(document: Mapping[str, Any], rooms: list[shapely.Polygon], frame: MapF
     # Gaps between rooms up to twice a wall's thickness are walls.
     around = shapely.union_all(rooms).buffer(2.0 * _WALL_M, join_style="mitre")
     walls = around.buffer(-_WALL_M, join_style="mitre")
-    doors = [
-        shapely.LineString(opening["line"]).buffer(2.0 * _WALL_M, cap_style="flat")
-        for opening in document.get("openings", ())
-        if opening["kind"] != "window"
-    ]
+    doors = [opening["line"] for opening in document.get("openings", ()) if opening["kind"] != "window"]
+    ways = [shapely.LineString(line).buffer(2.0 * _WALL_M, cap_style="flat") for line in doors]
     inner = [shapely.LineString(line) for room in document["rooms"] for line in room.get("walls", ())]
     layers = (
         (walls, _OCCUPIED),
         (shapely.union_all(rooms), _FREE),
         (shapely.union_all([*inner, *_shared_edges(rooms, half_m)]).buffer(1.5 * half_m), _OCCUPIED),
-        (shapely.union_all(doors).intersection(walls), _FREE),
+        (shapely.union_all(ways).intersection(walls), _FREE),
     )
     for shape, _ in layers:
         shapely.prepare(shape)

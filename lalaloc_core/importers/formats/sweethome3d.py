@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import cast
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import shapely
 from jaxtyping import Float
+from shapely import affinity
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
@@ -100,20 +102,18 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
     walls = shapely.union_all(bodies)
     drawn: list[tuple[shapely.Polygon, str | None]] = []
     for room in storey.rooms:
-        corners = [(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"]
-        budget.spend(len(corners))
-        outline = _CM * np.array(corners, dtype=float).reshape(-1, 2)
-        name = str(room.get("name") or "") or None
+        outline = _CM * np.array([(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"])
+        budget.spend(len(outline))
         has_area = len(outline) >= 3 and np.isfinite(outline).all()
         parts = polygons_from_geometry(shapely.Polygon(outline)) if has_area else []
         builder.use("room", "rooms" if parts else "ignored (no area)")
-        drawn += [(part, name) for part in parts]
+        drawn += [(part, room.get("name") or None) for part in parts]
     height_m = storey.height_m if ROOM_HEIGHT_M[0] <= storey.height_m <= ROOM_HEIGHT_M[1] else None
     for area in (room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2):
         names = [name for part, name in drawn if shapely.intersection(part, area).area > _SAME * part.area]
-        if len(names) <= 1:
-            sketch.rooms.append(SketchedRoom(area, names[0] if names else None, (), height_m))
         # Several drawn rooms divide an open area.
+        if len(names) <= 1:
+            sketch.rooms.append(SketchedRoom(area, next(iter(names), None), (), height_m))
     taken = shapely.union_all([room.shape for room in sketch.rooms])
     for part, name in drawn:
         if shapely.intersection(part, taken).area <= _SAME * part.area:
@@ -140,13 +140,10 @@ def _wall(wall: Element, builder: ReportBuilder, budget: Budget) -> list[shapely
 
 def _arc(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], angle: float) -> Float[np.ndarray, "n 2"]:
     """Return the points from `start` to `end` on a circle, counter-clockwise by `angle`."""
-    chord = end - start
-    left = np.array([-chord[1], chord[0]])
-    centre = 0.5 * (start + end) + 0.5 * left / math.tan(0.5 * angle)
-    away = start - centre
-    turn = np.linspace(0.0, angle, _ARC_STEPS + 1)
-    c, s = np.cos(turn), np.sin(turn)
-    return centre + np.column_stack([c * away[0] - s * away[1], s * away[0] + c * away[1]])
+    first, last = complex(*start), complex(*end)
+    centre = 0.5 * (first + last) + 0.5j * (last - first) / math.tan(0.5 * angle)
+    points = centre + (first - centre) * np.exp(1j * np.linspace(0.0, angle, _ARC_STEPS + 1))
+    return np.column_stack([points.real, points.imag])
 
 
 def _add_pieces(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
@@ -155,46 +152,39 @@ def _add_pieces(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget:
         budget.spend()
         catalogue = str(piece.get("catalogId") or "")[:200].rpartition("#")[2]
         name = str(piece.get("name") or "")[:200]
-        if local_name(piece) == "doorOrWindow":
-            opening = _opening(piece, catalogue, name)
-            builder.use("doorOrWindow", "ignored (no width)" if opening is None else opening.kind)
-            sketch.openings += [] if opening is None else [opening]
-            continue
+        box, is_opening = _box(piece), local_name(piece) == "doorOrWindow"
         kind = "stairs" if piece.get("staircaseCutOutShape") else fixture_from_name(catalogue, name)
-        box = None if kind is None else _box(piece)
-        builder.use("pieceOfFurniture", f"fixtures: {kind}" if box is not None else "ignored")
-        if kind is not None and box is not None:
+        if is_opening and box is not None:
+            sketch.openings.append(opening := _opening(piece, box, catalogue, name))
+            builder.use("doorOrWindow", opening.kind)
+        elif is_opening or box is None or kind is None:
+            builder.use(local_name(piece), "ignored (no width)" if is_opening else "ignored")
+        else:
             sketch.fixtures.append(SketchedFixture(kind, box))
+            builder.use("pieceOfFurniture", f"fixtures: {kind}")
 
 
-def _opening(piece: Element, catalogue: str, name: str) -> SketchedOpening | None:
-    box = _box(piece)
-    if box is None:
-        return None
+def _opening(piece: Element, box: shapely.Polygon, catalogue: str, name: str) -> SketchedOpening:
     sill_m, height_m = _CM * _number(piece, "elevation", 0.0), _CM * _number(piece, "height", 0.0)
     roles = [role for text in (catalogue, name) if (role := role_from_name(text)) in ("door", "window", "passage")]
-    kind: OpeningKind = "window" if sill_m >= _WINDOW_SILL_M else "door"
-    if "frame" in catalogue.casefold() or "passage" in roles:
-        kind = "passage"
-    elif roles:
-        kind = roles[0]  # type: ignore[assignment]
-    corners = np.asarray(box.exterior.coords)[:4]
+    usual = "window" if sill_m >= _WINDOW_SILL_M else "door"
+    is_passage = "frame" in catalogue.casefold() or "passage" in roles
+    kind = cast("OpeningKind", "passage" if is_passage else next(iter(roles), usual))
     # The width runs along the wall, from the first corner to the second.
-    start, end = point_xy(0.5 * (corners[0] + corners[3])), point_xy(0.5 * (corners[1] + corners[2]))
+    a, b, c, d = shapely.get_coordinates(box)[:4]
+    start, end = point_xy(0.5 * (a + d)), point_xy(0.5 * (b + c))
     return SketchedOpening(kind, start, end, name or None, sill_m if kind == "window" else None, sill_m + height_m)
 
 
 def _box(piece: Element) -> shapely.Polygon | None:
     """Return the rectangle of a piece of furniture, which begins along its width; None without an area."""
     width_m, depth_m = _CM * _number(piece, "width", 0.0), _CM * _number(piece, "depth", 0.0)
-    centre = np.array([_number(piece, "x"), -_number(piece, "y")]) * _CM
-    angle = -_number(piece, "angle", 0.0)
-    if width_m <= 0.0 or depth_m <= 0.0 or not np.isfinite([*centre, width_m, depth_m, angle]).all():
+    x_m, y_m = _CM * _number(piece, "x"), -_CM * _number(piece, "y")
+    if width_m <= 0.0 or depth_m <= 0.0 or not np.isfinite([x_m, y_m]).all():
         return None
-    along = 0.5 * width_m * np.array([math.cos(angle), math.sin(angle)])
-    across = 0.5 * depth_m * np.array([-math.sin(angle), math.cos(angle)])
-    corners = [centre - along - across, centre + along - across, centre + along + across, centre - along + across]
-    return shapely.Polygon(corners)
+    corners = 0.5 * np.array([[-width_m, -depth_m], [width_m, -depth_m], [width_m, depth_m], [-width_m, depth_m]])
+    turned = affinity.rotate(shapely.Polygon(corners), -_number(piece, "angle", 0.0), (0.0, 0.0), use_radians=True)
+    return affinity.translate(turned, x_m, y_m)
 
 
 def _number(element: Element, key: str, default: float = math.nan) -> float:

@@ -56,19 +56,20 @@ class Ink:
     skew_deg: float
     size: tuple[int, int]
 
+    @property
+    def _margin(self) -> Float[np.ndarray, "2"]:
+        """Columns and rows that the rotation added on each side."""
+        return 0.5 * np.subtract(self.mask.shape, self.size)[::-1]
+
     def to_plan(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert pixel coordinates (column, row; of edges, not centres) to metres with y up."""
-        rows, columns = self.mask.shape
-        shift = np.array([0.5 * (columns - self.size[1]), 0.5 * (rows - self.size[0])])
-        x, y = (np.asarray(points, dtype=float) - shift).T
+        x, y = (np.asarray(points, dtype=float) - self._margin).T
         return np.column_stack([x, self.size[0] - y]) * self.metres_per_pixel
 
     def to_pixels(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert plan coordinates (m) to pixel coordinates (column, row); the inverse of `to_plan`."""
-        rows, columns = self.mask.shape
-        shift = np.array([0.5 * (columns - self.size[1]), 0.5 * (rows - self.size[0])])
         x, y = (np.asarray(points_m, dtype=float) / self.metres_per_pixel).T
-        return np.column_stack([x, self.size[0] - y]) + shift
+        return np.column_stack([x, self.size[0] - y]) + self._margin
 
 
 def read_ink(
@@ -101,15 +102,8 @@ def read_ink(
         usual, colour = float(np.median(warmth[mask])) - COLOURLESS, warmth.astype(np.float32) - COLOURLESS
         colour -= np.clip(usual, np.minimum(colour, 0.0), np.maximum(colour, 0.0))
         warmth = (colour + COLOURLESS).astype(np.uint8)
-    return Ink(
-        gray=even,
-        warmth=warmth,
-        mask=mask,
-        lines=mask | faint_lines(even, metres_per_pixel),
-        metres_per_pixel=metres_per_pixel,
-        skew_deg=skew_deg,
-        size=(int(gray.shape[0]), int(gray.shape[1])),
-    )
+    lines = mask | faint_lines(even, metres_per_pixel)
+    return Ink(even, warmth, mask, lines, metres_per_pixel, skew_deg, gray.shape)
 
 
 def blank_outside(
@@ -174,16 +168,16 @@ def _of_tone(colours: UInt8[np.ndarray, "h w 3"], tone: Float[np.ndarray, "3"]) 
 def drawn_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
     """Return the longer side (pixels) of the largest drawing in a picture, without titles and small print beside it."""
     ink = gray < min(float(np.median(gray)) - _FAINTEST, _THRESHOLD[1])
-    boxes = _boxes_of_parts(ink)
+    boxes = boxes_of_parts(ink)
     longest = int(boxes[:, 2:].max(initial=0))
     near = round(_NEAR_PARTS * longest)
     drawn = np.zeros_like(ink)
     for x, y, width, height in boxes[boxes[:, 2:].max(axis=1) >= _LARGE_PARTS * longest]:
         drawn[max(y - near, 0) : y + height + near, max(x - near, 0) : x + width + near] = True
-    return float(max(_boxes_of_parts(drawn)[:, 2:].max(initial=0) - 2 * near, longest) or max(gray.shape))
+    return float(max(boxes_of_parts(drawn)[:, 2:].max(initial=0) - 2 * near, longest) or max(gray.shape))
 
 
-def _boxes_of_parts(mask: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "n 4"]:
+def boxes_of_parts(mask: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, "n 4"]:
     """Return the left column, top row, width and height of connected parts."""
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     return stats[1:, :4]

@@ -21,9 +21,10 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import install_command
 from lalaloc_core.importers.common import Budget, ReportBuilder
+from lalaloc_core.importers.common.geometry import point_xy
 from lalaloc_core.importers.drawing.enclosed_rooms import without_overlaps
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
-from lalaloc_core.importers.picture.ink import Ink, read_ink
+from lalaloc_core.importers.picture.ink import Ink, boxes_of_parts, read_ink
 
 # Side (pixels) of a tile, which takes about 0.8 GB of address space, and longer side of the picture that is read.
 _TILE_PX, _OVERLAP_PX = 1280, 256
@@ -67,15 +68,15 @@ class PictureTexts:
 
     def scaled(self, factor: float) -> PictureTexts:
         """Return the texts in another unit."""
-        size = (self.size[0] * factor, self.size[1] * factor)
+        width, height = self.size
         outlines = [corners * factor for corners in self.outlines]
-        return PictureTexts(self.drawing.scaled(factor, flip_y=False), size, outlines)
+        return PictureTexts(self.drawing.scaled(factor, flip_y=False), (width * factor, height * factor), outlines)
 
     def placed(self, factor: float) -> list[Lettering]:
         """Return the texts in another unit, from the picture's lower left corner, as `sketch_picture` places rooms."""
-        scaled = self.scaled(factor)
-        x, y = 0.5 * scaled.size[0], 0.5 * scaled.size[1]
-        return [replace(t, position=(t.position[0] + x, t.position[1] + y)) for t in scaled.drawing.letterings]
+        corner = 0.5 * factor * np.array(self.size)
+        texts = self.drawing.scaled(factor, flip_y=False).letterings
+        return [replace(text, position=point_xy(text.position + corner)) for text in texts]
 
 
 def read_texts(
@@ -108,14 +109,12 @@ def read_texts(
         return found
     middle = 0.5 * np.array(ink.mask.shape[::-1])
 
-    def from_middle(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def from_middle(points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         return (points - middle) * [1.0, -1.0] / factor
 
     for text, box in boxes:
-        x, y = from_middle(box.mean(axis=0, keepdims=True))[0]
-        found.drawing.letterings.append(
-            Lettering(text, (float(x), float(y)), height=_height(box) / factor, is_ocr=True)
-        )
+        place = point_xy(from_middle(box.mean(axis=0)))
+        found.drawing.letterings.append(Lettering(text, place, height=_height(box) / factor, is_ocr=True))
         found.outlines.append(from_middle(box))
     if boxes:
         lines = _thin_lines(ink, [box for _, box in boxes])
@@ -136,10 +135,8 @@ def _resized_ink(gray: UInt8[np.ndarray, "h w"], longest_px: int, *, straighten:
 
 def _has_letters(ink: Ink) -> bool:
     """Return whether anything in a picture has the size of letters; looking for texts takes seconds."""
-    _, _, stats, _ = cv2.connectedComponentsWithStats(ink.lines.astype(np.uint8), connectivity=8)
-    width, height = stats[1:, cv2.CC_STAT_WIDTH], stats[1:, cv2.CC_STAT_HEIGHT]
     # Texts can be upright.
-    short, long = np.minimum(width, height), np.maximum(width, height)
+    short, long = np.sort(boxes_of_parts(ink.lines)[:, 2:], axis=1).T
     return bool(((short >= _LETTER_PX[0]) & (short <= _LETTER_PX[1]) & (long <= _WORD_WIDTH * short)).any())
 
 
@@ -240,10 +237,8 @@ def _share_of_time(budget: Budget) -> float:
 
 def _starts(length: int) -> list[int]:
     """Return the beginnings of tiles that overlap and cover a length."""
-    if length <= _TILE_PX:
-        return [0]
-    count = math.ceil((length - _OVERLAP_PX) / (_TILE_PX - _OVERLAP_PX))
-    return [round(k * (length - _TILE_PX) / (count - 1)) for k in range(count)]
+    count = max(math.ceil((length - _OVERLAP_PX) / (_TILE_PX - _OVERLAP_PX)), 1)
+    return np.linspace(0, max(length - _TILE_PX, 0), count).round().astype(int).tolist()
 
 
 def _whole_texts(parts: Sequence[_Part]) -> list[_Part]:
@@ -269,29 +264,22 @@ def _thin_lines(ink: Ink, texts: Sequence[Corners]) -> list[shapely.LineString]:
         cv2.fillConvexPoly(mask, np.round(box).astype(np.int32), 0)
     lines: list[shapely.LineString] = []
     marks: list[shapely.LineString] = []
-    for is_vertical in (False, True):
-        turned_mask = np.ascontiguousarray(mask.T if is_vertical else mask)
-        bounds = [np.concatenate([box.min(axis=0), box.max(axis=0)]) for box in texts]
-        spans = [box[[1, 0, 3, 2]] if is_vertical else box for box in bounds]
+    # Columns and rows change places for vertical lines.
+    for turned_mask, axes in ((mask, [0, 1]), (np.ascontiguousarray(mask.T), [1, 0])):
+        spans = [np.concatenate([box.min(axis=0)[axes], box.max(axis=0)[axes]]) for box in texts]
         for x0, x1, y, height in _join_runs(_runs(turned_mask), spans):
-            found = [shapely.LineString([(x0, y), (x1, y)])]
-            found += [
-                shapely.LineString([(x, y - 2 * _MARK_PX), (x, y + 2 * _MARK_PX)])
+            lines.append(shapely.LineString(np.array([(x0, y), (x1, y)])[:, axes]))
+            marks += [
+                shapely.LineString(np.array([(x, y - 2 * _MARK_PX), (x, y + 2 * _MARK_PX)])[:, axes])
                 for x in _marks(turned_mask, x0, x1, round(y - 0.5 * height), height)
             ]
-            if is_vertical:
-                found = [shapely.LineString(np.array(line.coords)[:, ::-1]) for line in found]
-            lines += found[:1]
-            marks += found[1:]
     # A tick is a line itself, and its mark is part of the line that it crosses.
     if not marks:
         return lines
     tree = shapely.STRtree(lines)
-    along = {
-        int(mark)
-        for mark, line in tree.query(marks, predicate="intersects").T
-        if shapely.intersection(marks[mark], lines[line]).length > 0.0
-    }
+    mark, line = tree.query(marks, predicate="intersects")
+    shared = shapely.intersection(np.array(marks)[mark], tree.geometries[line])
+    along = set(mark[shapely.length(shared) > 0.0].tolist())
     return lines + [mark for index, mark in enumerate(marks) if index not in along]
 
 
@@ -299,9 +287,8 @@ def _runs(mask: UInt8[np.ndarray, "h w"]) -> list[_Run]:
     """Return the longest thin horizontal lines."""
     shortest, widest = (round(share * max(mask.shape)) for share in (_SHORTEST, _WIDEST))
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((1, shortest), np.uint8))
-    _, _, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
-    boxes = [box[:4] for box in stats[1:] if box[cv2.CC_STAT_HEIGHT] <= widest]
-    longest = sorted(boxes, key=lambda box: -box[2])[:_MAX_LINES]
+    boxes = boxes_of_parts(opened)
+    longest = sorted(boxes[boxes[:, 3] <= widest], key=lambda box: -box[2])[:_MAX_LINES]
     return [(float(x), float(x + width), y + 0.5 * height, int(height)) for x, y, width, height in longest]
 
 

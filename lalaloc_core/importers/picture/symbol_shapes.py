@@ -86,8 +86,7 @@ class Shape:
     @cached_property
     def is_oval(self) -> bool:
         """True if the shape is an ellipse."""
-        points = shapely.get_coordinates(self.outline) - self.centre
-        x, y = points @ self.axis, points @ np.array([-self.axis[1], self.axis[0]])
+        x, y = ((shapely.get_coordinates(self.outline) - self.centre) @ self.frame).T
         radius = np.hypot(x / (0.5 * self.long_m), y / (0.5 * self.short_m))
         # Small shapes are blocks of pixels.
         slack = 0.6 * self.pixel_m / self.short_m
@@ -123,11 +122,8 @@ def closed_shapes(ink: Ink, sizes: tuple[float, float] = _PART, *, is_faint: boo
     long_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * pixel_m
     is_part = (area_m2 >= sizes[0]) & (long_m <= sizes[1])
     is_part[0] = False
-    numbers = np.flatnonzero(is_part)
-    if len(numbers) > _MOST:
-        return []
     shapes = []
-    for number in numbers.tolist():
+    for number in np.flatnonzero(is_part).tolist() if is_part.sum() <= _MOST else ():
         x, y, width, height = stats[number, :4].tolist()
         left, top = max(x - 1, 0), max(y - 1, 0)
         window = labels[top : y + height + 1, left : x + width + 1] == number

@@ -107,14 +107,10 @@ def _symbol(shape: Shape, parts: Sequence[Shape]) -> Symbol | None:
     outline = shapely.Polygon(shape.box)
     if _is_stove(shape, parts):
         return Symbol("stove", outline)
-    if _is_bath(shape, parts):
-        return Symbol("bath", outline, outline)
-    washed_in = (("basin", _is_basin), ("sink", _is_sink), ("shower", _is_shower))
-    kind = next((kind for kind, is_kind in washed_in if is_kind(shape, parts)), None)
-    if kind is not None:
+    washed_in = (("bath", _is_bath), ("basin", _is_basin), ("sink", _is_sink), ("shower", _is_shower))
+    if kind := next((kind for kind, is_kind in washed_in if is_kind(shape, parts)), None):
         return Symbol(kind, outline, outline)
-    head = _head_of_bed(shape, parts)
-    if head is not None:
+    if (head := _head_of_bed(shape, parts)) is not None:
         return Symbol("bed", outline, head)
     # Letters are smaller, and rooms larger.
     rounded = [part for part in parts if part.area >= _ROUNDED_M2 and (part.is_oval or part.rounded_corners >= 2)]
@@ -137,7 +133,11 @@ def _is_stove(shape: Shape, parts: Sequence[Shape]) -> bool:
 
 def _toilets(shapes: Sequence[Shape]) -> list[Symbol]:
     """Return the toilets: ovals before the middle of a cistern."""
-    ovals = [part for part in shapes if _fits(part, _BOWL_M) and _is_bowl(part)]
+    ovals = [
+        part
+        for part in shapes
+        if _fits(part, _BOWL_M) and (part.is_oval or (0.78 <= part.filled <= 0.95 and part.rounded_corners in (2, 4)))
+    ]
     around = shapely.STRtree([oval.outline for oval in ovals])
     bowls = [oval for oval in ovals if not any(ovals[k].holds(oval) for k in around.query(oval.outline))]
     cisterns = [part for part in shapes if _fits(part, _CISTERN_M) and part.filled >= 0.85]
@@ -145,20 +145,14 @@ def _toilets(shapes: Sequence[Shape]) -> list[Symbol]:
     for bowl in bowls:
         for number in tree.query(bowl.outline, predicate="dwithin", distance=_TOUCHING_M):
             cistern = cisterns[number]
-            step = cistern.centre - bowl.centre
-            if is_taken(bowl.outline, found):
-                continue
-            both = Shape.around([bowl, cistern])
+            step, both = cistern.centre - bowl.centre, Shape.around([bowl, cistern])
             is_before = abs(float(bowl.axis @ cistern.axis)) < 0.2 or bowl.is_circle
-            apart = float(np.linalg.norm(step)) >= 0.5 * cistern.short_m + 0.3 * bowl.long_m
+            is_apart = float(np.linalg.norm(step)) >= 0.5 * cistern.short_m + 0.3 * bowl.long_m
             is_in_middle = abs(float(step @ cistern.axis)) <= 0.07
-            if is_before and is_in_middle and apart and _TOILET_M[0] <= both.long_m <= _TOILET_M[1]:
+            has_size = _TOILET_M[0] <= both.long_m <= _TOILET_M[1]
+            if is_before and is_apart and is_in_middle and has_size and not is_taken(bowl.outline, found):
                 found.append(Symbol("toilet", shapely.Polygon(both.box), cistern.outline))
     return found
-
-
-def _is_bowl(part: Shape) -> bool:
-    return part.is_oval or (0.78 <= part.filled <= 0.95 and part.rounded_corners in (2, 4))
 
 
 def _is_bath(shape: Shape, parts: Sequence[Shape]) -> bool:
@@ -242,11 +236,10 @@ def _beds(boxes: Sequence[Shape]) -> list[Shape]:
     """Return beds of two boxes: the head, and the cover from its edge on."""
     tree, found = shapely.STRtree([box.outline for box in boxes]), []
     for number, box in enumerate(boxes):
-        for other in tree.query(box.outline.buffer(3.0 * box.pixel_m), predicate="intersects").tolist():
-            if other <= number or max(box.long_m, boxes[other].long_m) > _BED_M[0][1]:
-                continue
-            both = Shape.around([box, boxes[other]])
-            if _fits(both, _BED_M) and box.area + boxes[other].area >= 0.9 * both.long_m * both.short_m:
+        near = tree.query(box.outline.buffer(3.0 * box.pixel_m), predicate="intersects")
+        for other in (boxes[k] for k in near[near > number] if boxes[k].long_m <= _BED_M[0][1] >= box.long_m):
+            both = Shape.around([box, other])
+            if _fits(both, _BED_M) and box.area + other.area >= 0.9 * both.long_m * both.short_m:
                 found.append(both)
     return found
 
@@ -258,22 +251,15 @@ def _head_of_bed(shape: Shape, parts: Sequence[Shape]) -> shapely.Point | None:
     pillows = [part for part in parts if _fits(part, _PILLOW_M) and part.filled >= 0.8]
     along, across = shape.frame.T
     # Nearly square beds can have the head at any side.
-    for axis in (along, -along) if shape.short_m < 1.8 else (along, -along, across, -across):
-        length, width = (float(np.ptp(shape.box @ side)) for side in (axis, _left(axis)))
-        if _has_pillows(shape, pillows, axis, length, width):
-            return shapely.Point(shape.centre + 0.5 * length * axis)
-    return None
+    axes = (along, -along) if shape.short_m < 1.8 else (along, -along, across, -across)
+    ends = [shapely.Point(shape.centre + 0.5 * axis * np.ptp(shape.box @ axis)) for axis in axes]
+    return next((end for axis, end in zip(axes, ends, strict=True) if _has_pillows(shape, pillows, axis)), None)
 
 
-def _has_pillows(
-    shape: Shape, parts: Sequence[Shape], head: Float[np.ndarray, "2"], length: float, width: float
-) -> bool:
-    places = [(part, *((part.centre - shape.centre) @ np.stack([head, _left(head)]).T).tolist()) for part in parts]
-    pillows = [
-        (part, beside)
-        for part, along, beside in places
-        if 0.5 * length - along <= 0.45 and abs(float(part.axis @ head)) < 0.3
-    ]
+def _has_pillows(shape: Shape, parts: Sequence[Shape], head: Float[np.ndarray, "2"]) -> bool:
+    length, width = (float(np.ptp(shape.box @ side)) for side in (head, _left(head)))
+    places = [(part, part.centre - shape.centre) for part in parts if abs(float(part.axis @ head)) < 0.3]
+    pillows = [(part, float(away @ _left(head))) for part, away in places if 0.5 * length - away @ head <= 0.45]
     if width < _DOUBLE_M:
         return len(pillows) == 1 and abs(pillows[0][1]) <= 0.1 and pillows[0][0].long_m >= 0.45 * width
     if len(pillows) != 2:

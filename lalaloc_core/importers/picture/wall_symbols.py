@@ -182,22 +182,16 @@ class GapReader:
 
 def _dips(profile: Float[np.ndarray, "n"]) -> list[tuple[int, float]]:
     """Return the indices of a profile's minima that a rise separates, each with the level of the paper beside it."""
-    lows: list[int] = []
-    lowest = highest = 0
-    falling = True
+    # Extremes in turn, each found by the change that follows it: a low, a high, a low, and so on.
+    extremes, extreme, sign = list[int](), 0, 1.0
     for index, value in enumerate(profile):
-        if falling:
-            if value < profile[lowest]:
-                lowest = index
-            elif value > profile[lowest] + _RISE:
-                lows.append(lowest)
-                falling, highest = False, index
-        elif value > profile[highest]:
-            highest = index
-        elif value < profile[highest] - _RISE:
-            falling, lowest = True, index
-    if falling:
-        lows.append(lowest)
+        change = sign * (value - profile[extreme])
+        if change > _RISE:
+            extremes.append(extreme)
+            sign = -sign
+        if change < 0.0 or change > _RISE:
+            extreme = index
+    lows = [*extremes, extreme][::2]
     found = []
     for before, low, after in zip([0, *lows], lows, [*lows[1:], len(profile)], strict=False):
         level = float(min(profile[before : low + 1].max(), profile[low:after].max()))
@@ -214,18 +208,16 @@ def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) 
         return []
     panes = _panes(walls, ink, check_time)
     found: list[SketchedOpening] = []
-    used: set[int] = set()
-    for i, (first, angle) in enumerate(panes):
+    while panes:
         check_time()
-        if i in used:
-            continue
-        group = [first]
-        for j in range(i + 1, len(panes)):
-            second, second_angle = panes[j]
+        (first, angle), *others = panes
+        group, panes = [first], []
+        for second, second_angle in others:
             apart = abs((angle - second_angle + 90.0) % 180.0 - 90.0)
-            if j not in used and apart < _SLANTED_DEG and _side_by_side(group[-1], second, ink, walls):
+            if apart < _SLANTED_DEG and _side_by_side(group[-1], second, ink, walls):
                 group.append(second)
-                used.add(j)
+            else:
+                panes.append((second, second_angle))
         if len(group) >= 2:
             ends = opening_line(shapely.MultiPoint(ink.to_plan(np.concatenate(group))).convex_hull)
             assert ends is not None
