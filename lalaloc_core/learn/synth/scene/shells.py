@@ -218,14 +218,16 @@ def _beams(room: Room, wall: int, bottom_m: float, rng: np.random.Generator) -> 
 def _box(
     room: Room, footprint: shapely.Polygon, along: np.ndarray, bottom_m: float, finish: Finish = "paint"
 ) -> Prism | None:
-    if room.ceiling_height_m - bottom_m < 0.03 or footprint.intersection(room.shape).area < _INSIDE * footprint.area:
-        return None
     corners = shapely.get_coordinates(footprint)
     across = np.array([-along[1], along[0]])
     low, high = (np.array([function(corners @ along), function(corners @ across)]) for function in (np.min, np.max))
     centre = 0.5 * (low + high)
     middle = along * centre[0] + across * centre[1]
     half_a, half_b = (0.5 * (high - low)).tolist()
+    # A part of a beam in an acute corner is not parallel to it.
+    box = rectangle(middle, along, half_a, half_b)
+    if room.ceiling_height_m - bottom_m < 0.03 or box.intersection(room.shape).area < _INSIDE * box.area:
+        return None
     return Prism(middle, along, (half_a, half_b), (bottom_m, room.ceiling_height_m), finish, piece=-1)
 
 
