@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from lalaloc_core.floorplan.opening_trust import estimate_trust
 from lalaloc_core.importers import import_plan
-from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
+from lalaloc_core.importers.common.plausibility import check_document
 
 SIDE_M = 4.0
 

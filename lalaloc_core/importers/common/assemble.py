@@ -16,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits
 from lalaloc_core.floorplan.earth import Anchor, anchor_document
+from lalaloc_core.floorplan.opening_trust import estimate_trust
 from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
 from lalaloc_core.floorplan.room_types import room_types_from_name, type_fields
 from lalaloc_core.importers.common.fixtures_by_name import place_fixtures, type_rooms
@@ -24,7 +25,7 @@ from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
 from lalaloc_core.importers.common.opening_placement import place_openings
-from lalaloc_core.importers.common.plausibility import check_document, estimate_trust
+from lalaloc_core.importers.common.plausibility import check_document
 from lalaloc_core.importers.common.sketch import Level, Point, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
 from lalaloc_core.importers.common.vocabulary import is_roof
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.plausibility import OpeningTrust
+from lalaloc_core.floorplan.opening_trust import OpeningTrust
 from lalaloc_core.importers.common.vocabulary import Role
 
 TracePart = Literal["line", "wall line", "door", "window", "passage", "other", "wall", "gap", "room", "no room"]
