@@ -176,7 +176,7 @@ def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = Fa
     """
     shapes: list[BaseGeometry] = list(rings)
     check_network(shapes)
-    if is_nonzero:
+    if is_nonzero and len(shapes) > 1:
         is_ccw = shapely.is_ccw(shapely.get_exterior_ring(shapes))
         shapes = [shapely.union_all(np.array(shapes)[is_ccw == direction]) for direction in (True, False)]
     # In pairs, so that the time is not quadratic in the number of outlines.
