@@ -144,6 +144,11 @@ def in_range(points: Float[np.ndarray, "..."]) -> bool:
     return bool((np.abs(points) <= MAX_COORDINATE).all())
 
 
+def without_repeats(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """Return points without those that equal the one before."""
+    return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
+
+
 def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:
@@ -160,13 +165,10 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
                 f"{limit} times, the limit for as many points; draw the outline once around its area"
             )
         valid = shapely.make_valid(geometry)
-    found: list[shapely.Polygon] = []
-    for part in shapely.get_parts(valid):
-        if isinstance(part, shapely.Polygon):
-            found += [part] if part.area > 0.0 else []
-        elif isinstance(part, shapely.MultiPolygon | shapely.GeometryCollection):
-            found.extend(polygons_from_geometry(part))
-    return found
+    if isinstance(valid, shapely.Polygon):
+        return [valid] if valid.area > 0.0 else []
+    has_parts = isinstance(valid, shapely.MultiPolygon | shapely.GeometryCollection)
+    return [polygon for part in shapely.get_parts(valid) if has_parts for polygon in polygons_from_geometry(part)]
 
 
 def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = False) -> list[shapely.Polygon]:

@@ -295,6 +295,24 @@ def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[],
     return found
 
 
+@dataclass
+class Subpath:
+    """Part of a path: its points, its curves (runs of curved pieces), and whether it is closed."""
+
+    points: list[tuple[float, float]] = field(default_factory=list)
+    curves: list[list[tuple[float, float]]] = field(default_factory=list)
+    is_closed: bool = False
+    was_curved: bool = False
+
+    def add(self, piece: Sequence[tuple[float, float]], *, is_curved: bool) -> None:
+        """Add a piece, which begins at the last point."""
+        if is_curved:
+            self.curves += [] if self.was_curved else [list(piece[:1])]
+            self.curves[-1] += piece[1:]
+        self.points += piece[1:] if self.points else piece
+        self.was_curved = is_curved
+
+
 def leaves_of(curves: Sequence[Float[np.ndarray, "_ 2"]], layer: str = "") -> list[Swing]:
     """Return the swings among the curves of a line, which has no more than two if they are of a door."""
     swings = [fit_swing(curve, layer) for curve in curves] if len(curves) <= 2 else []

@@ -43,7 +43,13 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
-from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import (
+    even_odd_polygons,
+    in_range,
+    label_position,
+    polygons_from_geometry,
+    without_repeats,
+)
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.storeys import by_storey
@@ -222,12 +228,10 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     missing = _count_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget, frozen):
-        if context.layer.casefold() in off | frozen or entity.dxf.get("invisible", 0):
-            builder.use(
-                context.layer,
-                "ignored (layer is off)" if context.layer.casefold() in off | frozen else "ignored (invisible)",
-            )
-        elif context.layer.casefold() in unplotted and context.role is None and not options.layers:
+        layer = context.layer.casefold()
+        if layer in off | frozen or entity.dxf.get("invisible", 0):
+            builder.use(context.layer, f"ignored ({'layer is off' if layer in off | frozen else 'invisible'})")
+        elif layer in unplotted and context.role is None and not options.layers:
             builder.use(context.layer, "ignored (layer is not plotted)")
             missing[f"layer '{context.layer[:50]}'", _UNPLOTTED] += 1
         elif isinstance(entity, Insert) and context.fixture is not None and options.includes_layer(context.layer):
@@ -467,9 +471,7 @@ def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
         points = _flatten(dxf_path.make_path(entity), sag)
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return np.empty((0, 2))
-    if not len(points) or not in_range(points):
-        return np.empty((0, 2))
-    return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
+    return without_repeats(points) if len(points) and in_range(points) else np.empty((0, 2))
 
 
 def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:

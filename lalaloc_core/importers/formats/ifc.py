@@ -271,18 +271,13 @@ def _add_fixture(element: Any, kind: str, sketch: Sketch, builder: ReportBuilder
 def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
     """Add passages between touching spaces, unless all spaces reach to the centre lines of their walls."""
     shapes = [room.shape for room in sketch.rooms]
-    tree = shapely.STRtree(shapes)
-    first, second = tree.query(shapes, predicate="dwithin", distance=_THICK_M)
-    pairs = [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
-    touching = [
-        (i, j)
-        for i, j in pairs
-        if shapes[i].distance(shapes[j]) < _TOUCHING_M and shapes[i].buffer(-_TOUCHING_M).disjoint(shapes[j])
-    ]
+    near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=_THICK_M).T
+    pairs = [(shapes[i], shapes[j]) for i, j in near if i < j]
+    touching = [(a, b) for a, b in pairs if a.distance(b) < _TOUCHING_M and a.buffer(-_TOUCHING_M).disjoint(b)]
     if len(touching) > _MOSTLY * len(pairs):
         return
-    for i, j in touching:
-        shared = shapely.intersection(shapes[i].boundary.buffer(_TOUCHING_M), shapes[j].boundary)
+    for a, b in touching:
+        shared = shapely.intersection(a.boundary.buffer(_TOUCHING_M), b.boundary)
         for part in shapely.get_parts(shapely.simplify(shapely.line_merge(shared), _TOUCHING_M)):
             for start, end in pairwise(part.coords):
                 if math.dist(start, end) > _TOUCHING_PASSAGE_M:
@@ -336,13 +331,10 @@ class _Meshes:
                 f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}' has more than {limit} entities "
                 "(max_entities) with those of its mapped items, or contains itself; simplify it"
             )
-        outlines = ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS
+        outlines = {"DIMENSIONALITY": ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS}
         # Some programs write the outline of a space alone.
-        for dimensionality in (None, outlines) if element.is_a("IfcSpace") else (None,):
-            settings = ifcopenshell.geom.settings()
-            settings.set("use-world-coords", True)
-            if dimensionality is not None:
-                settings.set("dimensionality", dimensionality)
+        for more in ({}, outlines) if element.is_a("IfcSpace") else ({},):
+            settings = ifcopenshell.geom.settings(USE_WORLD_COORDS=True, **more)
             try:
                 geometry: Any = ifcopenshell.geom.create_shape(settings, element).geometry  # type: ignore[union-attr]
             except RuntimeError:

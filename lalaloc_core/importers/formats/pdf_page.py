@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import clean_name
-from lalaloc_core.importers.common.geometry import in_range, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
@@ -29,6 +29,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     Lettering,
     Paint,
     Stroke,
+    Subpath,
     leaves_of,
 )
 
@@ -69,14 +70,6 @@ class PageContent:
     painted: float = 0.0
     unit_m: float = _METRES_PER_POINT
     hidden: Counter[str] = field(default_factory=Counter)
-
-
-@dataclass
-class _Subpath:
-    points: list[tuple[float, float]] = field(default_factory=list)
-    curves: list[list[tuple[float, float]]] = field(default_factory=list)
-    was_curved: bool = False
-    is_closed: bool = False
 
 
 def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdfium2.PdfPage]:
@@ -276,10 +269,10 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
     return out_of_range
 
 
-def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
+def _subpaths(item: Any, budget: Budget) -> list[Subpath]:
     count = pdfium.FPDFPath_CountSegments(item)
     budget.spend(max(count, 0))
-    paths: list[_Subpath] = []
+    paths: list[Subpath] = []
     bezier: list[tuple[float, float]] = []
     x, y = ctypes.c_float(), ctypes.c_float()
     for index in range(count):
@@ -289,31 +282,24 @@ def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
         point = (float(x.value), float(y.value))
         kind = pdfium.FPDFPathSegment_GetType(segment)
         if kind == pdfium.FPDF_SEGMENT_MOVETO or not paths:
-            paths.append(_Subpath([point]))
+            paths.append(Subpath([point]))
             bezier = []
         elif kind == pdfium.FPDF_SEGMENT_BEZIERTO:
             bezier.append(point)
             if len(bezier) == 3:
-                _add_curve(paths[-1], bezier)
+                paths[-1].add(_curve(paths[-1].points[-1], *bezier), is_curved=True)
                 bezier = []
         else:
-            paths[-1].points.append(point)
-            paths[-1].was_curved = False
+            paths[-1].add([paths[-1].points[-1], point], is_curved=False)
         paths[-1].is_closed |= bool(pdfium.FPDFPathSegment_GetClose(segment))
     return [path for path in paths if len(path.points) > 1]
 
 
-def _add_curve(path: _Subpath, control: list[tuple[float, float]]) -> None:
-    start, (a, b, end) = np.array(path.points[-1]), (np.array(point) for point in control)
-    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[1:, None]
-    points = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end
-    piece = [(float(px), float(py)) for px, py in points]
-    if path.was_curved:
-        path.curves[-1] += piece
-    else:
-        path.curves.append([path.points[-1], *piece])
-    path.points += piece
-    path.was_curved = True
+def _curve(*control: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return the points of a Bézier curve."""
+    start, a, b, end = map(np.array, control)
+    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[:, None]
+    return list(map(point_xy, (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end))
 
 
 def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarray, "n 2"]:

@@ -23,7 +23,7 @@ from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
-from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry, without_repeats
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
@@ -37,6 +37,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     Lettering,
     Paint,
     Stroke,
+    Subpath,
     leaves_of,
 )
 from lalaloc_core.importers.formats.svg_limits import HREF, check_work
@@ -392,36 +393,23 @@ def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.nda
     A subpath whose coordinates are out of range has no points.
     """
     # Rectangles and ellipses still have the transform that turns them.
-    for subpath in abs(svgelements.Path(shape)).as_subpaths():
-        segments = [s for s in svgelements.Path(subpath) if not isinstance(s, svgelements.Move)]
-        closed = any(isinstance(segment, svgelements.Close) for segment in segments)
-        points: list[complex] = []
-        curves: list[list[complex]] = []
-        was_curved = False
-        for segment in segments:
-            if segment.start is None or segment.end is None:
+    for segments in abs(svgelements.Path(shape)).as_subpaths():
+        path = Subpath()
+        for segment in svgelements.Path(segments):
+            path.is_closed |= isinstance(segment, svgelements.Close)
+            if isinstance(segment, svgelements.Move) or segment.start is None or segment.end is None:
                 continue
             is_curved = not isinstance(segment, svgelements.Line | svgelements.Close)
             steps = CURVE_STEPS if is_curved else 1
             budget.spend(steps)
-            piece = [complex(*segment.point(k / steps)) for k in range(steps + 1)]
-            points += piece if not points else piece[1:]
-            if is_curved and was_curved:
-                curves[-1] += piece[1:]
-            elif is_curved:
-                curves.append(piece)
-            was_curved = is_curved
-        array = _array(points)
-        if not in_range(array):
+            path.add([(*segment.point(k / steps),) for k in range(steps + 1)], is_curved=is_curved)
+        points = np.array(path.points, dtype=float).reshape(-1, 2)
+        if not in_range(points):
             yield np.empty((0, 2)), False, []
-        elif len(array):
-            distinct = array[np.concatenate([[True], np.any(np.diff(array, axis=0) != 0.0, axis=1)])]
-            returns = len(distinct) > 3 and bool(np.all(distinct[0] == distinct[-1]))
-            yield distinct, closed or returns, [_array(curve) for curve in curves]
-
-
-def _array(points: list[complex]) -> np.ndarray:
-    return np.array([[point.real, point.imag] for point in points]).reshape(-1, 2)
+        elif len(points):
+            points = without_repeats(points)
+            returns = len(points) > 3 and bool(np.all(points[0] == points[-1]))
+            yield points, path.is_closed or returns, [np.array(curve) for curve in path.curves]
 
 
 def _name_of(element: Any, context: _Context) -> str | None:
