@@ -144,11 +144,6 @@ def in_range(points: Float[np.ndarray, "..."]) -> bool:
     return bool((np.abs(points) <= MAX_COORDINATE).all())
 
 
-def without_repeats(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
-    """Return points without those that equal the one before."""
-    return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
-
-
 def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -74,11 +75,8 @@ def choose_reading(
     The drawing has no leaves of doors among its lines; `leaves` are these and the swings of doors. `marked` are the
     rooms that the file marks, see `marked_rooms`.
     """
-    readings: list[Reading] = []
     bounds = budget.limits.rooms
-    if marked:
-        reading = Reading("the areas that the file marks as rooms", marked, bounds=bounds)
-        readings.append(_count_doors_and_names(reading, drawing, leaves))
+    readings = [Reading("the areas that the file marks as rooms", marked, bounds=bounds)] if marked else []
     # Rooms that layers mark by a word for rooms are complete, unless they are a small part of the drawing.
     is_by_word = any(area.role == "room" for area in marked)
     box_m2 = shapely.box(*shapely.total_bounds(drawing.shapes)).area if drawing.shapes else 0.0
@@ -93,16 +91,15 @@ def choose_reading(
                 refused = error
                 continue
             if found is not None:
-                shapes = [Area(shape, "", "room") for shape in found.rooms]
-                reading = Reading(f"the areas enclosed by {source}", shapes, found.gaps, found.walls, bounds=bounds)
-                readings.append(_count_doors_and_names(reading, drawing, leaves))
+                rooms = [Area(shape, "", "room") for shape in found.rooms]
+                readings.append(
+                    Reading(f"the areas enclosed by {source}", rooms, found.gaps, found.walls, bounds=bounds)
+                )
         if refused is not None and not any(reading.rooms for reading in readings):
             raise refused
     nothing = Reading("the areas enclosed by all lines", [], walls=shapely.Polygon(), bounds=bounds)
-    best = readings[0] if readings else nothing
-    for reading in readings[1:]:
-        if _is_better(reading, best):
-            best = reading
+    readings = [_count_doors_and_names(reading, drawing, leaves) for reading in readings or [nothing]]
+    best = reduce(lambda best, reading: reading if _is_better(reading, best) else best, readings)
     closed = f"; gaps up to {bounds.walls.widest_gap:g} m were closed" if best.walls is not None else ""
     builder.notes.append(f"rooms are {best.source}{closed}")
     rivals = [reading for reading in readings if reading is not best and reading.rooms]

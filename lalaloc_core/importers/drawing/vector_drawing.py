@@ -359,12 +359,9 @@ def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometr
     if not shapes:
         return []
     check_network(shapes)
-    around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
-    regions = list(shapely.get_parts(around))
-    tree = shapely.STRtree(regions)
+    around = shapely.union_all(shapely.buffer(shapes, 0.5 * reach_m, quad_segs=2))
+    tree = shapely.STRtree(shapely.get_parts(around))
     members: dict[int, list[BaseGeometry]] = {}
-    for shape in shapes:
-        indices = tree.query(shape, predicate="intersects")
-        if len(indices):
-            members.setdefault(int(indices[0]), []).append(shape)
+    for index, region in zip(*tree.query(shapes, predicate="intersects").tolist(), strict=True):
+        members.setdefault(region, []).append(shapes[index])
     return [shapely.GeometryCollection(group) for group in members.values()]

@@ -43,13 +43,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
-from lalaloc_core.importers.common.geometry import (
-    even_odd_polygons,
-    in_range,
-    label_position,
-    polygons_from_geometry,
-    without_repeats,
-)
+from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.storeys import by_storey
@@ -471,7 +465,9 @@ def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
         points = _flatten(dxf_path.make_path(entity), sag)
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return np.empty((0, 2))
-    return without_repeats(points) if len(points) and in_range(points) else np.empty((0, 2))
+    if not len(points) or not in_range(points):
+        return np.empty((0, 2))
+    return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
 
 
 def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:

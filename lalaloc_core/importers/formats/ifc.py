@@ -31,7 +31,7 @@ _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 _MOSTLY = 0.9
 # Heights of storeys nearer than this are of one storey (m).
 _SAME_STOREY_M = 1.5
-_KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
+_KINDS: Mapping[str, OpeningKind] = {"IfcDoor": "door", "IfcWindow": "window"}
 # Share of the time limit after which shapes of fixtures, which can be very detailed, are left out.
 _FIXTURES_SHARE = 0.6
 
@@ -242,10 +242,13 @@ def _add_elements(
             _add_fixture(element, fixture, sketch, builder, meshes)
             continue
         mesh = _shape(element, meshes)
-        kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
-        opening = None if mesh is None or kind is None else _opening(element, kind, mesh[0], floor_m)  # type: ignore[arg-type]
-        if opening is not None:
-            sketch.openings.append(opening)
+        kind: OpeningKind | None = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
+        ends = None if mesh is None or kind is None else opening_line(shapely.MultiPoint(mesh[0][:, :2]).convex_hull)
+        if mesh is not None and kind is not None and ends is not None:
+            sill, head = float(mesh[0][:, 2].min()) - floor_m, float(mesh[0][:, 2].max()) - floor_m
+            name = str(element.Tag or element.Name or "") or None
+            sill_m = max(sill, 0.0) if kind == "window" else None
+            sketch.openings.append(SketchedOpening(kind, *ends, name, sill_m, head))
         elif kind is None and mesh is not None:
             sketch.obstacles += _projection(*mesh)
         else:
@@ -289,17 +292,6 @@ def _shape(element: Any, meshes: _Meshes) -> _Mesh | None:
     """Return the mesh of the void that an element fills; without a void, its own."""
     voids = [relation.RelatingOpeningElement for relation in getattr(element, "FillsVoids", None) or ()]
     return next((found for void in voids if (found := meshes.of(void)) is not None), None) or meshes.of(element)
-
-
-def _opening(
-    element: Any, kind: OpeningKind, vertices: Float[np.ndarray, "n 3"], floor_m: float
-) -> SketchedOpening | None:
-    ends = opening_line(shapely.MultiPoint(vertices[:, :2]).convex_hull)
-    if ends is None:
-        return None
-    sill, head = float(vertices[:, 2].min()) - floor_m, float(vertices[:, 2].max()) - floor_m
-    name = str(element.Tag or element.Name or "") or None
-    return SketchedOpening(kind, *ends, name, max(sill, 0.0) if kind == "window" else None, head)
 
 
 class _Meshes:
@@ -365,12 +357,10 @@ class _Meshes:
 def _inside(vertices: Float[np.ndarray, "n 3"], edges: Any) -> _Mesh | None:
     """Return a flat mesh of the area that edges enclose, None without one."""
     area = shapely.build_area(shapely.multilinestrings(vertices[edges][:, :, :2]))
-    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
-    if not len(triangles):
-        return None
-    corners = np.concatenate([np.asarray(triangle.exterior.coords)[:3] for triangle in triangles])
-    flat = np.column_stack([corners, np.full(len(corners), vertices[:, 2].min())])
-    return flat, np.arange(len(corners)).reshape(-1, 3)
+    rings = shapely.get_coordinates(shapely.constrained_delaunay_triangles(area)).reshape(-1, 4, 2)
+    corners = rings[:, :3].reshape(-1, 2)
+    flat = np.insert(corners, 2, vertices[:, 2].min(), axis=1)
+    return (flat, np.arange(len(flat)).reshape(-1, 3)) if len(flat) else None
 
 
 def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shapely.Polygon]:

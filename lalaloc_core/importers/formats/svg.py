@@ -23,7 +23,7 @@ from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
-from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry, without_repeats
+from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
@@ -168,16 +168,12 @@ def _view(attributes: Mapping[str, str], around: tuple[float, float]) -> tuple[t
     for place, (key, whole) in enumerate(zip(_OF_VIEW, (*around, *around), strict=False)):
         # Words such as "auto" are no length.
         if _NUMBER.match(text := attributes.get(key, "").strip()):
-            length = svgelements.Length(text).value(
-                _PPI, whole, _LETTER_PX, 0.5 * _LETTER_PX, "0 0 {} {}".format(*around)
-            )
-            box[place] = float(length)
+            length: Any = svgelements.Length(text)
+            box[place] = float(length.value(_PPI, whole, _LETTER_PX, 0.5 * _LETTER_PX, f"0 0 {around[0]} {around[1]}"))
     view = _box(attributes) or [0.0, 0.0, *(side or 1.0 for side in box[2:])]
-    fit = attributes.get("preserveAspectRatio", "xMidYMid")
-    return (
-        view[2],
-        view[3],
-    ), f"{attributes.get('transform', '')} {svgelements.Viewbox.viewbox_transform(*box, *view, fit)}"
+    numbers: list[Any] = [*box, *view, attributes.get("preserveAspectRatio", "xMidYMid")]
+    transform = svgelements.Viewbox.viewbox_transform(*numbers)
+    return (view[2], view[3]), f"{attributes.get('transform', '')} {transform}"
 
 
 def _box(attributes: Mapping[str, str]) -> list[float] | None:
@@ -269,7 +265,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 
 def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
     """Return the lengths (m) on paper of a user unit and the longer side, None if the width has no unit or pixels."""
-    sides = [svgelements.Length(root.get(key, "")) for key in ("width", "height")]
+    sides: list[Any] = [svgelements.Length(root.get(key, "")) for key in ("width", "height")]
     sizes_m = [float(side.amount) * _METRES.get(side.units, 0.0) for side in sides]
     units = (_box(root.attrib) or [size * _PPI / _METRES["in"] for size in (0.0, 0.0, *sizes_m)])[2:]
     scales = [size / unit for size, unit in zip(sizes_m, units, strict=True) if size > 0.0]
@@ -407,7 +403,7 @@ def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.nda
         if not in_range(points):
             yield np.empty((0, 2)), False, []
         elif len(points):
-            points = without_repeats(points)
+            points = points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
             returns = len(points) > 3 and bool(np.all(points[0] == points[-1]))
             yield points, path.is_closed or returns, [np.array(curve) for curve in path.curves]
 
