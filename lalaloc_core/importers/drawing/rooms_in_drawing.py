@@ -220,8 +220,8 @@ def _by_named_walls(drawing: Drawing, budget: Budget) -> Enclosed | None:
 def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     """Return the areas between dark areas and lines of a thick pen, without the parts that are painted over."""
     bounds = budget.limits.rooms
-    drawn = [(area.shape, area.order) for area in drawing.areas if area.is_dark and area.role is None]
-    drawn = [(shape, order) for shape, order in drawn if not _is_stroke_of_letter(shape, bounds)]
+    dark = [area for area in drawing.areas if area.is_dark and area.role is None]
+    drawn = [(area.shape, area.order) for area in dark if not _is_stroke_of_letter(area.shape, bounds)]
     drawn += _drawn_thick(drawing, None, bounds)
     visible, painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
     bodies = [shape for shape in visible if not _is_outline(Area(shape, "", is_dark=True), bounds)]
@@ -315,17 +315,16 @@ class GapFinder:
 
     def closed_by(self, swing: Swing) -> int | None:
         """Return the index of the gap that a leaf closes, alone or as one of two leaves."""
-        best: tuple[float, int] | None = None
+        found: list[tuple[float, int]] = []
         hinge_m, (narrow, wide) = self._bounds.hinge_m, self._bounds.leaf_of_gap
-        for end in sorted(self._tree.query(shapely.Point(swing.hinge), predicate="dwithin", distance=hinge_m)):
+        for end in self._tree.query(shapely.Point(swing.hinge), predicate="dwithin", distance=hinge_m):
             (near, far), gap = self._ends[end], self.gaps[end // 2]
-            distance = math.dist(swing.hinge, near)
             shares = [leaves * swing.radius / max(gap.width, 1e-6) for leaves in (1, 2)]
             fits = any(narrow <= share <= wide for share in shares)
             tip_distance = min(math.dist(swing.first, far), math.dist(swing.last, far))
-            if fits and tip_distance <= self._bounds.open_leaf * gap.width and (best is None or distance < best[0]):
-                best = (distance, int(end) // 2)
-        return None if best is None else best[1]
+            if fits and tip_distance <= self._bounds.open_leaf * gap.width:
+                found.append((math.dist(swing.hinge, near), int(end) // 2))
+        return min(found)[1] if found else None
 
 
 # Walls by which rooms are looked for, in words, in the order of trust.
