@@ -30,14 +30,10 @@ _NAMED = "the walls"
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Rooms of a drawing by one kind of evidence.
+    """Rooms of a drawing by one kind of evidence, which `source` names in words.
 
-    Attributes:
-        source: what the rooms are, in words.
-        walls: walls that enclose the rooms; None for rooms that the file marks.
-        doors: gaps that leaves of doors close.
-        named: rooms with a name that is a use.
-        bounds: bounds that it was found by.
+    `walls` enclose the rooms; None for rooms that the file marks. `doors` is the number of gaps that leaves close, and
+    `named` that of the rooms with a name that is a use.
     """
 
     source: str

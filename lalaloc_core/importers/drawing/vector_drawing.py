@@ -75,15 +75,10 @@ class Paint:
 
 @dataclass(frozen=True, eq=False)
 class Area:
-    """Closed shape.
+    """Closed shape on a layer, or in a group or class, with the role by its name.
 
-    Attributes:
-        layer: layer, group or class.
-        role: role by the name of the layer.
-        kind: words about the use of a room, such as the class of an SVG element.
-        is_dark: dark enough to be a wall; None if the drawing has no fills.
-        width: width of the pen that draws the outline, 0 if unknown.
-        order: place in the order of painting.
+    `kind` are words about the use of a room, such as the class of an SVG element. What `is_dark` can be a wall; None if
+    the drawing has no fills. `width` is that of the outline's pen, 0 if unknown. `order` is the place in painting.
     """
 
     shape: shapely.Polygon

@@ -29,8 +29,8 @@ _Mesh = tuple[Float[np.ndarray, "n 3"], Any]
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
 _MOSTLY = 0.9
-# Heights of storeys nearer than this are of one storey (m).
-_SAME_STOREY_M = 1.5
+# Heights of storeys nearer than this are of one storey (m). Triangles seen from the side have no larger area (m²).
+_SAME_STOREY_M, _NO_AREA_M2 = 1.5, 5e-10
 _KINDS: Mapping[str, OpeningKind] = {"IfcDoor": "door", "IfcWindow": "window"}
 # Share of the time limit after which shapes of fixtures, which can be very detailed, are left out.
 _FIXTURES_SHARE = 0.6
@@ -365,7 +365,5 @@ def _inside(vertices: Float[np.ndarray, "n 3"], edges: Any) -> _Mesh | None:
 
 def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shapely.Polygon]:
     """Return the area that triangles cover, seen from above."""
-    corners = vertices[triangles][:, :, :2]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-9
-    return join_faces([shapely.Polygon(triangle) for triangle in corners[flat]]) if flat.any() else []
+    shapes = np.asarray(shapely.polygons(vertices[triangles][:, :, :2]))
+    return join_faces(shapes[shapely.area(shapes) > _NO_AREA_M2].tolist())
