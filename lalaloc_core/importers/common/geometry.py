@@ -234,12 +234,9 @@ def point_xy(point: Float[np.ndarray, "2"] | tuple[float, ...]) -> tuple[float, 
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Grid of a map.
+    """Grid of a map, with the size of a cell, and the numbers of rows and columns.
 
-    Attributes:
-        resolution_m: size of a cell.
-        origin: place of the lower left corner (m) and the grid's counter-clockwise rotation in the map frame.
-        size: rows and columns.
+    `origin` is the place of the lower left corner (m) and the grid's counter-clockwise rotation in the map frame.
     """
 
     resolution_m: float
@@ -292,13 +289,9 @@ class WallAreas:
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """Floor of a solid.
+    """Outlines of the floor of a solid, the height of its lowest point, and that of its highest above the lowest.
 
-    Attributes:
-        parts: its outlines.
-        low_m: height of its lowest point.
-        rise_m: height of its highest point above the lowest.
-        higher_m2: area of the solid that lies beside its floor, more than a step above it.
+    `higher_m2` is the area of the solid that lies beside its floor, more than a step above it.
     """
 
     parts: list[shapely.Polygon]

@@ -288,8 +288,7 @@ def _names(letterings: Sequence[Lettering]) -> list[Lettering]:
 
 def _is_name(text: str) -> bool:
     """Return whether a text is neither a size ("12.5 m²", "3,20 x 4,10") nor a door number."""
-    letters = sum(character.isalpha() for character in text)
-    digits = sum(character.isdigit() for character in text)
+    letters, digits = sum(map(str.isalpha, text)), sum(map(str.isdigit, text))
     return letters >= 2 and letters > digits
 
 
