@@ -41,8 +41,6 @@ EXPECTED = {
     "hidden_parts.dxf": _Expected((35.5, 23.7), {"passage": 1}, said="layer 'LINES' is not plotted, and was left out"),
     "illustrator.svg": _Expected((24.1, 16.9), types=frozenset({"kitchen", "bedroom"})),
     "lat_lon.geojson": _Expected((24.2, 21.0, 19.8), said="latitude and longitude"),
-    "lat_lon_areas.geojson": _Expected((24.0, 20.0, 44.0), said="the area of rooms would be 1.5 times"),
-    "lat_lon_doors.geojson": _Expected((24.0, 19.2, 41.8), {"door": 2}, said="the width of doors would be 1.5 times"),
     "layers_off.pdf": _Expected((33.6, 22.0), said="switched off in the PDF were not read: one without a name, 'Äß'"),
     "layers_on.pdf": _Expected((22.0, 16.2, 16.2)),
     "low_attic.ifc": _Expected((19.2, 16.0), said="room 'Eaves' (34.2 m², 100 % of the floor) is 1.20 m high"),

@@ -160,13 +160,10 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
                 f"{limit} times, the limit for as many points; draw the outline once around its area"
             )
         valid = shapely.make_valid(geometry)
-    found: list[shapely.Polygon] = []
-    for part in shapely.get_parts(valid):
-        if isinstance(part, shapely.Polygon):
-            found += [part] if part.area > 0.0 else []
-        elif isinstance(part, shapely.MultiPolygon | shapely.GeometryCollection):
-            found.extend(polygons_from_geometry(part))
-    return found
+    if isinstance(valid, shapely.Polygon):
+        return [valid] if valid.area > 0.0 else []
+    has_parts = isinstance(valid, shapely.MultiPolygon | shapely.GeometryCollection)
+    return [polygon for part in shapely.get_parts(valid) if has_parts for polygon in polygons_from_geometry(part)]
 
 
 def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = False) -> list[shapely.Polygon]:
@@ -176,7 +173,7 @@ def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = Fa
     """
     shapes: list[BaseGeometry] = list(rings)
     check_network(shapes)
-    if is_nonzero:
+    if is_nonzero and len(shapes) > 1:
         is_ccw = shapely.is_ccw(shapely.get_exterior_ring(shapes))
         shapes = [shapely.union_all(np.array(shapes)[is_ccw == direction]) for direction in (True, False)]
     # In pairs, so that the time is not quadratic in the number of outlines.
@@ -237,12 +234,9 @@ def point_xy(point: Float[np.ndarray, "2"] | tuple[float, ...]) -> tuple[float, 
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Grid of a map.
+    """Grid of a map, with the size of a cell, and the numbers of rows and columns.
 
-    Attributes:
-        resolution_m: size of a cell.
-        origin: place of the lower left corner (m) and the grid's counter-clockwise rotation in the map frame.
-        size: rows and columns.
+    `origin` is the place of the lower left corner (m) and the grid's counter-clockwise rotation in the map frame.
     """
 
     resolution_m: float
@@ -295,13 +289,9 @@ class WallAreas:
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """Floor of a solid.
+    """Outlines of the floor of a solid, the height of its lowest point, and that of its highest above the lowest.
 
-    Attributes:
-        parts: its outlines.
-        low_m: height of its lowest point.
-        rise_m: height of its highest point above the lowest.
-        higher_m2: area of the solid that lies beside its floor, more than a step above it.
+    `higher_m2` is the area of the solid that lies beside its floor, more than a step above it.
     """
 
     parts: list[shapely.Polygon]

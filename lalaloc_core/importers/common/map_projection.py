@@ -23,10 +23,6 @@ ORDERED = "OGC:CRS84"
 # which they are not, and cosines of corners that are square, and of those that count.
 _MAX_LATITUDE, _SQUARE, _OBLIQUE = 85.0, 0.9, 0.5
 _SQUARE_COSINE, _STRAIGHT = 0.05, 0.9
-# Widths (m), and directions along an axis. Logarithms of what is stretched up to which the order is right, and from
-# which it is not.
-_WIDTHS_M = {"thickness of walls": (0.03, 0.8), "width of doors": (0.4, 2.5)}
-_ALONG, _EVEN, _STRETCHED = 0.1, 0.15, 0.25
 
 
 class Projection(NamedTuple):
@@ -40,13 +36,10 @@ class Projection(NamedTuple):
     unsure: tuple[str, ...] = ()
 
 
-def projection(
-    shapes: Sequence[BaseGeometry], crs: str | None, options: ImportOptions, areas: Sequence[float | None] = ()
-) -> Projection:
+def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportOptions) -> Projection:
     """Return the conversion for the shapes of a file.
 
-    `crs` is the code of the coordinate reference system, None for WGS84 in a probable order. `areas` are those that the
-    file states for the shapes (m²).
+    `crs` is the code of the coordinate reference system, None for WGS84 in a probable order.
     """
     is_ordered, crs = crs == ORDERED, None if crs == ORDERED else crs
     points = np.concatenate([shapely.get_coordinates(shape) for shape in shapes])
@@ -71,7 +64,7 @@ def projection(
             raise InvalidFloorPlanError(
                 f"the crs '{crs}' is unknown or cannot be used; export the file in WGS84"
             ) from error
-    exchanged, why = (False, "") if crs is not None else _order(shapes, areas, low, high)
+    exchanged, why = (False, "") if crs is not None else _order(shapes, low, high)
     if exchanged:
         found = projection([_flipped(shape) for shape in shapes], ORDERED, options)
         warning = f"the positions are latitude and longitude, and were read so: {why}; exchange the two"
@@ -100,9 +93,7 @@ def projection(
     return Projection(project, anchor, 1.0, source, unsure=() if is_ordered or not why else (why,))
 
 
-def _order(
-    shapes: Sequence[BaseGeometry], areas: Sequence[float | None], low: np.ndarray, high: np.ndarray
-) -> tuple[bool, str]:
+def _order(shapes: Sequence[BaseGeometry], low: np.ndarray, high: np.ndarray) -> tuple[bool, str]:
     """Return whether positions are latitude and longitude, and the reason, or that it is unknown; "" if it is sure."""
     x, y = np.abs([low, high]).max(axis=0)
     if x > _MAX_LATITUDE or y > 180.0:
@@ -112,23 +103,14 @@ def _order(
     if y > 90.0:
         return True, beyond
     frame, swapped = LocalFrame(longitude, latitude), LocalFrame(latitude, longitude)
-    orders = [
-        [shapely.transform(shape, change) for shape in shapes]
+    as_stated, exchanged = (
+        _square_share([shapely.transform(shape, change) for shape in shapes])
         for change in (frame.to_local, lambda points: swapped.to_local(points[:, ::-1]))
-    ]
-    as_stated, exchanged = map(_square_share, orders)
+    )
     if as_stated < _OBLIQUE and exchanged > _SQUARE:
         return True, "in the order of GeoJSON, longitude first, the rooms would not be square"
     if exchanged < _OBLIQUE and as_stated > _SQUARE:
         return False, ""
-    stretched, if_exchanged = (_stretches(order, areas) for order in orders)
-    if stretched and max(stretched.values()) < _EVEN and max(if_exchanged.values(), default=0.0) > _STRETCHED:
-        return False, ""
-    # Walls of one direction can be thicker than others.
-    told = stretched.keys() - {"thickness of walls"} and min(stretched.values()) > _STRETCHED
-    if told and max(if_exchanged.values(), default=1.0) < _EVEN:
-        named = " and ".join(f"the {kind} would be {math.exp(value):.1f} times" for kind, value in stretched.items())
-        return True, f"in the order of GeoJSON, longitude first, {named} what it is elsewhere or stated to be"
     # Near a pole a plan spans many longitudes, which would be many latitudes.
     if y > _MAX_LATITUDE and np.abs(swapped.to_local(np.array([low, high])[:, ::-1])).max() <= _MAX_REACH_M:
         return True, beyond
@@ -156,26 +138,6 @@ def _square_share(shapes: Sequence[BaseGeometry]) -> float:
             square += float(weight[turns & (np.abs(cosine) < _SQUARE_COSINE)].sum())
             total += float(weight[turns].sum())
     return square / total if total > 0.0 else math.nan
-
-
-def _stretches(shapes: Sequence[BaseGeometry], areas: Sequence[float | None]) -> dict[str, float]:
-    """Return by how much, as logarithms, openings and walls are wider along one axis, and areas are not as stated."""
-    pairs = zip(shapes, areas, strict=False)
-    shares = [shape.area / stated for shape, stated in pairs if stated and shape.area > 0.0 and stated > 0.0]
-    found = {"area of rooms": abs(math.log(np.median(shares)))} if shares else {}
-    parts = shapely.get_parts(shapes)
-    rooms = parts[shapely.get_dimensions(parts) == 2]
-    a, b = shapely.STRtree(rooms).query(rooms, predicate="dwithin", distance=_WIDTHS_M["thickness of walls"][1])
-    lines_of = {"width of doors": parts[shapely.get_dimensions(parts) == 1]}
-    lines_of["thickness of walls"] = shapely.shortest_line(rooms[a], rooms[b])
-    for kind, lines in lines_of.items():
-        steps = np.abs([np.subtract(line.coords[-1], line.coords[0]) for line in lines]).reshape(-1, 2)
-        low_m, high_m = _WIDTHS_M[kind]
-        steps = steps[(steps.max(axis=1) >= low_m) & (steps.max(axis=1) <= high_m)]
-        along = [steps[steps[:, 1 - axis] < _ALONG * steps[:, axis], axis] for axis in (0, 1)]
-        if all(map(len, along)):
-            found[kind] = abs(math.log(np.median(along[0]) / np.median(along[1])))
-    return found
 
 
 def _middle(lon_lat: Float[np.ndarray, "n 2"]) -> tuple[float, float]:

@@ -88,9 +88,7 @@ def import_features(
         raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
     _refuse_map(features, format)
     # The other formats state which number is the latitude.
-    areas = [_number(feature.properties, "area_m2", "area", "floor_area") for feature in features]
-    order = crs if format == "geojson" else ORDERED
-    placed = projection([feature.shape for feature in features], order, options, areas)
+    placed = projection([feature.shape for feature in features], crs if format == "geojson" else ORDERED, options)
     is_indoor = any(str(feature.properties.get("indoor")) in _INDOOR for feature in features)
     by_level: dict[str, tuple[Level, list[Feature]]] = {}
     on_any_level: list[Feature] = []

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -29,14 +30,10 @@ _NAMED = "the walls"
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Rooms of a drawing by one kind of evidence.
+    """Rooms of a drawing by one kind of evidence, which `source` names in words.
 
-    Attributes:
-        source: what the rooms are, in words.
-        walls: walls that enclose the rooms; None for rooms that the file marks.
-        doors: gaps that leaves of doors close.
-        named: rooms with a name that is a use.
-        bounds: bounds that it was found by.
+    `walls` enclose the rooms; None for rooms that the file marks. `doors` is the number of gaps that leaves close, and
+    `named` that of the rooms with a name that is a use.
     """
 
     source: str
@@ -74,11 +71,8 @@ def choose_reading(
     The drawing has no leaves of doors among its lines; `leaves` are these and the swings of doors. `marked` are the
     rooms that the file marks, see `marked_rooms`.
     """
-    readings: list[Reading] = []
     bounds = budget.limits.rooms
-    if marked:
-        reading = Reading("the areas that the file marks as rooms", marked, bounds=bounds)
-        readings.append(_count_doors_and_names(reading, drawing, leaves))
+    readings = [Reading("the areas that the file marks as rooms", marked, bounds=bounds)] if marked else []
     # Rooms that layers mark by a word for rooms are complete, unless they are a small part of the drawing.
     is_by_word = any(area.role == "room" for area in marked)
     box_m2 = shapely.box(*shapely.total_bounds(drawing.shapes)).area if drawing.shapes else 0.0
@@ -93,16 +87,15 @@ def choose_reading(
                 refused = error
                 continue
             if found is not None:
-                shapes = [Area(shape, "", "room") for shape in found.rooms]
-                reading = Reading(f"the areas enclosed by {source}", shapes, found.gaps, found.walls, bounds=bounds)
-                readings.append(_count_doors_and_names(reading, drawing, leaves))
+                rooms = [Area(shape, "", "room") for shape in found.rooms]
+                readings.append(
+                    Reading(f"the areas enclosed by {source}", rooms, found.gaps, found.walls, bounds=bounds)
+                )
         if refused is not None and not any(reading.rooms for reading in readings):
             raise refused
     nothing = Reading("the areas enclosed by all lines", [], walls=shapely.Polygon(), bounds=bounds)
-    best = readings[0] if readings else nothing
-    for reading in readings[1:]:
-        if _is_better(reading, best):
-            best = reading
+    readings = [_count_doors_and_names(reading, drawing, leaves) for reading in readings or [nothing]]
+    best = reduce(lambda best, reading: reading if _is_better(reading, best) else best, readings)
     closed = f"; gaps up to {bounds.walls.widest_gap:g} m were closed" if best.walls is not None else ""
     builder.notes.append(f"rooms are {best.source}{closed}")
     rivals = [reading for reading in readings if reading is not best and reading.rooms]
@@ -223,8 +216,8 @@ def _by_named_walls(drawing: Drawing, budget: Budget) -> Enclosed | None:
 def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
     """Return the areas between dark areas and lines of a thick pen, without the parts that are painted over."""
     bounds = budget.limits.rooms
-    drawn = [(area.shape, area.order) for area in drawing.areas if area.is_dark and area.role is None]
-    drawn = [(shape, order) for shape, order in drawn if not _is_stroke_of_letter(shape, bounds)]
+    dark = [area for area in drawing.areas if area.is_dark and area.role is None]
+    drawn = [(area.shape, area.order) for area in dark if not _is_stroke_of_letter(area.shape, bounds)]
     drawn += _drawn_thick(drawing, None, bounds)
     visible, painted = cut_painted(drawn, drawing.patches, bounds.walls.thickest, budget.check_time)
     bodies = [shape for shape in visible if not _is_outline(Area(shape, "", is_dark=True), bounds)]
@@ -318,17 +311,16 @@ class GapFinder:
 
     def closed_by(self, swing: Swing) -> int | None:
         """Return the index of the gap that a leaf closes, alone or as one of two leaves."""
-        best: tuple[float, int] | None = None
+        found: list[tuple[float, int]] = []
         hinge_m, (narrow, wide) = self._bounds.hinge_m, self._bounds.leaf_of_gap
-        for end in sorted(self._tree.query(shapely.Point(swing.hinge), predicate="dwithin", distance=hinge_m)):
+        for end in self._tree.query(shapely.Point(swing.hinge), predicate="dwithin", distance=hinge_m):
             (near, far), gap = self._ends[end], self.gaps[end // 2]
-            distance = math.dist(swing.hinge, near)
             shares = [leaves * swing.radius / max(gap.width, 1e-6) for leaves in (1, 2)]
             fits = any(narrow <= share <= wide for share in shares)
             tip_distance = min(math.dist(swing.first, far), math.dist(swing.last, far))
-            if fits and tip_distance <= self._bounds.open_leaf * gap.width and (best is None or distance < best[0]):
-                best = (distance, int(end) // 2)
-        return None if best is None else best[1]
+            if fits and tip_distance <= self._bounds.open_leaf * gap.width:
+                found.append((math.dist(swing.hinge, near), int(end) // 2))
+        return min(found)[1] if found else None
 
 
 # Walls by which rooms are looked for, in words, in the order of trust.

@@ -288,8 +288,7 @@ def _names(letterings: Sequence[Lettering]) -> list[Lettering]:
 
 def _is_name(text: str) -> bool:
     """Return whether a text is neither a size ("12.5 m²", "3,20 x 4,10") nor a door number."""
-    letters = sum(character.isalpha() for character in text)
-    digits = sum(character.isdigit() for character in text)
+    letters, digits = sum(map(str.isalpha, text)), sum(map(str.isdigit, text))
     return letters >= 2 and letters > digits
 
 
@@ -324,18 +323,12 @@ def _is_frame(part: BaseGeometry) -> bool:
 
 def _swings(swings: Sequence[Swing], finder: GapFinder, rooms: Sequence[Area]) -> list[SketchedOpening]:
     """Return doors from their swings: the gap that a leaf closes, else the leaf in its closed position."""
-    walls = shapely.union_all([area.shape.exterior for area in rooms]) if rooms else shapely.LineString()
-    found: list[SketchedOpening] = []
-    closed: set[int] = set()
-    for swing in swings:
-        index = finder.closed_by(swing)
-        if index is not None:
-            if index not in closed:
-                closed.add(index)
-                found.append(SketchedOpening("door", finder.gaps[index].start, finder.gaps[index].end))
-        elif not walls.is_empty:
-            found.append(_closed_leaf(swing, walls))
-    return found
+    closed = [finder.closed_by(swing) for swing in swings]
+    gaps = [finder.gaps[index] for index in dict.fromkeys(closed) if index is not None]
+    walls = shapely.union_all([area.shape.exterior for area in rooms])
+    others = [swing for swing, index in zip(swings, closed, strict=True) if index is None and not walls.is_empty]
+    doors = [SketchedOpening("door", gap.start, gap.end) for gap in gaps]
+    return [*doors, *(_closed_leaf(swing, walls) for swing in others)]
 
 
 def _closed_leaf(swing: Swing, walls: BaseGeometry) -> SketchedOpening:

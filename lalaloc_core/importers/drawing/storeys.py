@@ -273,9 +273,8 @@ def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Leve
 
 def _are_over_each_other(first: Sequence[BaseGeometry], second: Sequence[BaseGeometry]) -> bool:
     """Return whether the lines of both run around most of the same outline, and both have others as well."""
-    small, large = sorted(
-        (shapely.convex_hull(shapely.GeometryCollection(g)) for g in (first, second)), key=lambda hull: hull.area
-    )
+    hulls = shapely.convex_hull([shapely.GeometryCollection(group) for group in (first, second)])
+    small, large = sorted(hulls, key=shapely.area)
     along = small.boundary.intersection(large.boundary.buffer(_SAME_LINE_M))
     least = _MOSTLY_ALONG * small.length
     if not small.area or along.length < least:

@@ -20,6 +20,7 @@ from lalaloc_core.floorplan.room_types import PLAN_WORDS, room_types_from_name, 
 from lalaloc_core.importers.common.geometry import (
     check_network,
     distinct,
+    even_odd_polygons,
     extent_of,
     lines_of,
     point_xy,
@@ -29,12 +30,10 @@ from lalaloc_core.importers.common.geometry import (
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
-# Fills of lower luminance (of 255) can be walls.
-_DARK = 110.0
-# Channels of white from here on.
-_WHITE = 250.0
-# Glass is bluer than red by this.
-_BLUER = 20.0
+# Of 255: fills of lower luminance can be walls, channels of white are not lower, and glass is bluer than red by this.
+_DARK, _WHITE, _BLUER = 110.0, 250.0, 20.0
+# Least opacity (of 255) of what can be seen, and of fills that hide what is below them.
+_VISIBLE, _HIDING = 60.0, 230.0
 # Straight pieces per curve.
 CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
@@ -49,17 +48,37 @@ _LINES_AT_A_TIME = 100
 _SHEETS, _SAME_SIDES = np.array([math.sqrt(2.0), 400 / 277, 277 / 180, 17 / 11, 11 / 8.5]), 0.004
 
 
+@dataclass(frozen=True)
+class Paint:
+    """Colour of a fill or a pen: channels and opacity, 0 to 255."""
+
+    red: float
+    green: float
+    blue: float
+    opacity: float
+
+    @property
+    def is_visible(self) -> bool:
+        """Whether it does not show most of what is below it."""
+        return self.opacity >= _VISIBLE
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether a fill can be a wall, by its luminance (ITU-R BT.601)."""
+        return 0.299 * self.red + 0.587 * self.green + 0.114 * self.blue < _DARK
+
+    @property
+    def is_white(self) -> bool:
+        """Whether a line cannot be seen on paper."""
+        return min(self.red, self.green, self.blue) >= _WHITE
+
+
 @dataclass(frozen=True, eq=False)
 class Area:
-    """Closed shape.
+    """Closed shape on a layer, or in a group or class, with the role by its name.
 
-    Attributes:
-        layer: layer, group or class.
-        role: role by the name of the layer.
-        kind: words about the use of a room, such as the class of an SVG element.
-        is_dark: dark enough to be a wall; None if the drawing has no fills.
-        width: width of the pen that draws the outline, 0 if unknown.
-        order: place in the order of painting.
+    `kind` are words about the use of a room, such as the class of an SVG element. What `is_dark` can be a wall; None if
+    the drawing has no fills. `width` is that of the outline's pen, 0 if unknown. `order` is the place in painting.
     """
 
     shape: shapely.Polygon
@@ -91,6 +110,7 @@ class Patch:
     shape: shapely.Polygon
     order: int
     is_bluish: bool = False
+    layer: str = ""
 
 
 @dataclass(frozen=True)
@@ -158,6 +178,20 @@ class Drawing:
         """Longer side of the box around areas and lines; NaN without any."""
         return extent_of(self.shapes)
 
+    def add_areas(
+        self, shells: Sequence[shapely.Polygon], like: Area, fill: Paint | None, *, is_nonzero: bool, has_line: bool
+    ) -> int:
+        """Add areas between outlines, with the attributes of one, and return their number; a light fill hides others.
+
+        Of outlines without a line only dark areas are kept: not a coloured floor or a white background.
+        """
+        order, parts = self.next_order, even_odd_polygons(shells, is_nonzero=is_nonzero)
+        if fill is not None and like.role is None and not like.is_dark and fill.opacity >= _HIDING:
+            self.patches += [Patch(part, order, fill.blue > fill.red + _BLUER) for part in parts]
+        if like.is_dark or has_line:
+            self.areas += [replace(like, shape=part, order=order) for part in parts]
+        return len(parts)
+
     def on_paper(self) -> Drawing:
         """Return the drawing without white lines, which hide others, unless most is white, as on a dark ground."""
         seen = [stroke for stroke in self.strokes if not stroke.is_white or stroke.role is not None]
@@ -165,14 +199,8 @@ class Drawing:
 
     def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
         """Return what is on some layers; patches, which have none, stay."""
-        return Drawing(
-            [area for area in self.areas if is_wanted(area.layer)],
-            [stroke for stroke in self.strokes if is_wanted(stroke.layer)],
-            [swing for swing in self.swings if is_wanted(swing.layer)],
-            [lettering for lettering in self.letterings if is_wanted(lettering.layer)],
-            self.patches,
-            [fixture for fixture in self.fixtures if is_wanted(fixture.layer)],
-        )
+        kept = {kind: [item for item in items if is_wanted(item.layer)] for kind, items in vars(self).items()}
+        return replace(self, **kept | {"patches": self.patches})
 
     def cropped(self, box: tuple[float, float, float, float]) -> Drawing:
         """Return the part of the drawing in a box; lines are cut, other shapes belong to it by their middles."""
@@ -262,6 +290,30 @@ def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[],
     return found
 
 
+@dataclass
+class Subpath:
+    """Part of a path: its points, its curves (runs of curved pieces), and whether it is closed."""
+
+    points: list[tuple[float, float]] = field(default_factory=list)
+    curves: list[list[tuple[float, float]]] = field(default_factory=list)
+    is_closed: bool = False
+    was_curved: bool = False
+
+    def add(self, piece: Sequence[tuple[float, float]], *, is_curved: bool) -> None:
+        """Add a piece, which begins at the last point."""
+        if is_curved:
+            self.curves += [] if self.was_curved else [list(piece[:1])]
+            self.curves[-1] += piece[1:]
+        self.points += piece[1:] if self.points else piece
+        self.was_curved = is_curved
+
+
+def leaves_of(curves: Sequence[Float[np.ndarray, "_ 2"]], layer: str = "") -> list[Swing]:
+    """Return the swings among the curves of a line, which has no more than two if they are of a door."""
+    swings = [fit_swing(curve, layer) for curve in curves] if len(curves) <= 2 else []
+    return [swing for swing in swings if swing is not None]
+
+
 def fit_swing(
     points: Float[np.ndarray, "n 2"], layer: str, angles_deg: tuple[float, float] = _SWING_DEG
 ) -> Swing | None:
@@ -302,27 +354,9 @@ def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometr
     if not shapes:
         return []
     check_network(shapes)
-    around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
-    regions = list(shapely.get_parts(around))
-    tree = shapely.STRtree(regions)
+    around = shapely.union_all(shapely.buffer(shapes, 0.5 * reach_m, quad_segs=2))
+    tree = shapely.STRtree(shapely.get_parts(around))
     members: dict[int, list[BaseGeometry]] = {}
-    for shape in shapes:
-        indices = tree.query(shape, predicate="intersects")
-        if len(indices):
-            members.setdefault(int(indices[0]), []).append(shape)
+    for index, region in zip(*tree.query(shapes, predicate="intersects").tolist(), strict=True):
+        members.setdefault(region, []).append(shapes[index])
     return [shapely.GeometryCollection(group) for group in members.values()]
-
-
-def is_dark(red: float, green: float, blue: float) -> bool:
-    """Return whether a fill can be a wall, by the luminance (ITU-R BT.601) of its channels, 0 to 255."""
-    return 0.299 * red + 0.587 * green + 0.114 * blue < _DARK
-
-
-def is_white_pen(red: float, green: float, blue: float) -> bool:
-    """Return whether a line of a colour cannot be seen on paper, by its channels, 0 to 255."""
-    return min(red, green, blue) >= _WHITE
-
-
-def is_bluish(red: float, green: float, blue: float) -> bool:
-    """Return whether a fill is the colour of glass in drawings, by its channels, 0 to 255."""
-    return blue > red + _BLUER

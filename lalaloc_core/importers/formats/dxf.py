@@ -47,7 +47,7 @@ from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, 
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.storeys import by_storey
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, fit_swing
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, leaves_of
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
@@ -222,12 +222,10 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     missing = _count_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget, frozen):
-        if context.layer.casefold() in off | frozen or entity.dxf.get("invisible", 0):
-            builder.use(
-                context.layer,
-                "ignored (layer is off)" if context.layer.casefold() in off | frozen else "ignored (invisible)",
-            )
-        elif context.layer.casefold() in unplotted and context.role is None and not options.layers:
+        layer = context.layer.casefold()
+        if layer in off | frozen or entity.dxf.get("invisible", 0):
+            builder.use(context.layer, f"ignored ({'layer is off' if layer in off | frozen else 'invisible'})")
+        elif layer in unplotted and context.role is None and not options.layers:
             builder.use(context.layer, "ignored (layer is not plotted)")
             missing[f"layer '{context.layer[:50]}'", _UNPLOTTED] += 1
         elif isinstance(entity, Insert) and context.fixture is not None and options.includes_layer(context.layer):
@@ -424,14 +422,10 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
         parts = zip(pairwise(points), widths, strict=True)
         drawing.strokes += [Stroke(shapely.LineString(part), context.layer, role, pen) for part, pen in parts]
         builder.use(context.layer, f"lines: {role or 'possible walls'}")
-        return
-    if entity.dxftype() == "ARC" and role in (None, "door"):
-        swing = fit_swing(points, context.layer)
-        if swing is not None:
-            drawing.swings.append(swing)
-            builder.use(context.layer, "door swings")
-            return
-    if len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
+    elif entity.dxftype() == "ARC" and role in (None, "door") and (leaves := leaves_of([points], context.layer)):
+        drawing.swings += leaves
+        builder.use(context.layer, "door swings")
+    elif len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
         shapes = polygons_from_geometry(shapely.Polygon(points))
         drawing.areas += [Area(shape, context.layer, role, width=width) for shape in shapes]
         builder.use(context.layer, f"closed lines: {role or 'possible walls or rooms'}", max(len(shapes), 1))

@@ -29,9 +29,9 @@ _Mesh = tuple[Float[np.ndarray, "n 3"], Any]
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
 _MOSTLY = 0.9
-# Heights of storeys nearer than this are of one storey (m).
-_SAME_STOREY_M = 1.5
-_KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
+# Heights of storeys nearer than this are of one storey (m). Triangles seen from the side have no larger area (m²).
+_SAME_STOREY_M, _NO_AREA_M2 = 1.5, 5e-10
+_KINDS: Mapping[str, OpeningKind] = {"IfcDoor": "door", "IfcWindow": "window"}
 # Share of the time limit after which shapes of fixtures, which can be very detailed, are left out.
 _FIXTURES_SHARE = 0.6
 
@@ -242,10 +242,13 @@ def _add_elements(
             _add_fixture(element, fixture, sketch, builder, meshes)
             continue
         mesh = _shape(element, meshes)
-        kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
-        opening = None if mesh is None or kind is None else _opening(element, kind, mesh[0], floor_m)  # type: ignore[arg-type]
-        if opening is not None:
-            sketch.openings.append(opening)
+        kind: OpeningKind | None = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
+        ends = None if mesh is None or kind is None else opening_line(shapely.MultiPoint(mesh[0][:, :2]).convex_hull)
+        if mesh is not None and kind is not None and ends is not None:
+            sill, head = float(mesh[0][:, 2].min()) - floor_m, float(mesh[0][:, 2].max()) - floor_m
+            name = str(element.Tag or element.Name or "") or None
+            sill_m = max(sill, 0.0) if kind == "window" else None
+            sketch.openings.append(SketchedOpening(kind, *ends, name, sill_m, head))
         elif kind is None and mesh is not None:
             sketch.obstacles += _projection(*mesh)
         else:
@@ -271,18 +274,13 @@ def _add_fixture(element: Any, kind: str, sketch: Sketch, builder: ReportBuilder
 def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
     """Add passages between touching spaces, unless all spaces reach to the centre lines of their walls."""
     shapes = [room.shape for room in sketch.rooms]
-    tree = shapely.STRtree(shapes)
-    first, second = tree.query(shapes, predicate="dwithin", distance=_THICK_M)
-    pairs = [(int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j]
-    touching = [
-        (i, j)
-        for i, j in pairs
-        if shapes[i].distance(shapes[j]) < _TOUCHING_M and shapes[i].buffer(-_TOUCHING_M).disjoint(shapes[j])
-    ]
+    near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=_THICK_M).T
+    pairs = [(shapes[i], shapes[j]) for i, j in near if i < j]
+    touching = [(a, b) for a, b in pairs if a.distance(b) < _TOUCHING_M and a.buffer(-_TOUCHING_M).disjoint(b)]
     if len(touching) > _MOSTLY * len(pairs):
         return
-    for i, j in touching:
-        shared = shapely.intersection(shapes[i].boundary.buffer(_TOUCHING_M), shapes[j].boundary)
+    for a, b in touching:
+        shared = shapely.intersection(a.boundary.buffer(_TOUCHING_M), b.boundary)
         for part in shapely.get_parts(shapely.simplify(shapely.line_merge(shared), _TOUCHING_M)):
             for start, end in pairwise(part.coords):
                 if math.dist(start, end) > _TOUCHING_PASSAGE_M:
@@ -294,17 +292,6 @@ def _shape(element: Any, meshes: _Meshes) -> _Mesh | None:
     """Return the mesh of the void that an element fills; without a void, its own."""
     voids = [relation.RelatingOpeningElement for relation in getattr(element, "FillsVoids", None) or ()]
     return next((found for void in voids if (found := meshes.of(void)) is not None), None) or meshes.of(element)
-
-
-def _opening(
-    element: Any, kind: OpeningKind, vertices: Float[np.ndarray, "n 3"], floor_m: float
-) -> SketchedOpening | None:
-    ends = opening_line(shapely.MultiPoint(vertices[:, :2]).convex_hull)
-    if ends is None:
-        return None
-    sill, head = float(vertices[:, 2].min()) - floor_m, float(vertices[:, 2].max()) - floor_m
-    name = str(element.Tag or element.Name or "") or None
-    return SketchedOpening(kind, *ends, name, max(sill, 0.0) if kind == "window" else None, head)
 
 
 class _Meshes:
@@ -336,13 +323,10 @@ class _Meshes:
                 f"the shape of {element.is_a()} '{str(element.Name or '')[:50]}' has more than {limit} entities "
                 "(max_entities) with those of its mapped items, or contains itself; simplify it"
             )
-        outlines = ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS
+        outlines = {"DIMENSIONALITY": ifcopenshell.ifcopenshell_wrapper.CURVES_SURFACES_AND_SOLIDS}
         # Some programs write the outline of a space alone.
-        for dimensionality in (None, outlines) if element.is_a("IfcSpace") else (None,):
-            settings = ifcopenshell.geom.settings()
-            settings.set("use-world-coords", True)
-            if dimensionality is not None:
-                settings.set("dimensionality", dimensionality)
+        for more in ({}, outlines) if element.is_a("IfcSpace") else ({},):
+            settings = ifcopenshell.geom.settings(USE_WORLD_COORDS=True, **more)
             try:
                 geometry: Any = ifcopenshell.geom.create_shape(settings, element).geometry  # type: ignore[union-attr]
             except RuntimeError:
@@ -373,17 +357,13 @@ class _Meshes:
 def _inside(vertices: Float[np.ndarray, "n 3"], edges: Any) -> _Mesh | None:
     """Return a flat mesh of the area that edges enclose, None without one."""
     area = shapely.build_area(shapely.multilinestrings(vertices[edges][:, :, :2]))
-    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
-    if not len(triangles):
-        return None
-    corners = np.concatenate([np.asarray(triangle.exterior.coords)[:3] for triangle in triangles])
-    flat = np.column_stack([corners, np.full(len(corners), vertices[:, 2].min())])
-    return flat, np.arange(len(corners)).reshape(-1, 3)
+    rings = shapely.get_coordinates(shapely.constrained_delaunay_triangles(area)).reshape(-1, 4, 2)
+    corners = rings[:, :3].reshape(-1, 2)
+    flat = np.insert(corners, 2, vertices[:, 2].min(), axis=1)
+    return (flat, np.arange(len(flat)).reshape(-1, 3)) if len(flat) else None
 
 
 def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shapely.Polygon]:
     """Return the area that triangles cover, seen from above."""
-    corners = vertices[triangles][:, :, :2]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-9
-    return join_faces([shapely.Polygon(triangle) for triangle in corners[flat]]) if flat.any() else []
+    shapes = np.asarray(shapely.polygons(vertices[triangles][:, :, :2]))
+    return join_faces(shapes[shapely.area(shapes) > _NO_AREA_M2].tolist())

@@ -20,19 +20,17 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import clean_name
-from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.drawing.vector_drawing import (
     CURVE_STEPS,
     Area,
     Drawing,
     Lettering,
-    Patch,
+    Paint,
     Stroke,
-    fit_swing,
-    is_bluish,
-    is_dark,
-    is_white_pen,
+    Subpath,
+    leaves_of,
 )
 
 # Functions that count and return the objects of a page, and those of a form in it.
@@ -41,8 +39,6 @@ _OF_FORM: Any = pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject
 _MAX_FORM_DEPTH = 8
 # Pages' worth of areas that are painted; each takes some milliseconds.
 _MAX_PAINTED = 1000
-# Opacity (of 255) of what can be walls, and of fills that hide what is below them.
-_OPAQUE, _HIDING = 60, 230
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
 # Smallest packed size of a line or area.
 _BYTES_PER_SHAPE = 4
@@ -74,14 +70,6 @@ class PageContent:
     painted: float = 0.0
     unit_m: float = _METRES_PER_POINT
     hidden: Counter[str] = field(default_factory=Counter)
-
-
-@dataclass
-class _Subpath:
-    points: list[tuple[float, float]] = field(default_factory=list)
-    curves: list[list[tuple[float, float]]] = field(default_factory=list)
-    was_curved: bool = False
-    is_closed: bool = False
 
 
 def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdfium2.PdfPage]:
@@ -248,18 +236,16 @@ def _layers_of(item: Any) -> Iterator[str]:
 
 def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> int:
     """Add the outlines and lines of a path; return the number of those out of range, which are left out."""
-    drawing, (page_width, page_height) = found.drawing, found.size_pt
+    drawing = found.drawing
     fill, stroke = ctypes.c_int(), ctypes.c_int()
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return 0
     is_filled = fill.value != pdfium.FPDF_FILLMODE_NONE
-    fill_colour = _colour(item, pdfium.FPDFPageObj_GetFillColor) if is_filled else None
-    pen_colour = _colour(item, pdfium.FPDFPageObj_GetStrokeColor) if stroke.value else None
-    is_stroked, is_white = pen_colour is not None, pen_colour is not None and is_white_pen(*pen_colour[:3])
-    is_wall = fill_colour is not None and is_dark(*fill_colour[:3])
+    paint = _paint(item, pdfium.FPDFPageObj_GetFillColor) if is_filled else None
+    pen = _paint(item, pdfium.FPDFPageObj_GetStrokeColor) if stroke.value else None
     width = ctypes.c_float()
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
-    pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
+    width_pt = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if pen is not None else 0.0
     shells: list[shapely.Polygon] = []
     out_of_range = 0
     for subpath in _subpaths(item, budget):
@@ -268,33 +254,25 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
             out_of_range += 1
             continue
         if is_filled:
-            width_pt, height_pt = np.ptp(points, axis=0)
-            share = min(width_pt / max(page_width, 1.0), 1.0) * min(height_pt / max(page_height, 1.0), 1.0)
-            found.painted += float(share)
-        swings = [fit_swing(_apply(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
-        leaves = [swing for swing in swings if swing is not None]
-        if leaves and is_stroked and not is_filled:
+            found.painted += float(np.minimum(np.ptp(points, axis=0) / np.maximum(found.size_pt, 1.0), 1.0).prod())
+        leaves = [] if pen is None or is_filled else leaves_of([_apply(matrix, curve) for curve in subpath.curves])
+        if leaves:
             drawing.swings += leaves
-        elif len(points) >= 3 and (subpath.is_closed or is_filled) and (is_stroked or is_filled):
+        elif len(points) >= 3 and (is_filled or (subpath.is_closed and pen is not None)):
             shells += polygons_from_geometry(shapely.Polygon(points))
-        elif len(points) >= 2 and is_stroked and (line := shapely.LineString(points)).length > 0.0:
-            drawing.strokes.append(Stroke(line, "", None, pen, drawing.next_order, is_white))
-    if not shells:
-        return out_of_range
-    is_nonzero = fill.value == pdfium.FPDF_FILLMODE_WINDING
-    parts, order = even_odd_polygons(shells, is_nonzero=is_nonzero), drawing.next_order
-    if fill_colour is not None and not is_wall and fill_colour[3] >= _HIDING:
-        drawing.patches += [Patch(part, order, is_bluish(*fill_colour[:3])) for part in parts]
-    # A coloured floor or a white background has no drawn outline.
-    if is_wall or is_stroked:
-        drawing.areas += [Area(part, "", None, is_dark=is_wall, width=pen, order=order) for part in parts]
+        elif len(points) >= 2 and pen is not None and (line := shapely.LineString(points)).length > 0.0:
+            drawing.strokes.append(Stroke(line, "", None, width_pt, drawing.next_order, pen.is_white))
+    if shells:
+        like = Area(shells[0], "", is_dark=paint is not None and paint.is_dark, width=width_pt)
+        is_nonzero = fill.value == pdfium.FPDF_FILLMODE_WINDING
+        drawing.add_areas(shells, like, paint, is_nonzero=is_nonzero, has_line=pen is not None)
     return out_of_range
 
 
-def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
+def _subpaths(item: Any, budget: Budget) -> list[Subpath]:
     count = pdfium.FPDFPath_CountSegments(item)
     budget.spend(max(count, 0))
-    paths: list[_Subpath] = []
+    paths: list[Subpath] = []
     bezier: list[tuple[float, float]] = []
     x, y = ctypes.c_float(), ctypes.c_float()
     for index in range(count):
@@ -304,31 +282,24 @@ def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
         point = (float(x.value), float(y.value))
         kind = pdfium.FPDFPathSegment_GetType(segment)
         if kind == pdfium.FPDF_SEGMENT_MOVETO or not paths:
-            paths.append(_Subpath([point]))
+            paths.append(Subpath([point]))
             bezier = []
         elif kind == pdfium.FPDF_SEGMENT_BEZIERTO:
             bezier.append(point)
             if len(bezier) == 3:
-                _add_curve(paths[-1], bezier)
+                paths[-1].add(_curve(paths[-1].points[-1], *bezier), is_curved=True)
                 bezier = []
         else:
-            paths[-1].points.append(point)
-            paths[-1].was_curved = False
+            paths[-1].add([paths[-1].points[-1], point], is_curved=False)
         paths[-1].is_closed |= bool(pdfium.FPDFPathSegment_GetClose(segment))
     return [path for path in paths if len(path.points) > 1]
 
 
-def _add_curve(path: _Subpath, control: list[tuple[float, float]]) -> None:
-    start, (a, b, end) = np.array(path.points[-1]), (np.array(point) for point in control)
-    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[1:, None]
-    points = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end
-    piece = [(float(px), float(py)) for px, py in points]
-    if path.was_curved:
-        path.curves[-1] += piece
-    else:
-        path.curves.append([path.points[-1], *piece])
-    path.points += piece
-    path.was_curved = True
+def _curve(*control: tuple[float, float]) -> list[tuple[float, float]]:
+    """Return the points of a Bézier curve."""
+    start, a, b, end = map(np.array, control)
+    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[:, None]
+    return list(map(point_xy, (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end))
 
 
 def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarray, "n 2"]:
@@ -336,9 +307,7 @@ def _apply(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarra
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _colour(item: Any, get: Any) -> tuple[float, float, float, float] | None:
-    """Return the channels and the opacity of a colour, 0 to 255; None for one that shows most of what is below it."""
-    red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
-    if not get(item, red, green, blue, alpha) or alpha.value < _OPAQUE:
-        return None
-    return float(red.value), float(green.value), float(blue.value), float(alpha.value)
+def _paint(item: Any, get: Any) -> Paint | None:
+    channels = [ctypes.c_uint() for _ in range(4)]
+    paint = Paint(*(float(channel.value) for channel in channels)) if get(item, *channels) else None
+    return paint if paint is not None and paint.is_visible else None

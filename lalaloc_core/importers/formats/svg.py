@@ -23,7 +23,7 @@ from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
-from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
@@ -35,12 +35,10 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     Area,
     Drawing,
     Lettering,
-    Patch,
+    Paint,
     Stroke,
-    fit_swing,
-    is_bluish,
-    is_dark,
-    is_white_pen,
+    Subpath,
+    leaves_of,
 )
 from lalaloc_core.importers.formats.svg_limits import HREF, check_work
 
@@ -57,15 +55,13 @@ _AUTOMATIC = re.compile(
 )
 # A character in an id of Illustrator.
 _ESCAPED = re.compile(r"_x([0-9A-F]{2,4})_")
-_METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
+_NONZERO = (None, "nonzero")
+_METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0}
+# Pixels per inch, and usual height of letters.
+_PPI, _LETTER_PX = 96.0, 16.0
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_ANY_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc|px|%|)")
-# Attributes of the view of a drawing or symbol, and shares of the free space before it.
+# Attributes of the view of a drawing or symbol.
 _OF_VIEW = ("x", "y", "width", "height", "viewBox", "preserveAspectRatio", "transform")
-_ALIGNED = {"Min": 0.0, "Mid": 0.5, "Max": 1.0}
-_LENGTH = re.compile(rf"\s*({_NUMBER.pattern})\s*(mm|cm|in|pt|pc)\s*")
-# Fills that are less opaque do not hide what is below them, and lines are invisible.
-_OPAQUE, _INVISIBLE = 0.9, 0.2
 # Elements without a shape, and elements that are drawn only where they are used.
 _IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker", "mask", "clipPath")
 # Export at 1:100: user units per metre, millimetres on paper per metre, and margin.
@@ -168,25 +164,22 @@ def _place_views(parent: Element, views: Mapping[str | None, Mapping[str, str]],
 
 def _view(attributes: Mapping[str, str], around: tuple[float, float]) -> tuple[tuple[float, float], str]:
     """Return the size of the view of a drawing or symbol in its own units, and the transform that places it."""
+    box = [0.0, 0.0, *around]
+    for place, (key, whole) in enumerate(zip(_OF_VIEW, (*around, *around), strict=False)):
+        # Words such as "auto" are no length.
+        if _NUMBER.match(text := attributes.get(key, "").strip()):
+            length: Any = svgelements.Length(text)
+            box[place] = float(length.value(_PPI, whole, _LETTER_PX, 0.5 * _LETTER_PX, f"0 0 {around[0]} {around[1]}"))
+    view = _box(attributes) or [0.0, 0.0, *(side or 1.0 for side in box[2:])]
+    numbers: list[Any] = [*box, *view, attributes.get("preserveAspectRatio", "xMidYMid")]
+    transform = svgelements.Viewbox.viewbox_transform(*numbers)
+    return (view[2], view[3]), f"{attributes.get('transform', '')} {transform}"
 
-    def length(key: str, usual: str, whole: float) -> float:
-        found = _ANY_LENGTH.match(attributes.get(key, usual)) or _ANY_LENGTH.match(usual)
-        number, unit = (float(found[1]), found[2]) if found is not None else (0.0, "")
-        return number * (0.01 * whole if unit == "%" else _METRES.get(unit, _METRES["px"]) / _METRES["px"])
 
-    x, y = length("x", "0", around[0]), length("y", "0", around[1])
-    width, height = length("width", "100%", around[0]), length("height", "100%", around[1])
+def _box(attributes: Mapping[str, str]) -> list[float] | None:
+    """Return the `viewBox`, None without a usable one."""
     box = [float(number) for number in _NUMBER.findall(attributes.get("viewBox", ""))]
-    left, top, wide, high = box if len(box) == 4 and min(box[2:]) > 0.0 else (0.0, 0.0, width, height)
-    scales = width / (wide or 1.0), height / (high or 1.0)
-    fit = attributes.get("preserveAspectRatio", "xMidYMid")
-    if "none" not in fit:
-        scales = (max(scales) if "slice" in fit else min(scales),) * 2
-    free = (width - scales[0] * wide, height - scales[1] * high)
-    shares = (next((share for word, share in _ALIGNED.items() if axis + word in fit), 0.5) for axis in "xY")
-    across, down = (rest * share for rest, share in zip(free, shares, strict=True))
-    place = f"translate({x + across - scales[0] * left!r} {y + down - scales[1] * top!r})"
-    return (wide, high), f"{attributes.get('transform', '')} {place} scale({scales[0]!r} {scales[1]!r})"
+    return box if len(box) == 4 and min(box[2:]) > 0.0 else None
 
 
 def _join_parts(text: Element) -> None:
@@ -272,13 +265,12 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
 
 def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
     """Return the lengths (m) on paper of a user unit and the longer side, None if the width has no unit or pixels."""
-    sides = [_LENGTH.fullmatch(root.get(key, "")) for key in ("width", "height")]
-    width_m, height_m = (0.0 if side is None else float(side[1]) * _METRES[side[2]] for side in sides)
-    numbers = [float(number) for number in _NUMBER.findall(root.get("viewBox", ""))]
-    units = numbers[2:] if len(numbers) == 4 else [width_m / _METRES["px"], height_m / _METRES["px"]]
-    scales = [size / unit for size, unit in zip((width_m, height_m), units, strict=True) if min(size, unit) > 0.0]
+    sides: list[Any] = [svgelements.Length(root.get(key, "")) for key in ("width", "height")]
+    sizes_m = [float(side.amount) * _METRES.get(side.units, 0.0) for side in sides]
+    units = (_box(root.attrib) or [size * _PPI / _METRES["in"] for size in (0.0, 0.0, *sizes_m)])[2:]
+    scales = [size / unit for size, unit in zip(sizes_m, units, strict=True) if size > 0.0]
     # A drawing is not stretched by default, and leaves a margin on a sheet of other proportions.
-    return (min(scales), max(width_m, height_m)) if scales else (None, None)
+    return (min(scales), max(sizes_m)) if scales else (None, None)
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
@@ -294,7 +286,7 @@ def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder,
     for key in ("width", "height", "viewBox", "preserveAspectRatio", "transform"):
         root.attrib.pop(key, None)
     try:
-        tree = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=96.0)
+        tree = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=_PPI)
     except (ValueError, TypeError, AttributeError, IndexError, KeyError, ZeroDivisionError, OverflowError) as error:
         raise InvalidFloorPlanError("the SVG has values that cannot be read; save it as plain SVG") from error
     drawing = Drawing()
@@ -358,39 +350,37 @@ def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
 
 
 def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
-    name = _name_of(element, context)
-    fill: Any = element.fill
-    is_filled = fill is not None and fill.value is not None and fill.opacity > _INVISIBLE
-    is_wall = fill is not None and is_filled and is_dark(float(fill.red), float(fill.green), float(fill.blue))
-    pen: Any = element.stroke if element.stroke is not None else svgelements.Color(None)
-    is_stroked = pen.value is not None
-    is_white = is_stroked and is_white_pen(float(pen.red), float(pen.green), float(pen.blue))
-    width = element.stroke_width if is_stroked else 0.0
+    role, layer, fill, pen = context.role, context.layer, _paint(element.fill), _paint(element.stroke)
+    is_filled, width = fill is not None and fill.is_visible, float((pen and element.stroke_width) or 0.0)
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(element, budget):
-        swings = [fit_swing(curve, context.layer) for curve in curves] if context.role in (None, "door") else []
-        leaves = [swing for swing in swings if swing is not None] if len(swings) <= 2 else []
-        if leaves:
+        if leaves := leaves_of(curves, layer) if role in (None, "door") else []:
             drawing.swings += leaves
-            builder.use(context.layer, "door swings", len(leaves))
-        elif is_stroked and pen.opacity <= _INVISIBLE and not closed and context.role is None:
-            builder.use(context.layer, "ignored (invisible)")
-        elif len(points) >= 4 and (closed or (context.role in ("room", "wall", "obstacle") and is_filled)):
+            builder.use(layer, "door swings", len(leaves))
+        elif pen is not None and not pen.is_visible and not closed and role is None:
+            builder.use(layer, "ignored (invisible)")
+        elif len(points) >= 4 and (closed or (role in ("room", "wall", "obstacle") and is_filled)):
             shells += polygons_from_geometry(shapely.Polygon(points))
-        elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
-            line, order = shapely.LineString(points), drawing.next_order
-            drawing.strokes.append(Stroke(line, context.layer, context.role, float(width or 0.0), order, is_white))
-            builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
+        elif len(points) >= 2 and (line := shapely.LineString(points)).length > 0.0:
+            is_white = pen is not None and pen.is_white
+            drawing.strokes.append(Stroke(line, layer, role, width, drawing.next_order, is_white))
+            builder.use(layer, f"lines: {role or 'possible walls'}")
         elif not len(points):
-            builder.use(context.layer, "ignored (coordinates out of range)")
-    order = drawing.next_order
-    is_nonzero = is_filled and str(element.values.get("fill-rule", "nonzero")) == "nonzero"
-    for shape in even_odd_polygons(shells, is_nonzero=is_nonzero) if len(shells) > 1 else shells:
-        if fill is not None and is_filled and not is_wall and context.role is None and fill.opacity > _OPAQUE:
-            drawing.patches.append(Patch(shape, order, is_bluish(float(fill.red), float(fill.green), float(fill.blue))))
-        width = float(width or 0.0)
-        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_wall, width, order))
-        builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
+            builder.use(layer, "ignored (coordinates out of range)")
+    if shells:
+        is_wall, is_nonzero = (
+            fill is not None and is_filled and fill.is_dark,
+            element.values.get("fill-rule") in _NONZERO,
+        )
+        like = Area(shells[0], layer, role, _name_of(element, context), context.kind, is_wall, width)
+        count = drawing.add_areas(shells, like, fill, is_nonzero=is_filled and is_nonzero, has_line=True)
+        builder.use(layer, f"areas: {role or 'possible rooms'}", count)
+
+
+def _paint(colour: Any) -> Paint | None:
+    if colour is None or colour.value is None:
+        return None
+    return Paint(float(colour.red), float(colour.green), float(colour.blue), float(colour.alpha))
 
 
 def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
@@ -399,36 +389,23 @@ def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.nda
     A subpath whose coordinates are out of range has no points.
     """
     # Rectangles and ellipses still have the transform that turns them.
-    for subpath in abs(svgelements.Path(shape)).as_subpaths():
-        segments = [s for s in svgelements.Path(subpath) if not isinstance(s, svgelements.Move)]
-        closed = any(isinstance(segment, svgelements.Close) for segment in segments)
-        points: list[complex] = []
-        curves: list[list[complex]] = []
-        was_curved = False
-        for segment in segments:
-            if segment.start is None or segment.end is None:
+    for segments in abs(svgelements.Path(shape)).as_subpaths():
+        path = Subpath()
+        for segment in svgelements.Path(segments):
+            path.is_closed |= isinstance(segment, svgelements.Close)
+            if isinstance(segment, svgelements.Move) or segment.start is None or segment.end is None:
                 continue
             is_curved = not isinstance(segment, svgelements.Line | svgelements.Close)
             steps = CURVE_STEPS if is_curved else 1
             budget.spend(steps)
-            piece = [complex(*segment.point(k / steps)) for k in range(steps + 1)]
-            points += piece if not points else piece[1:]
-            if is_curved and was_curved:
-                curves[-1] += piece[1:]
-            elif is_curved:
-                curves.append(piece)
-            was_curved = is_curved
-        array = _array(points)
-        if not in_range(array):
+            path.add([(*segment.point(k / steps),) for k in range(steps + 1)], is_curved=is_curved)
+        points = np.array(path.points, dtype=float).reshape(-1, 2)
+        if not in_range(points):
             yield np.empty((0, 2)), False, []
-        elif len(array):
-            distinct = array[np.concatenate([[True], np.any(np.diff(array, axis=0) != 0.0, axis=1)])]
-            returns = len(distinct) > 3 and bool(np.all(distinct[0] == distinct[-1]))
-            yield distinct, closed or returns, [_array(curve) for curve in curves]
-
-
-def _array(points: list[complex]) -> np.ndarray:
-    return np.array([[point.real, point.imag] for point in points]).reshape(-1, 2)
+        elif len(points):
+            points = points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
+            returns = len(points) > 3 and bool(np.all(points[0] == points[-1]))
+            yield points, path.is_closed or returns, [np.array(curve) for curve in path.curves]
 
 
 def _name_of(element: Any, context: _Context) -> str | None:
