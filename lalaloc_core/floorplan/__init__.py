@@ -1,9 +1,9 @@
 """Floor plans: validated, immutable rooms as closed polygons, with the openings in their walls.
 
 Begin with `plan.py`. `plan_document.py` reads rooms and openings from a document, `room_types.py` knows the names of
-rooms, `openings.py` places openings on walls, `opening_trust.py` tells how many are missing, `rooms.py` checks all
-rooms together, `geometry.py` builds the arrays for the layout renderer, and `earth.py` relates a plan to latitude and
-longitude.
+rooms, `plan_words.py` the other words of plans, `openings.py` places openings on walls, `opening_trust.py` tells how
+many are missing, `rooms.py` checks all rooms together, `geometry.py` builds the arrays for the layout renderer, and
+`earth.py` relates a plan to latitude and longitude.
 """
 
 from lalaloc_core.floorplan.json_values import DEFAULT_LIMITS, PlanLimits

@@ -11,10 +11,10 @@ import pytest
 from ezdxf.filemanagement import new as new_dxf
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.plan_words import role_from_name, room_types_from_reading
 from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
-from lalaloc_core.importers.common.vocabulary import role_from_name, room_types_from_reading
 from lalaloc_core.importers.drawing.drawing_scale import scale_by_dimensions
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import dxf_file, lines, names_and_types, shapes

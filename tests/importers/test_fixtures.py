@@ -12,8 +12,8 @@ from ezdxf.filemanagement import new as new_dxf
 from lalaloc_core.conventions import FIXTURE_KINDS
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.plan_words import fixture_from_name
 from lalaloc_core.importers import ImportOptions, import_plan
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from tests.importers.conftest import dxf_file
 from tests.importers.test_roomplan import _scan, _surface
 

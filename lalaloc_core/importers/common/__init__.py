@@ -1,8 +1,7 @@
 """Code that all importers share, from options to the finished plan.
 
 Begin with `sketch.py`, which every importer fills in, then `assemble.py`, which turns a sketch into a plan.
-`opening_placement.py` moves openings onto walls, `plausibility.py` finds likely mistakes, and `vocabulary.py` maps the
-names of layers and rooms to roles and types.
+`opening_placement.py` moves openings onto walls, and `plausibility.py` finds likely mistakes.
 """
 
 from lalaloc_core.importers.common.assemble import ImportedPlan

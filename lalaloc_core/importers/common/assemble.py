@@ -18,8 +18,9 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits
 from lalaloc_core.floorplan.earth import Anchor, anchor_document
 from lalaloc_core.floorplan.opening_trust import estimate_trust
 from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_CEILING_HEIGHT_M
+from lalaloc_core.floorplan.plan_words import is_roof
 from lalaloc_core.floorplan.room_types import room_types_from_name, type_fields
-from lalaloc_core.importers.common.fixtures_by_name import place_fixtures, type_rooms
+from lalaloc_core.importers.common.fixtures_in_rooms import place_fixtures, type_rooms
 from lalaloc_core.importers.common.geometry import check_network, check_overlaps, distinct, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
@@ -27,7 +28,6 @@ from lalaloc_core.importers.common.import_report import ImportReport, ReportBuil
 from lalaloc_core.importers.common.opening_placement import place_openings
 from lalaloc_core.importers.common.plausibility import check_document
 from lalaloc_core.importers.common.sketch import Level, Point, Sketch, SketchedOpening, SketchedRoom, T, choose_levels
-from lalaloc_core.importers.common.vocabulary import is_roof
 
 # Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01

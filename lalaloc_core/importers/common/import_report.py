@@ -11,7 +11,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan.opening_trust import OpeningTrust
-from lalaloc_core.importers.common.vocabulary import Role
+from lalaloc_core.floorplan.plan_words import Role
 
 TracePart = Literal["line", "wall line", "door", "window", "passage", "other", "wall", "gap", "room", "no room"]
 # Corners of an area in metres.

@@ -12,8 +12,8 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.plan_words import mentions_roof
 from lalaloc_core.importers.common.import_options import ImportOptions
-from lalaloc_core.importers.common.vocabulary import mentions_roof
 
 OpeningKind = Literal["door", "window", "passage"]
 Point = tuple[float, float]
@@ -32,7 +32,6 @@ class SketchedRoom:
     name: str | None = None
     types: tuple[str, ...] = ()
     ceiling_height_m: float | None = None
-    id: str | None = None
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from_name
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
@@ -35,7 +35,6 @@ from lalaloc_core.importers.common.sketch import (
     SketchedOpening,
     SketchedRoom,
 )
-from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 
 # Roles by the feature types of IMDF, and by `indoor` in Simple Indoor Tagging.
 _FEATURE_TYPES, _INDOOR = (cast("dict[str, Role]", keys_by_word(table)) for table in ("feature_types", "indoor"))
@@ -271,8 +270,7 @@ class _Drawer:
                 f"{highest_m:g} m"
             )
             ceiling_m = None
-        room_id = feature.id if len(parts) == 1 else None
-        self._sketch.rooms += [SketchedRoom(part, name, types, ceiling_m, room_id) for part in parts]
+        self._sketch.rooms += [SketchedRoom(part, name, types, ceiling_m) for part in parts]
 
     def _add_opening(self, feature: Feature, kind: OpeningKind, shape: BaseGeometry, layer: str) -> None:
         properties, name = feature.properties, _name(feature.properties)

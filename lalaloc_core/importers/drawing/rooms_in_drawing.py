@@ -15,11 +15,11 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import check_overlaps, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
-from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.drawn_openings import cut_painted, drawn_panes
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose, explained_size
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, clusters, split_lines

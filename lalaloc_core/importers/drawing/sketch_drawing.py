@@ -15,6 +15,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget
@@ -22,7 +23,6 @@ from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, Tr
 from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.common.vocabulary import Role
 from lalaloc_core.importers.drawing.door_leaves import (
     LEAF_M,
     drawn_leaves,

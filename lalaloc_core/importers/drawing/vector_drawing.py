@@ -16,6 +16,7 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.plan_words import Role, room_types_from_reading
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, room_types_from_name, split_words
 from lalaloc_core.importers.common.geometry import (
     check_network,
@@ -28,7 +29,6 @@ from lalaloc_core.importers.common.geometry import (
     side_lengths,
 )
 from lalaloc_core.importers.common.sketch import SketchedFixture
-from lalaloc_core.importers.common.vocabulary import Role, room_types_from_reading
 
 # Of 255: fills of lower luminance can be walls, channels of white are not lower, and glass is bluer than red by this.
 _DARK, _WHITE, _BLUER = 110.0, 250.0, 20.0

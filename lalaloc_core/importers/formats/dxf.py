@@ -41,11 +41,10 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import SketchedFixture
-from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.storeys import by_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, leaves_of
 from lalaloc_core.importers.formats.dxf_unit import find_unit

@@ -16,11 +16,11 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.plan_words import role_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, NoRoomError, assemble, assemble_levels, without_areas
 from lalaloc_core.importers.common.geometry import check_coordinates, find_floor, join_faces, opening_line, report_floor
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, SketchedFixture, SketchedOpening
-from lalaloc_core.importers.common.vocabulary import role_from_name
 from lalaloc_core.importers.formats.ifc_file import FURNISHINGS, find_anchor, fixture_kind, open_model
 
 # Vertices (m, model frame) and triangles.

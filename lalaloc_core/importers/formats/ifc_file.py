@@ -13,7 +13,7 @@ from pyproj.exceptions import ProjError
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
+from lalaloc_core.floorplan.plan_words import fixture_from_name
 
 # End of a complete file; some tools append white space or comments.
 _END, _TAIL_BYTES = b"END-ISO-10303-21", 4096

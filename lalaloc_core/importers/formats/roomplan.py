@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number
+from lalaloc_core.floorplan.plan_words import fixture_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates, point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose

@@ -19,13 +19,12 @@ import svgelements
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import SketchedFixture
-from lalaloc_core.importers.common.vocabulary import Role, role_from_name
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing

@@ -18,13 +18,12 @@ from jaxtyping import Float
 from shapely import affinity
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.plan_words import fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.fixtures_by_name import fixture_from_name
 from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, SketchedFixture, SketchedOpening
-from lalaloc_core.importers.common.vocabulary import role_from_name
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, enclose
 
 _MEMBER = "Home.xml"

@@ -1,4 +1,4 @@
-"""Roles of layers, blocks and classes of drawings by their names, and room types by misread ones."""
+"""Words of plans (`plan_words.toml`): roles of layers, blocks and classes, roofs, fixtures, misread names of rooms."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import unicodedata
 from difflib import get_close_matches
 from functools import lru_cache
+from itertools import pairwise
 from typing import Literal, cast
 
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, ROOM_WORDS, keys_by_word, room_types_from_name, split_words
@@ -23,6 +24,9 @@ _OTHER_SCRIPTS = cast("dict[str, Role]", keys_by_word("roles_in_other_scripts"))
 _DEMOLISHED = re.compile(r"[A-Z]{1,2}-[A-Z]{4}(?:-[A-Z]{4})*-D", re.IGNORECASE)
 # Words for roofs, and those that stand beside them in names of levels.
 _ROOFS, _OF_LEVELS = (frozenset(PLAN_WORDS["levels"][key].split()) for key in ("roof", "beside"))
+_KIND_OF, _IN_JAPANESE = keys_by_word("fixtures"), keys_by_word("fixtures_in_japanese")
+# Order in which kinds are looked for: a "kitchen sink with stove" is a stove.
+_KINDS = list(PLAN_WORDS["fixtures"])
 
 
 def is_roof(level: str) -> bool:
@@ -62,3 +66,17 @@ def _role_of_word(word: str) -> Role | None:
     if word in _ROLE_OF:
         return _ROLE_OF[word]
     return next((role for ending, role in _ENDINGS.items() if word.endswith(ending) and len(word) > len(ending)), None)
+
+
+def fixture_from_name(*names: str | None) -> str | None:
+    """Return the kind of a fixture from the names of its block, class or type; the first that gives one decides."""
+    for name in names:
+        words = split_words(name or "")
+        pairs = [first + second for first, second in pairwise(words)]
+        found = {_KIND_OF[word] for word in (*words, *pairs) if word in _KIND_OF}
+        if found:
+            return min(found, key=_KINDS.index)
+        text = unicodedata.normalize("NFKC", name or "")
+        if kinds := [kind for word, kind in _IN_JAPANESE.items() if word in text]:
+            return kinds[0]
+    return None

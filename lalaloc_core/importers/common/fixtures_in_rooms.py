@@ -1,22 +1,17 @@
-"""Fixtures in plan files: their kinds by names in many languages, their rooms, and the types that these get."""
+"""Fixtures in plan files: their rooms, and the types that these get."""
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import shapely
 
-from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words, types_by_fixtures
+from lalaloc_core.floorplan.room_types import types_by_fixtures
 from lalaloc_core.importers.common.geometry import side_lengths
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedFixture, SketchedRoom
 
-_KIND_OF, _JAPANESE = keys_by_word("fixtures"), keys_by_word("fixtures_in_japanese")
-# Order in which kinds are looked for: a "kitchen sink with stove" is a stove.
-_ORDER = list(PLAN_WORDS["fixtures"])
 # Longer side of a fixture (m); others are symbols of another kind, or whole rooms.
 _SIDES_M: Mapping[str, tuple[float, float]] = {
     "toilet": (0.3, 1.2), "shower": (0.5, 2.2), "bath": (0.8, 2.6), "basin": (0.2, 2.0), "stove": (0.3, 1.6),
@@ -24,20 +19,6 @@ _SIDES_M: Mapping[str, tuple[float, float]] = {
     "stairs": (0.6, 20.0),
 }  # fmt: skip
 _MAX_NAMED = 5
-
-
-def fixture_from_name(*names: str | None) -> str | None:
-    """Return the kind of a fixture from the names of its block, class or type; the first that gives one decides."""
-    for name in names:
-        words = split_words(name or "")
-        pairs = [first + second for first, second in pairwise(words)]
-        found = {_KIND_OF[word] for word in (*words, *pairs) if word in _KIND_OF}
-        if found:
-            return min(found, key=_ORDER.index)
-        text = unicodedata.normalize("NFKC", name or "")
-        if kinds := [kind for word, kind in _JAPANESE.items() if word in text]:
-            return kinds[0]
-    return None
 
 
 def place_fixtures(
