@@ -18,17 +18,7 @@ from service.http.http_protocol import MAX_HEAD_BYTES
 from service.openapi import openapi_text
 from service.runtime import Runtime, get_runtime
 from service.settings import Settings
-from tests.service.conftest import (
-    FLAT,
-    HALL,
-    StartApp,
-    assert_problem,
-    connection_to,
-    localise,
-    serve,
-    upload,
-    wait_for,
-)
+from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, localise, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 ROOT = Path(__file__).parents[2]
@@ -99,7 +89,8 @@ def test_every_get_answers_head(client: httpx.Client) -> None:
 
 
 def test_head_of_events_holds_no_stream(client: httpx.Client) -> None:
-    plan_id = upload(client, HALL, wait=False)
+    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [60, 0], [60, 60], [0, 60]]}]}
+    plan_id = upload(client, hall, wait=False)
     head = client.head(f"/floorplans/{plan_id}/events")
     assert head.headers["content-type"].startswith("text/event-stream")
     wait_for(lambda: "lalaloc_streams 0.0" in client.get("/metrics").text, 5.0)
