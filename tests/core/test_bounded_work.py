@@ -125,10 +125,8 @@ def test_crossing_combs_stay_within_the_work_limit(monkeypatch: pytest.MonkeyPat
 
 def test_simple_rooms_are_checked_beside_combs(monkeypatch: pytest.MonkeyPatch) -> None:
     document = crossing_combs(12)
-    document["rooms"] += plan_document(
-        rectangle(2.0, 2.0, corner=(50.0, 0.0)), rectangle(2.0, 2.0, corner=(51.0, 0.0))
-    )["rooms"]
-    document["rooms"][-2]["name"], document["rooms"][-1]["name"] = "left", "right"
+    for name, x_m in (("left", 50.0), ("right", 51.0)):
+        document["rooms"].append({"name": name, "polygon": rectangle(2.0, 2.0, corner=(x_m, 0.0))})
     monkeypatch.setattr(room_checks, "_MAX_WORK", 1000)
     assert "rooms 'left' and 'right' overlap by 2.00 m²" in FloorPlan.from_dict(document).warnings
 

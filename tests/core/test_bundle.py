@@ -59,6 +59,13 @@ def exported_bundle(folder: Path, config: TrainConfig) -> Bundle:
     )
 
 
+def assert_layouts_agree(encoders: PhotographEncoder, optimiser: PoseRefiner, count: int, columns: int) -> None:
+    """Check that both layout encoders give random profiles the same latents."""
+    layouts = (torch.empty(count, columns).uniform_(0.3, 8.0), torch.full((count,), 1.4), torch.full((count,), 2.6))
+    latents = encoders.layouts.latents(*(values.numpy() for values in layouts))
+    np.testing.assert_allclose(latents, optimiser.encoder(*layouts).numpy(), atol=1e-4)
+
+
 @pytest.fixture
 def bundle_copy(tiny_bundle: Path, tmp_path: Path) -> Path:
     """Copy of the tiny bundle that a test may damage."""
@@ -87,11 +94,7 @@ class TestExport:
         assert profile_m.shape == (300, opened_bundle.manifest.profile_columns)
         assert latents.shape == (300, opened_bundle.manifest.latent_size)
         np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1.0, atol=1e-5)
-        profile = torch.empty(300, 32).uniform_(0.3, 8.0)
-        heights = (torch.full((300,), 1.4), torch.full((300,), 2.6))
-        expected = optimiser.encoder(profile, *heights).numpy()
-        actual = encoders.layouts.latents(profile.numpy(), *(height.numpy() for height in heights))
-        np.testing.assert_allclose(actual, expected, atol=1e-4)
+        assert_layouts_agree(encoders, optimiser, 300, 32)
 
     def test_empty_batch_gives_no_latents(self, encoders: PhotographEncoder) -> None:
         assert encoders.layouts.latents(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
@@ -164,10 +167,7 @@ class TestExport:
         eighth = int(np.abs(unknown.roll - np.pi / 4).argmin())
         np.testing.assert_allclose(unknown.latents[eighth], known.latents[0], atol=1e-5)
         scene = scene_of(crooked_flat(), 2, 0)
-        profile = torch.empty(2, 64).uniform_(0.5, 5.0)
-        heights = (torch.full((2,), 1.5), torch.full((2,), 2.5))
-        latents = encoders.layouts.latents(profile.numpy(), *(h.numpy() for h in heights))
-        np.testing.assert_allclose(latents, optimiser.encoder(profile, *heights).numpy(), atol=1e-4)
+        assert_layouts_agree(encoders, optimiser, 2, 64)
         assert encoders.layouts.poses(scene.plan, scene.poses, scene.heading, 1.5)[0].shape == (2, 128)
 
 

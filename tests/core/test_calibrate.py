@@ -88,8 +88,8 @@ def both(known: list[Prediction], searched: list[Prediction]) -> ConfidenceModel
     return fit_confidence(Answers(own=known), Answers(own=searched))
 
 
-def fitted(predictions: list[Prediction]) -> LogisticModel:
-    return both(predictions, []).known_heading["lpo"]
+def fitted(own: list[Prediction], **others: list[Prediction]) -> LogisticModel:
+    return fit_confidence(Answers(own=own, **others), Answers(own=[])).known_heading["lpo"]
 
 
 def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> Prediction:
@@ -112,10 +112,7 @@ class TestConfidence:
         odds = rng.uniform(0.0, 5.0, 400)
         own = [result(0.2 if rng.random() < 1.0 / (1.0 + math.exp(-each)) else 3.0, each) for each in odds]
         mismatched = [result(0.2, rng.uniform(0.0, 5.0), cost=0.6) for _ in range(100)]
-        plain, fitted_model = (
-            fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
-            for others in ([], mismatched)
-        )
+        plain, fitted_model = fitted(own), fitted(own, mismatched=mismatched)
         assert np.mean([confidence(plain, prediction) for prediction in mismatched]) > 0.5
         assert np.mean([confidence(fitted_model, prediction) for prediction in mismatched]) < 0.1
         # Confidence in the home itself stays calibrated.
@@ -126,7 +123,7 @@ class TestConfidence:
         rng = np.random.default_rng(7)
         own = [result(0.2, 6.0, cost, answer_to_chance=rng.normal(-1.0, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
         others = [result(3.0, 6.0, cost, answer_to_chance=rng.normal(0.5, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
-        model = fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
+        model = fitted(own, mismatched=others)
         assert model.answer_to_chance < 0.0
         assert np.mean([confidence(model, prediction) for prediction in own]) > 0.95
         assert np.mean([confidence(model, prediction) for prediction in others]) < 0.1
@@ -137,10 +134,7 @@ class TestConfidence:
         disturbed = [result(0.2, 6.0, cost) for cost in rng.uniform(0.2, 0.55, 200)]
         others = [result(3.0, 6.0, cost) for cost in rng.uniform(0.6, 1.5, 200)]
         between = result(0.2, 6.0, 0.5)
-        plain, fitted_model = (
-            fit_confidence(Answers(own=own, disturbed=also, mismatched=others), Answers(own=own)).known_heading["lpo"]
-            for also in ([], disturbed)
-        )
+        plain, fitted_model = (fitted(own, disturbed=also, mismatched=others) for also in ([], disturbed))
         assert confidence(plain, between) < 0.6
         assert confidence(fitted_model, between) > 0.8
         assert np.mean([confidence(fitted_model, prediction) for prediction in others]) < 0.1
@@ -191,7 +185,7 @@ class TestConfidence:
         own = [result(0.2, rng.normal() + 5.0, cost=0.1) for _ in range(490)]
         own += [result(3.0, wrong_log_odds, cost=0.1) for _ in range(10) if wrong_log_odds is not None]
         mismatched = [result(0.2, rng.normal() + 3.0, cost=0.6) for _ in range(160)]
-        model = fit_confidence(Answers(own=own, mismatched=mismatched), Answers(own=own)).known_heading["lpo"]
+        model = fitted(own, mismatched=mismatched)
         assert np.mean([confidence(model, prediction) for prediction in own]) > 0.9
         assert np.mean([confidence(model, prediction) for prediction in mismatched]) < 0.1
 

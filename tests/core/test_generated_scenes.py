@@ -88,8 +88,7 @@ def test_camera_without_door_in_view_is_left_out() -> None:
 
 def test_cameras_show_the_next_home() -> None:
     mismatched, own = (
-        AlteredScenes(FURNISHED, "mismatched").load("validation-00001"),
-        FURNISHED.load("validation-00001"),
+        scenes.load("validation-00001") for scenes in (AlteredScenes(FURNISHED, "mismatched"), FURNISHED)
     )
     # The last home uses the first one beyond the split.
     following = FURNISHED.load("validation-00002")
@@ -112,10 +111,8 @@ def test_cameras_show_the_next_home() -> None:
 
 
 def test_even_homes_have_no_cropped_photograph() -> None:
-    shown = [
-        camera.photographs[LOOK] for camera in AlteredScenes(FURNISHED, "mismatched").load("validation-00000").cameras
-    ]
-    assert not any(isinstance(photograph, Cropped) for photograph in shown)
+    scene = AlteredScenes(FURNISHED, "mismatched").load("validation-00000")
+    assert not any(isinstance(camera.photographs[LOOK], Cropped) for camera in scene.cameras)
 
 
 def test_cropped_photograph_is_a_stretched_part() -> None:

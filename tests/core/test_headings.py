@@ -15,12 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.training.config import PRESETS
 from lalaloc_core.localise.belief import photograph_heading
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.query import CameraHeight
+from lalaloc_core.localise.query import CameraHeight, Query
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import localise
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
@@ -38,17 +37,25 @@ CAMERA_M = 1.5
 headings = st.floats(-math.pi, 2.0 * math.pi)
 
 
-def photograph_of(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
-    walls = plan.walls_m[pose.room_index]
+FLAT = crooked_flat()
+POSE = PoseSet(np.array([[1.37, 1.12]]), np.array([0]))
+
+
+def photograph_of(pose: PoseSet, heading: float) -> np.ndarray:
+    walls = FLAT.walls_m[pose.room_index]
     return paint(wall_profile(pose.position_m, np.array([heading]), walls, COLUMNS)[0])
 
 
-@pytest.fixture(scope="module")
-def flat() -> FloorPlan:
-    return crooked_flat()
-
-
-POSE = PoseSet(np.array([[1.37, 1.12]]), np.array([0]))
+def assert_found(
+    encoders: PhotographEncoder, optimiser: PoseRefiner, query: Query, pose: PoseSet, heading: float
+) -> None:
+    """Check that a search with a query finds a pose and the heading of the photograph."""
+    grid = build_grid(FLAT, encoders.layouts, step_m=0.25, camera_height_m=CAMERA_M)
+    best = localise(FLAT, grid, encoders.layouts, query, refiner=optimiser.refine).candidates[0]
+    assert best.room_index == pose.room_index[0]
+    assert np.hypot(*(best.position_m - pose.position_m[0])) < 0.02
+    assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)
+    assert -math.pi <= photograph_heading(query, best) <= math.pi
 
 
 class TestRolls:
@@ -111,15 +118,14 @@ class TestPerfectEncoder:
     @given(headings)
     @settings(max_examples=30)
     def test_nearest_hypothesis_has_the_latent_of_the_layout(
-        self, perfect: PhotographEncoder, flat: FloorPlan, known: bool, heading: float
+        self, perfect: PhotographEncoder, known: bool, heading: float
     ) -> None:
-        query = perfect.spheres.query(
-            photograph_of(flat, POSE, heading), heading if known else None, CameraHeight(CAMERA_M)
-        )
+        image = photograph_of(POSE, heading)
+        query = perfect.spheres.query(image, heading if known else None, CameraHeight(CAMERA_M))
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
-        layout, profile_m = perfect.layouts.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
+        layout, profile_m = perfect.layouts.poses(FLAT, POSE, rest[nearest : nearest + 1], CAMERA_M)
         np.testing.assert_allclose(query.latents[nearest], layout[0], atol=2e-3)
         np.testing.assert_allclose(np.exp(present(query.profile).log_m[nearest]), profile_m[0], atol=2e-4)
 
@@ -127,46 +133,23 @@ class TestPerfectEncoder:
     @given(heading=headings, share=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
     @settings(max_examples=30)
     def test_inexact_heading_is_searched_within_its_tolerance(
-        self,
-        perfect: PhotographEncoder,
-        optimiser: PoseRefiner,
-        flat: FloorPlan,
-        heading: float,
-        share: float,
-        tolerance: float,
+        self, perfect: PhotographEncoder, optimiser: PoseRefiner, heading: float, share: float, tolerance: float
     ) -> None:
-        image = photograph_of(flat, POSE, heading)
-        query = perfect.spheres.query(
-            image, heading + share * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance
-        )
+        image, stated = photograph_of(POSE, heading), heading + share * tolerance
+        query = perfect.spheres.query(image, stated, CameraHeight(CAMERA_M), heading_tolerance=tolerance)
         assert not query.heading_known
-        turned = wrap_angle(query.roll + query.frame_heading - (heading + share * tolerance))
+        turned = wrap_angle(query.roll + query.frame_heading - stated)
         assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
         assert np.abs(np.diff(np.sort(np.asarray(turned, dtype=float))) - SECTOR).max(initial=0.0) < 1e-9
-        grid = build_grid(flat, perfect.layouts, step_m=0.25, camera_height_m=CAMERA_M)
-        best = localise(flat, grid, perfect.layouts, query, refiner=optimiser.refine).candidates[0]
-        assert np.hypot(*(best.position_m - POSE.position_m[0])) < 0.02
-        assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)
+        assert_found(perfect, optimiser, query, POSE, heading)
 
     @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
     @settings(max_examples=24)
     def test_search_finds_the_pose_and_the_heading(
-        self,
-        perfect: PhotographEncoder,
-        optimiser: PoseRefiner,
-        flat: FloorPlan,
-        heading: float,
-        known: bool,
-        place: int,
+        self, perfect: PhotographEncoder, optimiser: PoseRefiner, heading: float, known: bool, place: int
     ) -> None:
         position = np.array([[1.37, 1.12], [3.21, 1.63], [0.81, 2.35], [5.12, 0.86], [4.23, 5.04], [1.66, 4.71]][place])
-        pose = PoseSet(position[None], flat.room_index_at(position[None]))
-        query = perfect.spheres.query(
-            photograph_of(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M)
-        )
-        grid = build_grid(flat, perfect.layouts, step_m=0.25, camera_height_m=CAMERA_M)
-        best = localise(flat, grid, perfect.layouts, query, refiner=optimiser.refine).candidates[0]
-        assert best.room_index == pose.room_index[0]
-        assert np.hypot(*(best.position_m - position)) < 0.02
-        assert abs(wrap_angle(photograph_heading(query, best) - heading)) < math.radians(1.0)
-        assert -math.pi <= photograph_heading(query, best) <= math.pi
+        pose = PoseSet(position[None], FLAT.room_index_at(position[None]))
+        image = photograph_of(pose, heading)
+        query = perfect.spheres.query(image, heading if known else None, CameraHeight(CAMERA_M))
+        assert_found(perfect, optimiser, query, pose, heading)

@@ -40,12 +40,9 @@ class TestLogRatio:
     def test_loss_is_invariant_to_scale(self, all_pairs: bool, seed: int, scale: float) -> None:
         latent, chamfer = distances(seed)
         expected = losses.log_ratio(latent, chamfer, 2, all_pairs=all_pairs)
-        torch.testing.assert_close(
-            losses.log_ratio(scale * latent, chamfer, 2, all_pairs=all_pairs), expected, rtol=1e-3, atol=1e-4
-        )
-        torch.testing.assert_close(
-            losses.log_ratio(latent, scale * chamfer, 2, all_pairs=all_pairs), expected, rtol=1e-3, atol=1e-4
-        )
+        for scaled in ((scale * latent, chamfer), (latent, scale * chamfer)):
+            loss = losses.log_ratio(*scaled, 2, all_pairs=all_pairs)
+            torch.testing.assert_close(loss, expected, rtol=1e-3, atol=1e-4)
 
     def test_positives_are_compared_with_negatives(self) -> None:
         latent = torch.tensor([[0.5, 1.0, 2.0]])
@@ -162,26 +159,26 @@ class TestStructure:
         # Of a camera at the ceiling.
         assert torch.isfinite(losses.ceiling(torch.zeros(1), torch.zeros(1), torch.tensor([-0.1])))
 
+    def openings_gradient(self, probability: list[float], target: list[float]) -> torch.Tensor:
+        """Return the gradient of the logits of one column."""
+        logits = torch.tensor([[probability]]).log().requires_grad_()
+        loss = losses.teacher_openings(logits, torch.tensor([[target]]), torch.ones(4))
+        return torch.autograd.grad(loss, logits)[0][0, 0]
+
     def test_teacher_openings_leave_passages_free(self) -> None:
-        target = torch.tensor([[[0.8, 0.1, math.nan]]])
-        for passage in (0.0, 0.05):
-            probability = torch.tensor([[[0.1 - passage, 0.8, 0.1, passage]]])
-            logits = (probability + 1e-12).log().requires_grad_()
-            (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, target, torch.ones(4)), logits)
-            torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
-        without_door = torch.tensor([[[0.8, 0.1, 0.1, 1e-6]]]).log().requires_grad_()
-        (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, target, torch.ones(4)), without_door)
-        assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
+        target = [0.8, 0.1, math.nan]
+        for passage in (1e-12, 0.05):
+            gradient = self.openings_gradient([0.1 - passage, 0.8, 0.1, passage], target)
+            torch.testing.assert_close(gradient, torch.zeros(4), atol=1e-6, rtol=0.0)
+        without_door = self.openings_gradient([0.8, 0.1, 0.1, 1e-6], target)
+        assert without_door[1] < 0.0 < without_door[0]
 
     def test_teacher_that_sees_passages_is_followed(self) -> None:
-        probability = torch.tensor([[[0.2, 0.3, 0.1, 0.4]]])
-        logits = probability.log().requires_grad_()
-        (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, probability[..., 1:], torch.ones(4)), logits)
-        torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
-        (gradient,) = torch.autograd.grad(
-            losses.teacher_openings(logits, torch.tensor([[[0.3, 0.1, 0.6]]]), torch.ones(4)), logits
-        )
-        assert gradient[0, 0, 3] < 0.0 < gradient[0, 0, 0]
+        probability = [0.2, 0.3, 0.1, 0.4]
+        alike = self.openings_gradient(probability, probability[1:])
+        torch.testing.assert_close(alike, torch.zeros(4), atol=1e-6, rtol=0.0)
+        gradient = self.openings_gradient(probability, [0.3, 0.1, 0.6])
+        assert gradient[3] < 0.0 < gradient[0]
 
     def test_weighted_teacher_is_followed_to_the_weighted_shares(self) -> None:
         share, weight = torch.tensor([0.6, 0.2, 0.1, 0.1]), torch.tensor([0.5, 2.0, 1.0, 2.0])

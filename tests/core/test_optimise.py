@@ -315,17 +315,11 @@ class TestBatches:
 
 
 class TestLoading:
-    @pytest.mark.parametrize("changes", [{"architecture": "transformer"}, {"layout_config": {"depth": 3}}])
-    def test_unknown_network_is_a_bundle_error(self, opened_bundle: Bundle, changes: dict) -> None:
-        with pytest.raises(BundleError, match="does not load"):
-            PoseRefiner.from_bundle(changed(opened_bundle, **changes))
-
-    def test_unsuitable_weights_are_a_bundle_error(self, opened_bundle: Bundle) -> None:
-        sizes = {**opened_bundle.manifest.layout_config, "layout_width": 24}
-        with pytest.raises(BundleError, match="does not load"):
-            PoseRefiner.from_bundle(changed(opened_bundle, layout_config=sizes))
-
-    def test_missing_weights_are_a_bundle_error(self, opened_bundle: Bundle) -> None:
+    def test_unknown_network_and_unsuitable_or_missing_weights_are_bundle_errors(self, opened_bundle: Bundle) -> None:
+        sizes = [opened_bundle.manifest.layout_config | {name: 24} for name in ("depth", "layout_width")]
+        for changes in ({"architecture": "transformer"}, *({"layout_config": config} for config in sizes)):
+            with pytest.raises(BundleError, match="does not load"):
+                PoseRefiner.from_bundle(changed(opened_bundle, **changes))
         files = {name: entry for name, entry in opened_bundle.manifest.files.items() if name != LAYOUT_WEIGHTS}
         with pytest.raises(BundleError, match="has no file"):
             PoseRefiner.from_bundle(changed(opened_bundle, files=files))

@@ -30,22 +30,18 @@ from tests.strategies import crooked_flat, plan_of, present, rectangle, seeds
 
 CAMERA_M = 1.5
 EXACT = CameraHeight(CAMERA_M, 0.0)
+FLAT = crooked_flat()
 Search = Callable[..., Localisation]
 
 
 @pytest.fixture(scope="module")
-def flat() -> FloorPlan:
-    return crooked_flat()
+def search(grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Search:
+    return partial(localise, FLAT, grid, encoders.layouts, refiner=optimiser.refine)
 
 
 @pytest.fixture(scope="module")
-def search(flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Search:
-    return partial(localise, flat, grid, encoders.layouts, refiner=optimiser.refine)
-
-
-@pytest.fixture(scope="module")
-def grid(flat: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(flat, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
+def grid(encoders: PhotographEncoder) -> PoseGrid:
+    return build_grid(FLAT, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
 
 
 def layout_query(encoders: PhotographEncoder, plan: FloorPlan, pose: PoseSet, *, by_profile: bool = False) -> Query:
@@ -60,12 +56,12 @@ def random_pose(plan: FloorPlan, seed: int) -> PoseSet:
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
     def test_each_stage_is_more_accurate_and_costs_less(
-        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search, by_profile: bool
+        self, encoders: PhotographEncoder, search: Search, by_profile: bool
     ) -> None:
         errors: dict[Refine, list[float]] = {"none": [], "vdr": [], "lpo": []}
         for seed in range(10):
-            pose = random_pose(flat, seed)
-            query = layout_query(encoders, flat, pose, by_profile=by_profile)
+            pose = random_pose(FLAT, seed)
+            query = layout_query(encoders, FLAT, pose, by_profile=by_profile)
             best = [search(query, refine=refine).candidates[0] for refine in errors]
             for distances, candidate in zip(errors.values(), best, strict=True):
                 distances.append(float(np.linalg.norm(candidate.position_m - pose.position_m[0])))
@@ -84,14 +80,7 @@ class TestCandidates:
     @given(seed=seeds(), top_k=st.integers(1, 10), heading_known=st.booleans(), refine=st.sampled_from(["none", "lpo"]))
     @settings(max_examples=20)
     def test_candidates_are_ranked_distinct_and_inside_rooms(
-        self,
-        flat: FloorPlan,
-        encoders: PhotographEncoder,
-        search: Search,
-        seed: int,
-        top_k: int,
-        heading_known: bool,
-        refine: Refine,
+        self, encoders: PhotographEncoder, search: Search, seed: int, top_k: int, heading_known: bool, refine: Refine
     ) -> None:
         image = np.random.default_rng(seed).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         query = encoders.spheres.query(image, 1.0 if heading_known else None, CameraHeight(CAMERA_M))
@@ -112,7 +101,7 @@ class TestCandidates:
             # The candidates' costs are computed in other batches than those that ranked them, and round differently.
             assert np.all(np.diff(costs) >= -1e-5)
         assert found.best[found.stage] == found.candidates[0]
-        assert flat.room_index_at(positions).tolist() == [candidate.room_index for candidate in found.candidates]
+        assert FLAT.room_index_at(positions).tolist() == [candidate.room_index for candidate in found.candidates]
         for candidate in found.candidates:
             assert -math.pi <= photograph_heading(query, candidate) <= math.pi
 
@@ -122,8 +111,8 @@ class TestCandidates:
         query = layout_query(encoders, plan, PoseSet(np.array([[0.5, 0.6]]), np.array([0])))
         assert len(localise(plan, grid, encoders.layouts, query, refine="vdr", top_k=5).candidates) == 1
 
-    def test_localisation_is_deterministic(self, flat: FloorPlan, encoders: PhotographEncoder, search: Search) -> None:
-        query = layout_query(encoders, flat, random_pose(flat, 1))
+    def test_localisation_is_deterministic(self, encoders: PhotographEncoder, search: Search) -> None:
+        query = layout_query(encoders, FLAT, random_pose(FLAT, 1))
         first, second = (search(query).candidates for _ in range(2))
         assert first == second
 
@@ -137,8 +126,8 @@ class TestCandidates:
 
 class TestStages:
     @pytest.fixture
-    def query(self, flat: FloorPlan, encoders: PhotographEncoder) -> Query:
-        return layout_query(encoders, flat, random_pose(flat, 3))
+    def query(self, encoders: PhotographEncoder) -> Query:
+        return layout_query(encoders, FLAT, random_pose(FLAT, 3))
 
     def test_localisation_names_its_stage(self, search: Search, query: Query) -> None:
         def stage(**options: Any) -> tuple[str, set[str]]:
@@ -177,10 +166,8 @@ class TestStages:
         assert few.signals == many.signals
         assert few.signals["lpo"].cost == few.candidates[0].cost
 
-    def test_profile_query_runs_vdr_only_if_needed(
-        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search
-    ) -> None:
-        query = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
+    def test_profile_query_runs_vdr_only_if_needed(self, encoders: PhotographEncoder, search: Search) -> None:
+        query = layout_query(encoders, FLAT, random_pose(FLAT, 3), by_profile=True)
         every = LocaliseConfig(every_stage=True)
         short = search(query)
         complete = search(query, config=every)
@@ -194,9 +181,7 @@ class TestStages:
         assert short.candidates == complete.candidates
         assert short.signals["lpo"] == complete.signals["lpo"]
 
-    def test_refiner_gets_each_candidates_room_and_target(
-        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search
-    ) -> None:
+    def test_refiner_gets_each_candidates_room_and_target(self, encoders: PhotographEncoder, search: Search) -> None:
         jobs: list[RefinementJob] = []
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         for heading in (None, 0.5):
@@ -213,16 +198,16 @@ class TestStages:
                 same_target = (job.targets == query.latents[candidate.hypothesis]).all(axis=1)
                 index = int(np.flatnonzero(same_place & same_target)[0])
                 np.testing.assert_array_equal(job.log_profile[index], query.profile.log_m[candidate.hypothesis])
-                np.testing.assert_array_equal(job.walls_m[index], flat.walls_m[candidate.room_index])
+                np.testing.assert_array_equal(job.walls_m[index], FLAT.walls_m[candidate.room_index])
                 assert job.heading[index] == candidate.frame_heading
                 assert job.camera_height_m[index] == CAMERA_M
 
     def test_number_of_refined_candidates_is_configured(
-        self, flat: FloorPlan, encoders: PhotographEncoder, search: Search, query: Query
+        self, encoders: PhotographEncoder, search: Search, query: Query
     ) -> None:
         refiner = Mock(return_value=None)
         config = LocaliseConfig(lpo_candidates=2, profile_candidates=3)
-        by_profile = layout_query(encoders, flat, random_pose(flat, 3), by_profile=True)
+        by_profile = layout_query(encoders, FLAT, random_pose(FLAT, 3), by_profile=True)
         for start in (query, by_profile):
             assert len(search(start, top_k=4, refiner=refiner, config=config).candidates) == 4
         assert [len(call.args[0].position_m) for call in refiner.call_args_list] == [2, 3]
@@ -238,14 +223,14 @@ class TestStages:
         assert np.linalg.norm(places[1:] - places[0], axis=1).min(initial=9.0) >= 1.0
 
     def test_posterior_pairs_each_refined_candidate_with_its_mode(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, search: Search
+        self, grid: PoseGrid, encoders: PhotographEncoder, search: Search
     ) -> None:
         def unmoved(job: RefinementJob) -> RefinementResult:
             return refinement_result(job, position_m=job.position_m, cost=np.linspace(0.1, 0.2, len(job.position_m)))
 
         config = LocaliseConfig(vdr_candidates=5)
         for seed in range(5):
-            query = layout_query(encoders, flat, random_pose(flat, seed))
+            query = layout_query(encoders, FLAT, random_pose(FLAT, seed))
             support = search(query, refiner=unmoved, config=config).posterior.support
             # Re-sampling moves a mode by at most the radius of the disc.
             moved_m = np.linalg.norm(support.position_m - grid.poses.position_m[support.pose], axis=1)
@@ -259,20 +244,16 @@ class TestStages:
 
 
 class TestGrid:
-    def test_grid_has_latents_and_profiles_at_heading_zero(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
-    ) -> None:
+    def test_grid_has_latents_and_profiles_at_heading_zero(self, grid: PoseGrid, encoders: PhotographEncoder) -> None:
         assert len(present(grid.latents)) == len(grid.poses)
         index = np.array([0, 5, len(grid.poses) - 1])
         poses = PoseSet(grid.poses.position_m[index], grid.poses.room_index[index])
-        latents, profile_m = encoders.layouts.poses(flat, poses, np.zeros(3), CAMERA_M)
+        latents, profile_m = encoders.layouts.poses(FLAT, poses, np.zeros(3), CAMERA_M)
         np.testing.assert_allclose(latents, present(grid.latents)[index], atol=1e-5)
         np.testing.assert_array_equal(profile_m, grid.profile_m[index])
 
-    def test_grid_depends_on_the_camera_height(
-        self, flat: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
-    ) -> None:
-        higher = build_grid(flat, encoders.layouts, step_m=0.5, camera_height_m=1.8)
+    def test_grid_depends_on_the_camera_height(self, grid: PoseGrid, encoders: PhotographEncoder) -> None:
+        higher = build_grid(FLAT, encoders.layouts, step_m=0.5, camera_height_m=1.8)
         assert dataclasses.replace(higher, latents=grid.latents).camera_height_m == 1.8
         assert np.abs(present(higher.latents) - grid.latents).max() > 1e-3
 
@@ -326,10 +307,9 @@ class TestShares:
     def test_copies_of_a_flat_share_the_probability(
         self, encoders: PhotographEncoder, optimiser: PoseRefiner, count: int, known: bool, place_m: tuple[float, float]
     ) -> None:
-        plan = copied([room.polygon_m for room in crooked_flat().rooms], count)
+        plan = copied([room.polygon_m for room in FLAT.rooms], count)
         found = localised(encoders, optimiser, plan, place_m, known=known)
-        assert found.posterior.position <= 1.0 / count + 0.05
-        assert found.posterior.position >= 0.6 / count
+        assert 0.6 / count <= found.posterior.position <= 1.0 / count + 0.05
 
     @pytest.mark.parametrize("width_m", [0.9, 1.15, 1.6, 2.9])
     def test_equal_offices_share_the_probability(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.bundle import Bundle, ConfidenceModel
 from lalaloc_core.errors import InvalidHintError
-from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.belief import (
     GridCosts,
     Posterior,
@@ -196,12 +196,8 @@ MODEL = ConfidenceModel(
     known_heading={}, searched_heading={}, position_factor=0.5, position_factor_searched=0.7, heading_factor=0.3
 )
 ROOM_STD_M = math.hypot(5.0, 4.0) / math.sqrt(12.0)
+ROOM = plan_of(rectangle(5.0, 4.0)).rooms[0]
 unknowns = st.sampled_from([2, 3])
-
-
-@pytest.fixture(scope="module")
-def room() -> Room:
-    return plan_of(rectangle(5.0, 4.0)).rooms[0]
 
 
 def information(seed: int, size: int, rank: int | None = None) -> np.ndarray:
@@ -211,16 +207,16 @@ def information(seed: int, size: int, rank: int | None = None) -> np.ndarray:
     return (10.0 * matrix).astype(np.float32)
 
 
-def uncertainty_of(given: np.ndarray, room: Room, model: ConfidenceModel = MODEL) -> tuple[np.ndarray, float | None]:
-    return present(pose_uncertainty(given, room, model))
+def uncertainty_of(given: np.ndarray, model: ConfidenceModel = MODEL) -> tuple[np.ndarray, float | None]:
+    return present(pose_uncertainty(given, ROOM, model))
 
 
 class TestCovariance:
     @given(seed=seeds(), size=unknowns)
-    def test_covariance_is_the_scaled_inverse(self, room: Room, seed: int, size: int) -> None:
+    def test_covariance_is_the_scaled_inverse(self, seed: int, size: int) -> None:
         given = information(seed, size)
         inverse = np.linalg.inv(given.astype(float))
-        position_m2, heading_std = uncertainty_of(given, room)
+        position_m2, heading_std = uncertainty_of(given)
         factor = present(MODEL.position_factor if size == 2 else MODEL.position_factor_searched)
         np.testing.assert_allclose(position_m2, factor * inverse[:2, :2], rtol=1e-3, atol=1e-6)
         if size == 3:
@@ -229,33 +225,30 @@ class TestCovariance:
             assert heading_std is None
 
     @given(seed=seeds(), size=unknowns, rank=st.integers(0, 3), scale=st.floats(1e-12, 1e12))
-    def test_covariance_is_symmetric_positive_and_bounded(
-        self, room: Room, seed: int, size: int, rank: int, scale: float
-    ) -> None:
-        position_m2, heading_std = uncertainty_of(
-            (scale * information(seed, size, min(rank, size))).astype(np.float32), room
-        )
+    def test_covariance_is_symmetric_positive_and_bounded(self, seed: int, size: int, rank: int, scale: float) -> None:
+        given = (scale * information(seed, size, min(rank, size))).astype(np.float32)
+        position_m2, heading_std = uncertainty_of(given)
         np.testing.assert_array_equal(position_m2, position_m2.T)
         variance = np.linalg.eigvalsh(position_m2)
         assert variance.min() >= -1e-12 * variance.max()
         assert variance.max() <= ROOM_STD_M**2 * (1.0 + 1e-9)
         assert heading_std is None or 0.0 <= heading_std <= math.pi / math.sqrt(3.0)
 
-    def test_unobserved_direction_is_as_wide_as_the_room_and_heading_uniform(self, room: Room) -> None:
-        position_m2, _ = uncertainty_of(np.diag([0.0, 400.0]), room)
+    def test_unobserved_direction_is_as_wide_as_the_room_and_heading_uniform(self) -> None:
+        position_m2, _ = uncertainty_of(np.diag([0.0, 400.0]))
         np.testing.assert_allclose(position_m2, np.diag([ROOM_STD_M**2, 0.5 / 400.0]), atol=1e-12)
-        position_m2, heading_std = uncertainty_of(np.diag([100.0, 100.0, 0.0]), room)
+        position_m2, heading_std = uncertainty_of(np.diag([100.0, 100.0, 0.0]))
         np.testing.assert_allclose(position_m2, 0.007 * np.eye(2), atol=1e-12)
         assert heading_std == math.pi / math.sqrt(3.0)
 
     @pytest.mark.parametrize(
         ("size", "missing"), [(2, "position_factor"), (3, "position_factor_searched"), (3, "heading_factor")]
     )
-    def test_model_without_the_factor_has_no_covariance(self, room: Room, size: int, missing: str) -> None:
+    def test_model_without_the_factor_has_no_covariance(self, size: int, missing: str) -> None:
         model = dataclasses.replace(MODEL, **{missing: None})
-        assert pose_uncertainty(information(0, size), room, model) is None
+        assert pose_uncertainty(information(0, size), ROOM, model) is None
         # The factor of the other size does not matter.
-        assert pose_uncertainty(information(0, 5 - size), room, model) is not None
+        assert pose_uncertainty(information(0, 5 - size), ROOM, model) is not None
 
 
 class TestMarginalInformation:
@@ -273,6 +266,9 @@ Ask = Callable[..., Localisation]
 # The plan has two identical rooms and a different one.
 ROOM_M, OFFSET_M = (4.0, 3.0), 10.0
 STANDS_M = (1.3, 0.9)
+COPIES = [{"name": "Bedroom", "polygon": rectangle(*ROOM_M, corner=(x, 0.0))} for x in (0.0, OFFSET_M)]
+HALL = {"name": "hall", "polygon": rectangle(7.0, 1.6, corner=(0.0, 5.0))}
+PLAN = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [*COPIES, HALL]})
 
 
 @pytest.fixture(scope="module")
@@ -287,27 +283,20 @@ def encoders(opened_bundle: Bundle) -> PhotographEncoder:
 
 
 @pytest.fixture(scope="module")
-def plan() -> FloorPlan:
-    copies = [{"name": "Bedroom", "polygon": rectangle(*ROOM_M, corner=(x, 0.0))} for x in (0.0, OFFSET_M)]
-    hall = {"name": "hall", "polygon": rectangle(7.0, 1.6, corner=(0.0, 5.0))}
-    return FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [*copies, hall]})
+def grid(encoders: PhotographEncoder) -> PoseGrid:
+    return build_grid(PLAN, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders.layouts, step_m=0.5, camera_height_m=CAMERA_M)
-
-
-@pytest.fixture(scope="module")
-def query(plan: FloorPlan, encoders: PhotographEncoder) -> Query:
-    return perfect_query(encoders, plan, STANDS_M)
+def query(encoders: PhotographEncoder) -> Query:
+    return perfect_query(encoders, PLAN, STANDS_M)
 
 
 class TestLocalisation:
     @pytest.fixture
-    def ask(self, plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Ask:
+    def ask(self, grid: PoseGrid, encoders: PhotographEncoder, optimiser: PoseRefiner) -> Ask:
         def localised(query: Query, hints: Hints = NO_HINTS, refine: Refine = "lpo") -> Localisation:
-            return localise(plan, grid, encoders.layouts, query, refine=refine, refiner=optimiser.refine, hints=hints)
+            return localise(PLAN, grid, encoders.layouts, query, refine=refine, refiner=optimiser.refine, hints=hints)
 
         return localised
 
@@ -324,9 +313,9 @@ class TestLocalisation:
 
     @pytest.mark.parametrize("refine", ["none", "vdr", "lpo"])
     def test_wrong_hint_does_not_override_a_clear_match(
-        self, ask: Ask, plan: FloorPlan, encoders: PhotographEncoder, refine: Refine
+        self, ask: Ask, encoders: PhotographEncoder, refine: Refine
     ) -> None:
-        query = perfect_query(encoders, plan, (2.1, 5.7))
+        query = perfect_query(encoders, PLAN, (2.1, 5.7))
         for hints, missed in (
             (Hints(near=Near(12.0, 1.5, 3.0)), ("near",)),
             (Hints(near=Near(12.0, 1.5, 3.0), rooms=frozenset({0, 1})), ("near", "rooms")),
@@ -336,10 +325,8 @@ class TestLocalisation:
             assert np.linalg.norm(found.candidates[0].position_m - (2.1, 5.7)) < 0.5
             assert found.hints_missed == missed
 
-    def test_hint_changes_the_odds_as_documented_and_not_the_cost(
-        self, ask: Ask, plan: FloorPlan, query: Query
-    ) -> None:
-        share = ROOM_M[0] * ROOM_M[1] / plan.area_m2
+    def test_hint_changes_the_odds_as_documented_and_not_the_cost(self, ask: Ask, query: Query) -> None:
+        share = ROOM_M[0] * ROOM_M[1] / PLAN.area_m2
         odds = 1.0 + 0.98 / (0.02 * share)
         first, second = ask(query, Hints(rooms=frozenset({1})), "lpo").posterior.candidate[:2]
         assert first / second == pytest.approx(odds, rel=0.05)
@@ -348,9 +335,9 @@ class TestLocalisation:
 
     @pytest.mark.parametrize("refine", ["none", "vdr", "lpo"])
     def test_strict_hints_restrict_and_report_contradictions(
-        self, ask: Ask, plan: FloorPlan, encoders: PhotographEncoder, refine: Refine
+        self, ask: Ask, encoders: PhotographEncoder, refine: Refine
     ) -> None:
-        query = perfect_query(encoders, plan, (2.1, 5.7))
+        query = perfect_query(encoders, PLAN, (2.1, 5.7))
         near = Near(11.0, 1.0, 0.8)
         found = ask(query, Hints(near=near, strict=True), refine)
         places = np.stack([candidate.position_m for candidate in found.candidates])
@@ -367,14 +354,13 @@ class TestLocalisation:
 
 
 def test_allowed_poses_of_a_large_grid_are_compared(
-    plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder, monkeypatch: pytest.MonkeyPatch
+    grid: PoseGrid, encoders: PhotographEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._ALL_COMPARED", 0)
-    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MIN_COMPARED", 8)
-    monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MAX_COMPARED", 8)
-    query = perfect_query(encoders, plan, (2.1, 5.7))
+    for limit, poses in (("ALL", 0), ("MIN", 8), ("MAX", 8)):
+        monkeypatch.setattr(f"lalaloc_core.localise.search.retrieval._{limit}_COMPARED", poses)
+    query = perfect_query(encoders, PLAN, (2.1, 5.7))
     hints = Hints(rooms=frozenset({1}), strict=True)
-    costs = grid_costs(plan, grid, query, encoders.manifest.evidence, MatchingConfig(), hints)
+    costs = grid_costs(PLAN, grid, query, encoders.manifest.evidence, MatchingConfig(), hints)
     rooms, total = grid.poses.room_index[costs.pose[: costs.compared]], costs.total[: costs.compared]
     assert costs.compared < len(grid.poses)
     assert {1, 2} <= set(rooms.tolist())
@@ -411,17 +397,17 @@ class TestChecks:
             (Hints(rooms=frozenset()), "rooms: no room is named"),
         ],
     )
-    def test_invalid_hints_are_refused(self, plan: FloorPlan, hints: Hints, message: str) -> None:
+    def test_invalid_hints_are_refused(self, hints: Hints, message: str) -> None:
         with pytest.raises(InvalidHintError, match=message):
-            hints.check(plan)
+            hints.check(PLAN)
 
-    def test_rooms_are_found_by_id_then_by_name(self, plan: FloorPlan) -> None:
-        assert [room.id for room in plan.rooms] == ["bedroom", "bedroom-2", "hall"]
-        assert rooms_named(plan, ["bedroom-2"]) == {1}
-        assert rooms_named(plan, ["Bedroom"]) == {0, 1}
-        assert rooms_named(plan, ["bedroom", " HALL "]) == {0, 2}
+    def test_rooms_are_found_by_id_then_by_name(self) -> None:
+        assert [room.id for room in PLAN.rooms] == ["bedroom", "bedroom-2", "hall"]
+        assert rooms_named(PLAN, ["bedroom-2"]) == {1}
+        assert rooms_named(PLAN, ["Bedroom"]) == {0, 1}
+        assert rooms_named(PLAN, ["bedroom", " HALL "]) == {0, 2}
         with pytest.raises(InvalidHintError, match="no room 'attic'; its rooms are 'bedroom', 'bedroom-2', 'hall'"):
-            rooms_named(plan, ["hall", "attic"])
+            rooms_named(PLAN, ["hall", "attic"])
 
     def test_no_hints_are_never_missed(self) -> None:
         assert NO_HINTS.are_none

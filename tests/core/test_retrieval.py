@@ -174,9 +174,8 @@ class TestRetrieval:
             unknown_heading_query(unit(rng, 2, 8)), profile=PredictedProfile(seen, np.full((2, 16), -3.0))
         )
         exhaustive = best_candidates(grid, query, top_k=3)
-        monkeypatch.setattr("lalaloc_core.localise.search.retrieval._ALL_COMPARED", 0)
-        monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MIN_COMPARED", 50)
-        monkeypatch.setattr("lalaloc_core.localise.search.retrieval._MAX_COMPARED", 50)
+        for limit, poses in (("ALL", 0), ("MIN", 50), ("MAX", 50)):
+            monkeypatch.setattr(f"lalaloc_core.localise.search.retrieval._{limit}_COMPARED", poses)
         costs = grid_costs(PLAN, grid, query, MatchingWeights(), MatchingConfig())
         assert costs.compared == 50
         assert best_candidates(grid, query, top_k=3)[:2] == exhaustive[:2]

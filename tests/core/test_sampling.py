@@ -173,10 +173,8 @@ class TestNeighbours:
 
     @given(seeds())
     def test_low_rooms_are_excluded(self, seed: int) -> None:
-        plan = plan_of(
-            rectangle(3.0, 3.0), rectangle(6.0, 6.0, corner=(3.1, 0.0)), rectangle(6.0, 6.0, corner=(3.1, 6.1))
-        )
-        document = plan.to_dict()
+        large = [rectangle(6.0, 6.0, corner=(3.1, y_m)) for y_m in (0.0, 6.1)]
+        document = plan_document(rectangle(3.0, 3.0), *large)
         document["rooms"][1]["ceiling_height_m"] = 2.0
         plan, rng = FloorPlan.from_dict(document), np.random.default_rng(seed)
         # The anchor is at the wall to the low room, so positives are drawn there as well.

@@ -45,35 +45,31 @@ WALK: Walk = [
     ((6.0, 1.6), 1, 0.4),
     ((6.3, 2.6), 1, 0.2),
 ]
+# The rooms of the walk with a door between them, and a third one without.
+RIGHT = [[4.2, 0.0], [9.2, 0.0], [9.2, 3.0], [7.0, 3.0], [7.0, 4.5], [4.2, 4.5]]
+DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
+OPENINGS = {"openings": [DOOR], "opening_kinds": ["door", "window", "passage"]}
+PLAN = plan_of(l_shape(4.0, 3.0, 1.2, 0.8), RIGHT, rectangle(4.0, 3.0, corner=(0.0, 3.2)), **OPENINGS)
 
 
 @pytest.fixture(scope="module")
-def plan() -> FloorPlan:
-    """Return two rooms with a door between them, and a third one without."""
-    right = [[4.2, 0.0], [9.2, 0.0], [9.2, 3.0], [7.0, 3.0], [7.0, 4.5], [4.2, 4.5]]
-    whole = plan_of(l_shape(4.0, 3.0, 1.2, 0.8), right, rectangle(4.0, 3.0, corner=(0.0, 3.2))).to_dict()
-    door = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
-    return FloorPlan.from_dict(whole | {"openings": [door], "opening_kinds": ["door", "window", "passage"]})
+def grid(encoders: PhotographEncoder) -> PoseGrid:
+    return build_grid(PLAN, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
+def graph(grid: PoseGrid) -> WalkGraph:
+    return WalkGraph.of(grid.poses, grid.layouts(PLAN), grid.step_m)
 
 
 @pytest.fixture(scope="module")
-def graph(plan: FloorPlan, grid: PoseGrid) -> WalkGraph:
-    return WalkGraph.of(grid.poses, grid.layouts(plan), grid.step_m)
+def ground(grid: PoseGrid, graph: WalkGraph) -> TrackedPlans:
+    return TrackedPlans.of_plan(PLAN, grid, graph)
 
 
 @pytest.fixture(scope="module")
-def ground(plan: FloorPlan, grid: PoseGrid, graph: WalkGraph) -> TrackedPlans:
-    return TrackedPlans.of_plan(plan, grid, graph)
-
-
-@pytest.fixture(scope="module")
-def queries(encoders: PhotographEncoder, plan: FloorPlan) -> list[Query]:
-    return queries_along(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
+def queries(encoders: PhotographEncoder) -> list[Query]:
+    return queries_along(encoders, PLAN, WALK, CameraHeight(CAMERA_M, 0.0))
 
 
 def odometry_along(walk: Walk) -> list[Odometry | None]:
@@ -331,9 +327,8 @@ class TestState:
         content, sizes, before = TrackState.first(len(queries[0].roll)).to_bytes(), list[int](), 0
         for number, (index, move) in enumerate(zip(order, moves, strict=True)):
             state = TrackState.from_bytes(content)
-            content = run_steps(
-                track_steps(ground, encoders.layouts, state, queries[index], move), lambda _job: None
-            ).state.to_bytes()
+            steps = track_steps(ground, encoders.layouts, state, queries[index], move)
+            content = run_steps(steps, lambda _job: None).state.to_bytes()
             sizes.append(len(content))
             if number == 500:
                 before = psutil.Process().memory_info().rss
@@ -344,9 +339,8 @@ class TestState:
 
     @pytest.mark.parametrize("damage", ["cut", "flipped", "version", "number"])
     def test_damaged_state_is_refused(self, damage: str) -> None:
-        state = replace(
-            TrackState.first(4), plans=(StatePlan("", 10),), belief=States(np.array([9]), np.array([3]), np.ones(1))
-        )
+        belief = States(np.array([9]), np.array([3]), np.ones(1))
+        state = replace(TrackState.first(4), plans=(StatePlan("", 10),), belief=belief)
         content = state.to_bytes()
         if damage == "number":
             content = replace(state, plans=(StatePlan("", 9),)).to_bytes()

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
@@ -23,29 +22,25 @@ from tests.strategies import plan_of, rectangle
 
 CAMERA_M, STEP_M = 1.5, 0.5
 SPOT_M, ROOM = (1.6, 7.0), 2
+HALL = [[1.0, 5.0], [13.0, 5.0], [13.0, 6.4], [3.0, 6.4], [3.0, 8.0], [1.0, 8.0]]
+PLAN = plan_of(rectangle(4.0, 3.0), rectangle(4.0, 3.0, corner=(10.0, 0.0)), HALL)
 
 
 @pytest.fixture(scope="module")
-def plan() -> FloorPlan:
-    hall = [[1.0, 5.0], [13.0, 5.0], [13.0, 6.4], [3.0, 6.4], [3.0, 8.0], [1.0, 8.0]]
-    return plan_of(rectangle(4.0, 3.0), rectangle(4.0, 3.0, corner=(10.0, 0.0)), hall)
+def grid(encoders: PhotographEncoder) -> PoseGrid:
+    return build_grid(PLAN, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
-@pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: PhotographEncoder) -> PoseGrid:
-    return build_grid(plan, encoders.layouts, step_m=STEP_M, camera_height_m=CAMERA_M)
-
-
-def query_at(encoders: PhotographEncoder, plan: FloorPlan, heading: float) -> Query:
-    (query,) = queries_along(encoders, plan, [(SPOT_M, ROOM, heading)], CameraHeight(CAMERA_M, 0.0))
+def query_at(encoders: PhotographEncoder, heading: float) -> Query:
+    (query,) = queries_along(encoders, PLAN, [(SPOT_M, ROOM, heading)], CameraHeight(CAMERA_M, 0.0))
     return query
 
 
 @pytest.fixture
-def search(plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder) -> partial[SearchedTurn]:
+def search(grid: PoseGrid, encoders: PhotographEncoder) -> partial[SearchedTurn]:
     def found(headings: list[float], relative: list[RelativeHeading]) -> SearchedTurn:
-        queries = [query_at(encoders, plan, heading) for heading in headings]
-        return run_steps(searched_turn(plan, grid, encoders.layouts, queries, relative, MatchingConfig()), None)
+        queries = [query_at(encoders, heading) for heading in headings]
+        return run_steps(searched_turn(PLAN, grid, encoders.layouts, queries, relative, MatchingConfig()), None)
 
     return partial(found)
 
@@ -119,10 +114,8 @@ def test_wrong_relative_heading_is_reported_and_ignored(search: partial[Searched
     assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
 
 
-def test_photographs_have_the_place_of_all_and_their_own_headings(
-    plan: FloorPlan, grid: PoseGrid, encoders: PhotographEncoder
-) -> None:
-    joint = localise(plan, grid, encoders.layouts, query_at(encoders, plan, 0.3), refine="none")
+def test_photographs_have_the_place_of_all_and_their_own_headings(grid: PoseGrid, encoders: PhotographEncoder) -> None:
+    joint = localise(PLAN, grid, encoders.layouts, query_at(encoders, 0.3), refine="none")
     found = TurnLocalisation(joint, [-0.5, 0.0, 1.0])
     np.testing.assert_allclose(found.turns, [0.0, 0.5, 1.5])
     for picture, heading in zip(found.pictures, found.headings, strict=True):

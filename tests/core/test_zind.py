@@ -246,14 +246,10 @@ class TestRooms:
             layout = sphere(document)["layout_complete"]
             shift = np.array(layout["vertices"][0])
             # The sphere's frame is mirrored, has the camera height of 1.5 m as its unit, and the same directions.
-            layout["internal"] = (
-                internal
-                if not isinstance(internal, list)
-                else [
-                    [[shift[0] - x / 1.5, shift[1] + y / 1.5] if not isinstance(y, str) else [x, y] for x, y in ring]
-                    for ring in internal
-                ]
-            )
+            layout["internal"] = internal and [
+                [[shift[0] - x / 1.5, shift[1] + y / 1.5] if not isinstance(y, str) else [x, y] for x, y in ring]
+                for ring in internal
+            ]
 
         change_home(tmp_path, change)
         plan = Zind(tmp_path).load(NAME).plan

@@ -46,6 +46,9 @@ FLAT: dict[str, Any] = {
     ],
 }
 
+# Large enough that its grid is still in preparation when a test looks.
+HALL = {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+
 # The flat of the example photographs.
 HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
 

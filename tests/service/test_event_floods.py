@@ -23,6 +23,7 @@ from service.settings import Settings
 from tests.service.test_server import served
 
 HOST = b"Host: localhost\r\n"
+LAST_REQUEST = b"GET /who HTTP/1.1\r\nConnection: close\r\n" + HOST
 
 
 def _app() -> FastAPI:
@@ -63,6 +64,14 @@ def _read_all(connection: socket.socket) -> bytes:
     except ConnectionResetError:
         pass
     return content
+
+
+def _answer_to(port: int, *pieces: bytes) -> bytes:
+    """Return all that is answered to bytes on a connection of their own."""
+    with _connected(port) as connection:
+        for piece in pieces:
+            connection.sendall(piece)
+        return _read_all(connection)
 
 
 def _chunked(path: str, chunk: bytes, count: int) -> bytes:
@@ -135,13 +144,9 @@ def test_answer_ends_the_connection_of_a_body_in_small_chunks(port: int) -> None
 
 def test_connections_after_a_body_in_small_chunks_are_read_later(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http_protocol, "_PENALTY_S", 60.0)
-    with _connected(port) as flood:
-        flood.sendall(_chunked("/refused", b"x", 6))
-        _read_all(flood)
+    _answer_to(port, _chunked("/refused", b"x", 6))
     begin = time.monotonic()
-    with _connected(port) as connection:
-        connection.sendall(b"GET /who HTTP/1.1\r\nConnection: close\r\n" + HOST + b"\r\n")
-        assert _read_all(connection).endswith(b'"me"')
+    assert _answer_to(port, LAST_REQUEST + b"\r\n").endswith(b'"me"')
     assert time.monotonic() - begin > 0.4
 
 
@@ -152,34 +157,23 @@ def _send_quietly(connection: socket.socket, content: bytes) -> None:
 
 
 def test_body_in_many_chunks_arrives_as_a_whole(port: int) -> None:
-    with _connected(port) as connection:
-        connection.sendall(
-            _chunked("/body", b"y" * 100, 3000) + b"0\r\n\r\nGET /who HTTP/1.1\r\nConnection: close\r\n" + HOST
-        )
-        connection.sendall(b"\r\n")
-        answers = _read_all(connection)
+    answers = _answer_to(port, _chunked("/body", b"y" * 100, 3000) + b"0\r\n\r\n" + LAST_REQUEST, b"\r\n")
     assert b"\r\n\r\n300000" in answers
     assert answers.endswith(b'"me"')
 
 
 def test_pipelined_requests_are_all_answered_and_other_versions_refused(port: int) -> None:
     request = b"GET /who HTTP/1.1\r\n" + HOST
-    with _connected(port) as connection:
-        connection.sendall(199 * (request + b"\r\n") + request + b"Connection: close\r\n\r\n")
-        assert _read_all(connection).count(b"HTTP/1.1 200 OK") == 200
-    with _connected(port) as connection:
-        connection.sendall(b"GET /who HTTP/9.9\r\n" + HOST + b"\r\n")
-        assert _read_all(connection).startswith(b"HTTP/1.1 505 ")
+    assert _answer_to(port, 199 * (request + b"\r\n") + LAST_REQUEST + b"\r\n").count(b"HTTP/1.1 200 OK") == 200
+    assert _answer_to(port, b"GET /who HTTP/9.9\r\n" + HOST + b"\r\n").startswith(b"HTTP/1.1 505 ")
 
 
 @pytest.mark.parametrize("parts", [1, 2])
 @pytest.mark.parametrize("size", [20_000, 108_000])
 def test_large_head_is_refused_in_any_number_of_segments(port: int, size: int, parts: int) -> None:
     head = b"GET /who HTTP/1.1\r\n" + HOST + b"X-Large: " + size * b"x" + b"\r\n\r\n"
-    with _connected(port) as connection:
-        for part in range(parts):
-            connection.sendall(head[part * len(head) // parts : (part + 1) * len(head) // parts])
-        answer = _read_all(connection)
+    cuts = [part * len(head) // parts for part in range(parts + 1)]
+    answer = _answer_to(port, *(head[begin:end] for begin, end in itertools.pairwise(cuts)))
     assert answer.startswith(b"HTTP/1.1 431 ")
     assert str(MAX_HEAD_BYTES).encode() in answer
 
@@ -193,9 +187,9 @@ def test_head_within_the_limits_passes(port: int) -> None:
 
 def test_upgrade_to_a_websocket_is_ignored_without_a_line_of_log(port: int, caplog: pytest.LogCaptureFixture) -> None:
     upgrade = b"Connection: Upgrade, close\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
-    with caplog.at_level(logging.WARNING), _connected(port) as connection:
-        connection.sendall(b"GET /who HTTP/1.1\r\n" + HOST + upgrade + b"\r\n")
-        assert _read_all(connection).startswith(b"HTTP/1.1 200 OK")
+    with caplog.at_level(logging.WARNING):
+        answer = _answer_to(port, b"GET /who HTTP/1.1\r\n" + HOST + upgrade + b"\r\n")
+    assert answer.startswith(b"HTTP/1.1 200 OK")
     assert not caplog.records
 
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
@@ -22,11 +23,10 @@ from service.http.events import PLAN_ENDS, ProgressEvents, plan_look
 from service.schemas.stored_plans import PlanEvent
 from service.settings import Settings
 from service.storage.store import Store
-from tests.service.conftest import FLAT, StartApp, assert_problem, metric, serve, upload, wait_for
+from tests.service.conftest import FLAT, HALL, StartApp, assert_problem, metric, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
 from tests.service.test_security import bearer, id_of, make_key
 
-HALL = {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
 SLOW: dict[str, Any] = {"grid_step_m": 0.1, "max_grid_poses": 10**6}
 Event = tuple[str, dict[str, Any]]
 
@@ -45,10 +45,16 @@ def _events(response: httpx.Response) -> Iterator[Event]:
             name, data = "message", ""
 
 
-def follow(client: httpx.Client, plan_id: str) -> list[Event]:
+@contextmanager
+def following(client: httpx.Client, plan_id: str) -> Iterator[Iterator[Event]]:
     with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
         assert response.status_code == 200
-        return list(_events(response))
+        yield _events(response)
+
+
+def follow(client: httpx.Client, plan_id: str) -> list[Event]:
+    with following(client, plan_id) as events:
+        return list(events)
 
 
 def test_ready_plan_has_one_event_and_an_unknown_one_none(client: httpx.Client) -> None:
@@ -83,15 +89,13 @@ def test_progress_is_streamed_until_ready(start_app: StartApp, tmp_path: Path) -
 def test_streams_of_deleted_plans_end_and_those_of_replaced_ones_go_on(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
-        with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
-            events = _events(response)
+        with following(client, plan_id) as events:
             assert next(events)[0] == "progress"
             assert client.delete(f"/floorplans/{plan_id}").status_code == 204
             assert list(events)[-1] == ("deleted", {"status": "deleted"})
         wait_for(lambda: metric(client, "lalaloc_streams") == 0)
         plan_id = upload(client, HALL, wait=False)
-        with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
-            events = _events(response)
+        with following(client, plan_id) as events:
             before = next(events)[1]["revision"]
             after = client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "small"}).json()["revision"]
             name, last = list(events)[-1]
@@ -132,8 +136,7 @@ def test_streams_end_when_the_service_stops(tiny_bundle: Path, tmp_path: Path) -
     app = create_app(Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW))
     with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
         plan_id = upload(client, HALL, wait=False)
-        with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
-            events = _events(response)
+        with following(client, plan_id) as events:
             assert next(events)[0] == "progress"
             app.state.admission.stop()
             assert {name for name, _ in events} <= {"progress"}
@@ -187,8 +190,7 @@ def test_progress_of_another_replica_is_streamed(postgres: PostgresServer, start
     with start_app(tmp_path / "a", **shared) as first, start_app(tmp_path / "b", **shared) as second:
         plan_id = upload(first, HALL, wait=False)
         wait_for(lambda: first.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
-        with second.stream("GET", f"/floorplans/{plan_id}/events") as response:
-            events = _events(response)
+        with following(second, plan_id) as events:
             assert max(next(events)[1]["progress"] for _ in range(3)) > 0.0
             sleep(0.1)
             assert first.delete(f"/floorplans/{plan_id}").status_code == 204

@@ -24,7 +24,7 @@ from service.security.permissions import network_of
 from service.storage.records import NewPlan, Original
 from service.storage.store import Store
 from tests.core.test_images import of_scans
-from tests.service.conftest import FLAT, StartApp, assert_problem, localise, metric, upload, wait_for
+from tests.service.conftest import FLAT, HALL, StartApp, assert_problem, localise, metric, upload, wait_for
 
 WORST = "127.0.0.2"
 
@@ -400,10 +400,9 @@ def test_unread_answers_leave_slots_for_others(start_app: StartApp, tmp_path: Pa
 
 @pytest.mark.one_replica
 def test_streams_of_one_client_leave_slots_for_others(start_app: StartApp, tmp_path: Path) -> None:
-    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     settings = {"grid_step_m": 0.1, "inline_grid_poses": 1, "max_grid_poses": 10**6}
     with start_app(tmp_path, max_streams=4, **settings) as client, ExitStack() as attack:
-        path = f"/floorplans/{upload(client, hall, wait=False)}"
+        path = f"/floorplans/{upload(client, HALL, wait=False)}"
         for _ in range(6):
             attack.enter_context(_sent(client, f"GET {path}/events HTTP/1.1\r\nHost: localhost\r\n\r\n"))
         wait_for(lambda: metric(client, "lalaloc_streams") == 3)

@@ -112,6 +112,12 @@ def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvide
 MakeGrids = Callable[..., GridProvider]
 
 
+@pytest.fixture
+def shared(open_store: OpenStore) -> Store:
+    """Return a store on a database of either kind, which other replicas open as well."""
+    return open_store()
+
+
 def test_chunked_grid_equals_the_core_grid(store: Store, make_grids: MakeGrids, encoders: PhotographEncoder) -> None:
     computed = make_grids(store).compute(_add(store, HALL), 1.5).result(30.0)
     expected = build_grid(HALL, encoders.layouts, step_m=0.5, camera_height_m=1.5, latents=False)
@@ -227,9 +233,7 @@ def test_replicas_share_one_computation(open_store: OpenStore, make_grids: MakeG
     first = make_grids(first_store, first_encoders, grid_lease_s=10.0)
     second = make_grids(second_store, second_encoders, grid_lease_s=10.0)
     record = _add(first_store, HALL)
-    first_encoders.go_on.clear()
-    first_future = first.compute(record, 1.5)
-    wait_for(lambda: first_encoders.embedded > 0)
+    first_future = _begun(first_encoders, first, record)
     second_future = second.compute(record, 1.5)
     wait_for(lambda: len(second._jobs.remote()) == 1)
     first_encoders.go_on.set()
@@ -260,12 +264,9 @@ def test_remote_progress_is_reported(open_store: OpenStore, make_grids: MakeGrid
     wait_for(lambda: _looked(grids) or grids.progress(key) == 0.25)
 
 
-def test_lease_of_dead_replica_is_taken_over(
-    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
-    store = open_store()
-    grids, record = make_grids(store), _add(store)
-    store.leases.claim(grids.key(record.revision_id, 1.5), "dead", 1.0)
+def test_lease_of_dead_replica_is_taken_over(shared: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
+    grids, record = make_grids(shared), _add(shared)
+    shared.leases.claim(grids.key(record.revision_id, 1.5), "dead", 1.0)
     future = grids.compute(record, 1.5)
     wait_for(lambda: len(grids._jobs.remote()) == 1)
     grids.poll_remote()
@@ -274,23 +275,20 @@ def test_lease_of_dead_replica_is_taken_over(
     assert len(future.result(30.0).poses) == encoders.embedded
 
 
-def test_grid_fails_after_unfinished_attempts(
-    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
-    store = open_store()
-    grids, record = make_grids(store), _add(store)
+def test_unfinished_attempts_fail(shared: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
+    grids, record = make_grids(shared), _add(shared)
     key = grids.key(record.revision_id, 1.5)
     # As replicas that lose their lease or die.
     for number in range(5):
-        assert store.leases.claim(key, f"replica {number % 2}", 0.001)
+        assert shared.leases.claim(key, f"replica {number % 2}", 0.001)
         time.sleep(0.01)
     with pytest.raises(PlanFailedError, match="begun 5 times"):
         grids.compute(record, 1.5).result(30.0)
     assert encoders.embedded == 0
-    state = grids.states(store.plans.list_plans("default", limit=1))[0]
+    state = grids.states(shared.plans.list_plans("default", limit=1))[0]
     assert (state.status, state.reason) == ("failed", "its pose grid was begun 5 times and never finished")
     # The next start tries again.
-    store.plans.clear_failures()
+    shared.plans.clear_failures()
     assert len(grids.compute(record, 1.5).result(30.0).poses) == encoders.embedded
 
 
@@ -326,26 +324,24 @@ def test_lease_is_renewed_during_sampling(bundle: Bundle) -> None:
     assert encoders.embedded == 0
 
 
-def test_overtaken_replica_gives_way(open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
-    store = open_store()
-    grids, record = make_grids(store, grid_lease_s=0.2), _add(store, HALL)
+def test_overtaken_replica_gives_way(shared: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
+    grids, record = make_grids(shared, grid_lease_s=0.2), _add(shared, HALL)
     key = grids.key(record.revision_id, 1.5)
     future = _begun(encoders, grids, record)
-    wait_for(lambda: store.leases.claim(key, "another replica", 60.0) is not None)
+    wait_for(lambda: shared.leases.claim(key, "another replica", 60.0) is not None)
     encoders.go_on.set()
     wait_for(lambda: len(grids._jobs.remote()) == 1)
     assert encoders.embedded < 1521
     grid = build_grid(HALL, encoders.layouts, step_m=0.5, camera_height_m=1.5)
-    assert store.grids.put(key, grid, keep=8, always_keep_mm=1500)
+    assert shared.grids.put(key, grid, keep=8, always_keep_mm=1500)
     wait_for(lambda: _looked(grids) or future.done())
     np.testing.assert_array_equal(future.result().profile_m, grid.profile_m)
 
 
 def test_remote_deletion_cancels_the_grid(
-    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+    open_store: OpenStore, shared: Store, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
-    store = open_store()
-    grids, record = make_grids(store, grid_lease_s=0.1), _add(store, HALL)
+    grids, record = make_grids(shared, grid_lease_s=0.1), _add(shared, HALL)
     future = _begun(encoders, grids, record)
     assert open_store().plans.delete("default", "p")
     encoders.go_on.set()
@@ -374,13 +370,10 @@ def test_work_of_stopped_replica_is_taken_over(
     assert grids.cache.find(grids.key(record.revision_id, 1.5)) is not None
 
 
-def test_unqueued_plans_count_as_preparing(
-    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
-) -> None:
-    store = open_store()
+def test_unqueued_plans_count_as_preparing(shared: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
     for number in range(20):
-        _add(store, plan_id=f"plan {number}")
-    grids = make_grids(store)
+        _add(shared, plan_id=f"plan {number}")
+    grids = make_grids(shared)
     encoders.go_on.clear()
     # Sixteen are queued at a time, and the rest is counted.
     assert grids.queue_missing()
@@ -388,12 +381,12 @@ def test_unqueued_plans_count_as_preparing(
     encoders.go_on.set()
     wait_for(lambda: grids.pending == 0)
     # Grids that another replica computes, dead or alive, count as well.
-    key = grids.key(store.grids.missing("m1", 0.5, 1)[0].revision_id, 1.5)
-    store.leases.claim(key, "another replica", 60.0)
+    key = grids.key(shared.grids.missing("m1", 0.5, 1)[0].revision_id, 1.5)
+    shared.leases.claim(key, "another replica", 60.0)
     grids.queue_missing()
     assert (grids.pending, grids.preparing) == (3, 4)
     wait_for(lambda: grids.pending == 0)
-    store.leases.release(key, "another replica")
+    shared.leases.release(key, "another replica")
     grids.queue_missing()
     wait_for(lambda: grids.pending == 0)
     grids.queue_missing()
@@ -418,10 +411,8 @@ def test_sweep_cancels_revisions_replaced_remotely(
 ) -> None:
     store, elsewhere = open_store(), open_store()
     grids = make_grids(store)
-    encoders.go_on.clear()
     # The first grid has begun, the others wait.
-    futures = [grids.compute(_add(store, HALL), 1.5)]
-    wait_for(lambda: encoders.embedded > 0)
+    futures = [_begun(encoders, grids, _add(store, HALL))]
     for _ in range(3):
         record = elsewhere.plans.add_revision("default", "p", NewPlan(HALL, Original(b"")), keep=5)
         futures.append(grids.compute(record, 1.5))
@@ -432,13 +423,12 @@ def test_sweep_cancels_revisions_replaced_remotely(
     assert encoders.embedded <= 256 + 1521
 
 
-def test_remote_job_of_replaced_revision_ends(open_store: OpenStore, make_grids: MakeGrids) -> None:
-    store = open_store()
-    grids, record = make_grids(store), _add(store)
-    store.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
+def test_remote_job_of_replaced_revision_ends(shared: Store, make_grids: MakeGrids) -> None:
+    grids, record = make_grids(shared), _add(shared)
+    shared.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
     future = grids.compute(record, 1.5)
     wait_for(lambda: len(grids._jobs.remote()) == 1)
-    store.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
+    shared.plans.add_revision("default", "p", NewPlan(PLAN, Original(b"")), keep=5)
     grids.cancel(record.revision_id)
     grids.poll_remote()
     assert isinstance(future.exception(30.0), PlanNotReadyError)

@@ -161,19 +161,13 @@ def test_compass_is_used_if_north_is_known(client: httpx.Client, north: str, com
     assert poses(given) == ("given", found)
 
 
-def test_requested_heading_takes_precedence(client: httpx.Client, north: str) -> None:
-    fields = {"refine": "none", "heading_deg": 200}
-    with_compass = poses(localise(client, north, with_packet(PoseHeadingDegrees=10), **fields))
-    assert with_compass[0] == "given"
-    assert with_compass == poses(localise(client, north, with_packet(), **fields))
+def test_compass_is_not_used_beside_a_heading_or_without_north(client: httpx.Client, north: str, flat: str) -> None:
+    for plan_id, fields, source in ((north, {"heading_deg": 200}, "given"), (flat, {}, "searched")):
+        with_compass = poses(localise(client, plan_id, with_packet(PoseHeadingDegrees=10), refine="none", **fields))
+        assert with_compass[0] == source
+        assert with_compass == poses(localise(client, plan_id, with_packet(), refine="none", **fields))
 
 
 @pytest.mark.parametrize("properties", [{}, {"PoseHeadingDegrees": 400}, {"InitialViewHeadingDegrees": 90}])
 def test_heading_is_searched_without_a_compass(client: httpx.Client, north: str, properties: dict[str, object]) -> None:
     assert poses(localise(client, north, with_packet(**properties), refine="none"))[0] == "searched"
-
-
-def test_heading_is_searched_without_north(client: httpx.Client, flat: str) -> None:
-    with_compass = poses(localise(client, flat, with_packet(PoseHeadingDegrees=10), refine="none"))
-    assert with_compass[0] == "searched"
-    assert with_compass == poses(localise(client, flat, with_packet(), refine="none"))

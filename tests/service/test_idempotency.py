@@ -38,7 +38,7 @@ from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY, KEPT_ANSWERS
 from service.uploaded_file import UploadedFile
-from tests.service.conftest import FLAT, StartApp, assert_problem, connection_to, localise, upload, wait_for
+from tests.service.conftest import FLAT, HALL, StartApp, assert_problem, connection_to, localise, upload, wait_for
 from tests.service.test_store import _add
 
 CONTENT = json.dumps(FLAT).encode()
@@ -200,9 +200,8 @@ def test_upload_after_disconnect_is_executed_once(own: httpx.Client) -> None:
 
 
 def test_query_after_disconnect_can_be_repeated_at_once(start_app: StartApp, tmp_path: Path, sphere: bytes) -> None:
-    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
-        plan_id = upload(client, hall, wait=False)
+        plan_id = upload(client, HALL, wait=False)
         # The query waits for the plan's grid.
         form: Any = {"data": {"floorplan_id": plan_id, "refine": "none"}, "files": {"photo": ("p.jpg", sphere)}}
         query = client.build_request("POST", "/localise", headers=_keyed("a"), **form)

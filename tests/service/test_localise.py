@@ -297,16 +297,8 @@ def test_hanging_database_does_not_block_known_plans(
             # Not every query waits 4 s, and waiting queries leave threads free.
             assert monotonic() - begin < 28.0
             assert_problem(localise(client, unknown, sphere, refine="none"), 503, "store-unavailable")
-            assert_problem(
-                client.post(
-                    "/localise",
-                    data={"floorplan_id": known},
-                    files={"photo": ("p.jpg", sphere, "image/jpeg")},
-                    headers={"Idempotency-Key": "silent"},
-                ),
-                503,
-                "store-unavailable",
-            )
+            form, headers = {"data": {"floorplan_id": known}, "files": {"photo": sphere}}, {"Idempotency-Key": "silent"}
+            assert_problem(client.post("/localise", headers=headers, **form), 503, "store-unavailable")
         wait_for(lambda: localise(client, unknown, sphere, refine="none").status_code == 404)
 
 

@@ -173,12 +173,10 @@ def test_file_as_body_is_detected_by_content(client: httpx.Client) -> None:
 def test_several_levels_require_the_level_option(client: httpx.Client) -> None:
     collection = json.loads(plan_file("geojson"))
     upper = json.loads(json.dumps(collection["features"]))
-    for feature in collection["features"]:
-        feature["properties"]["level"] = "0"
-        feature.pop("id", None)
-    for feature in upper:
-        feature["properties"]["level"] = "1"
-        feature.pop("id", None)
+    for level, features in (("0", collection["features"]), ("1", upper)):
+        for feature in features:
+            feature["properties"]["level"] = level
+            feature.pop("id", None)
     collection["features"] += upper
     content = json.dumps(collection).encode()
     problem = assert_problem(send_plan(client, content), 422, "several-levels")

@@ -300,25 +300,14 @@ def test_invalid_keys_get_the_same_message(guarded: Guarded) -> None:
     assert len({guarded.send("GET", "/limits", key).json()["detail"] for key in keys.values()}) == 1
 
 
-@pytest.mark.parametrize(
-    ("values", "accepted"),
-    [
-        (["Bearer {key}"], True),
-        (["bearer  {key}"], True),
-        (["{key}"], False),
-        (["Basic {key}"], False),
-        (["Bearer {key}x"], False),
-        (["Bearer {key} {key}"], False),
-        (["Bearer"], False),
-        ([""], False),
-        ([], False),
-        (["Bearer {key}", "Bearer {key}"], False),
-    ],
-)
-def test_only_one_whole_authorization_header_counts(values: list[str], accepted: bool) -> None:
+def test_only_one_whole_authorization_header_counts() -> None:
     key_id, secret = "0123456789abcdef" * 2, new_secret()
-    parsed = parse_authorization([value.format(key=key_text(key_id, secret)) for value in values])
-    assert parsed == (PresentedKey(key_id, hash_of(secret)) if accepted else None)
+    key = key_text(key_id, secret)
+    for value in (f"Bearer {key}", f"bearer  {key}"):
+        assert parse_authorization([value]) == PresentedKey(key_id, hash_of(secret)), value
+    for value in (key, f"Basic {key}", f"Bearer {key}x", f"Bearer {key} {key}", "Bearer", ""):
+        assert parse_authorization([value]) is None, value
+    assert parse_authorization([]) is parse_authorization(2 * [f"Bearer {key}"]) is None
 
 
 def test_secrets_are_random_256_bits() -> None:
@@ -570,26 +559,12 @@ def test_busy_database_does_not_extend_the_key_cache(cached: CachedKey) -> None:
 # --- Without keys -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("server", "local"),
-    [
-        (("127.0.0.1", 8000), True),
-        (("127.8.9.10", 8000), True),
-        (("::1", 8000), True),
-        (("::ffff:127.0.0.1", 8000), True),
-        (("/run/lalaloc.sock", None), True),
-        (None, True),
-        (("0.0.0.0", 8000), False),
-        (("::", 8000), False),
-        (("192.168.1.7", 8000), False),
-        (("fe80::1%eth0", 8000), False),
-        (("::ffff:10.0.0.1", 8000), False),
-        (("", 8000), False),
-        (("example.org", 8000), False),
-    ],
-)
-def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | None, local: bool) -> None:
-    assert is_local(server) == local
+def test_loopback_and_unix_sockets_are_local() -> None:
+    loopback = [(host, 8000) for host in ("127.0.0.1", "127.8.9.10", "::1", "::ffff:127.0.0.1")]
+    for server in (*loopback, ("/run/lalaloc.sock", None), None):
+        assert is_local(server), server
+    for host in ("0.0.0.0", "::", "192.168.1.7", "fe80::1%eth0", "::ffff:10.0.0.1", "", "example.org"):
+        assert not is_local((host, 8000)), host
 
 
 @pytest.mark.parametrize(

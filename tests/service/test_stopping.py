@@ -21,7 +21,7 @@ import pytest
 from ezdxf.filemanagement import new as new_dxf
 
 from tests.importers.conftest import dxf_file
-from tests.service.conftest import FLAT, assert_problem, tiled_plan, upload, wait_for
+from tests.service.conftest import FLAT, HALL, assert_problem, tiled_plan, upload, wait_for
 from tests.service.test_process import ROOT, alive, children, environment_of
 
 
@@ -193,10 +193,9 @@ def test_stop_succeeds_after_hung_up_reads(tiny_bundle: Path, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_event_streams_do_not_delay_the_stop(tiny_bundle: Path, tmp_path: Path) -> None:
-    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
     settings = {"GRID_STEP_M": "0.1", "MAX_GRID_POSES": "1000000"}
     with running_service(tiny_bundle, tmp_path / "data", **settings) as service:
-        plan_id = upload(service.client, hall, wait=False)
+        plan_id = upload(service.client, HALL, wait=False)
         with service.client.stream("GET", f"/floorplans/{plan_id}/events") as response:
             lines = response.iter_lines()
             assert "event: progress" in lines

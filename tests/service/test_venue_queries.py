@@ -184,16 +184,13 @@ def test_replaced_plan_is_chosen_by_its_new_revision(
         assert document_of(ask(client, venue_id, sphere, refine="none"))["floorplan_id"] == replaced["floorplan_id"]
 
 
+NEVER = "0" * 32
 BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
     "neither": ({}, "floorplan_id", "is missing"),
-    "both": (
-        {"venue_id": "0" * 32, "floorplan_id": "0" * 32},
-        "floorplan_id",
-        "set floorplan_id or venue_id, not both",
-    ),
-    "level": ({"floorplan_id": "0" * 32, "level": "1"}, "floorplan_id", "level needs venue_id"),
-    "level of none": ({"venue_id": "0" * 32, "level": "1001"}, "level", "at most 1000"),
-    "posterior": ({"venue_id": "0" * 32, "include": "posterior"}, "include", "one plan"),
+    "both": ({"venue_id": NEVER, "floorplan_id": NEVER}, "floorplan_id", "set floorplan_id or venue_id, not both"),
+    "level": ({"floorplan_id": NEVER, "level": "1"}, "floorplan_id", "level needs venue_id"),
+    "level of none": ({"venue_id": NEVER, "level": "1001"}, "level", "at most 1000"),
+    "posterior": ({"venue_id": NEVER, "include": "posterior"}, "include", "one plan"),
 }
 
 
@@ -209,15 +206,15 @@ def test_query_needs_exactly_one_of_plan_and_venue(
 
 def test_sequence_needs_exactly_one_of_plan_and_venue(client: httpx.Client, sphere: bytes) -> None:
     files = 2 * [("photo", ("p.jpg", sphere, "image/jpeg"))]
-    for fields, kind in (({}, "is missing"), ({"venue_id": "0" * 32, "floorplan_id": "0" * 32}, "not both")):
+    for fields, kind in (({}, "is missing"), ({"venue_id": NEVER, "floorplan_id": NEVER}, "not both")):
         response = client.post("/localise/sequence", data=fields | {"motion": "turn"}, files=files)
         assert kind in assert_problem(response, 422, "invalid-request")["detail"]
-    unknown = client.post("/localise/sequence", data={"venue_id": "0" * 32, "motion": "turn"}, files=files)
+    unknown = client.post("/localise/sequence", data={"venue_id": NEVER, "motion": "turn"}, files=files)
     assert_problem(unknown, 404, "unknown-venue")
 
 
 def test_unsearchable_venue_is_an_error(client: httpx.Client, sphere: bytes) -> None:
-    assert_problem(ask(client, "0" * 32, sphere), 404, "unknown-venue")
+    assert_problem(ask(client, NEVER, sphere), 404, "unknown-venue")
     assert_problem(ask(client, "no id", sphere), 404, "unknown-venue")
     problem = assert_problem(ask(client, venue_of(client), sphere), 409, "venue-unsearchable")
     assert "no floor plans" in problem["detail"]
