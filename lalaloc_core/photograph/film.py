@@ -401,6 +401,9 @@ def _checked(capture: cv2.VideoCapture, kind: str, limits: FilmLimits) -> float:
             f"the film has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
             "(max_film_pixels): record in 4K or less"
         )
+    across, down = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    if across > 0.0 and down > 0.0 and across != down:
+        raise InvalidFilmError(f"the film's pixels are {across:g}:{down:g}, not square: export it with square pixels")
     rate, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
     claimed_s = frames / rate if rate > 0.0 and frames > 0.0 and math.isfinite(rate) else 0.0
     if claimed_s > limits.max_s + 1.0:

@@ -63,6 +63,12 @@ def test_bars_above_and_below_a_film_are_cut_off(tmp_path: Path, kind: str) -> N
 
 
 @needs_ffmpeg
+def test_film_whose_pixels_are_not_square_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidFilmError, match="4:3, not square"):
+        read_film(encode(turn()[:10], tmp_path / "wide.mp4", *H264, "-vf", "setsar=4/3"))
+
+
+@needs_ffmpeg
 def test_film_that_is_cut_off_is_named(tmp_path: Path) -> None:
     content = encode(turn()[:46], tmp_path / "whole.mp4", *H264, "-movflags", "+faststart")
     assert "of 4.6 s, as if cut off" in read_film(content[: len(content) // 2]).warnings[0]
