@@ -37,6 +37,7 @@ from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 from lalaloc_core.importers.formats import dxf, pdf_page
 from lalaloc_core.importers.picture import lettering, wall_mask
 from lalaloc_core.importers.picture.ink import read_ink
+from lalaloc_core.importers.picture.occupancy import sketch_map
 from tests.importers.conftest import EXTERNAL_ENTITY, FLAT, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture, zip_file
 from tests.painted import picture_file
 from tests.strategies import present
@@ -440,3 +441,12 @@ def test_outlines_of_a_picture_of_noise_are_counted_before_they_are_polygons(mon
     monkeypatch.setattr(wall_mask, "_MAX_OUTLINES", 1000)
     with pytest.raises(InvalidFloorPlanError, match=r"\d+ outlines; the limit is 1000"):
         wall_mask.wall_polygons(walls, ink, lambda: None)
+
+
+def test_map_of_many_rooms_ends_with_the_time() -> None:
+    tones = np.array([[230, 120, 110], [110, 160, 230]], np.uint8)[np.indices((60, 60)).sum(axis=0) % 2]
+    board = np.pad(np.kron(tones, np.ones((8, 8, 1), np.uint8)), ((40, 40), (40, 40), (0, 0)), constant_values=255)
+    # Each reading of the clock is a second: the checks within the rooms' loop count.
+    budget = Budget(ImportLimits(max_import_s=100.0), itertools.count(0.0).__next__)
+    with pytest.raises(InvalidFloorPlanError, match="more than 100 s of CPU time"):
+        sketch_map(board, 0.5, ReportBuilder(), budget)

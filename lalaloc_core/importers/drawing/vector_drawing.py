@@ -59,7 +59,7 @@ class Paint:
 
     @property
     def is_visible(self) -> bool:
-        """Whether it does not show most of what is below it."""
+        """Whether it can be seen."""
         return self.opacity >= _VISIBLE
 
     @property

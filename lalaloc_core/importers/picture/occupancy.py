@@ -86,7 +86,7 @@ def sketch_map(
     ground &= _near(~_near(~ground, _OUTER_M / cell_m), _OUTER_M / cell_m)
     label = np.where(label >= first, label, 0)
     walls = _without_specks(_lines_around(ground, label > 0, small, tones, cell_m), frame) > 0
-    areas, zones_m2 = _areas(label, walls, cell_m)
+    areas, zones_m2 = _areas(label, walls, cell_m, budget)
     free = areas > 0
     between = _closed(free, _GAP_M / cell_m) & ~free
     thick_m = [usual_thickness(mask.astype(np.uint8)) * cell_m for mask in (between, walls)]
@@ -124,6 +124,7 @@ def sketch_map(
     inner = ((lowest != highest) & (lowest > 0) & ~_near(walls, _BLURRED)).astype(np.uint8)
     count, found = cv2.connectedComponents(inner, connectivity=8)
     for number in range(1, count):
+        budget.check_time()
         row, column = np.nonzero(np.asarray(found) == number)
         places = np.column_stack([column + 0.5, rows - row - 0.5]) * cell_m
         along = places[:, np.ptp(places, axis=0).argmax()]
@@ -187,7 +188,7 @@ def _lines_around(
 
 
 def _areas(
-    label: np.ndarray, walls: Bool[np.ndarray, "h w"], cell_m: float
+    label: np.ndarray, walls: Bool[np.ndarray, "h w"], cell_m: float, budget: Budget
 ) -> tuple[Int[np.ndarray, "h w"], list[float]]:
     """Return the number of each cell's room, 0 without, and the sizes (m²) of zones and carpets inside rooms."""
     areas, zones_m2 = np.zeros(label.shape, np.int32), list[float]()
@@ -198,11 +199,13 @@ def _areas(
         is_room[0] = False
         areas = np.maximum(areas, np.where(is_room, areas.max() + np.cumsum(is_room), 0)[np.asarray(found)])
     for number in range(1, int(areas.max()) + 1):
+        budget.check_time()
         room = (areas == number).astype(np.uint8)
         outlines, _ = cv2.findContours(room, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         inside = cv2.drawContours(np.zeros_like(room), outlines, -1, 1, cv2.FILLED) & ~room
         count, found, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=4)
         for hole in range(1, count):
+            budget.check_time()
             part, area_m2 = np.asarray(found) == hole, float(stats[hole, cv2.CC_STAT_AREA]) * cell_m**2
             if area_m2 < _ZONE_M2 and walls[part & _near(~part, _BLURRED)].mean() < _OPEN:
                 zones_m2 += [area_m2] if areas[part].any() else []
