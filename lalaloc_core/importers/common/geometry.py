@@ -125,8 +125,7 @@ def _side(
     start: Float[np.ndarray, "k 2"], end: Float[np.ndarray, "k 2"], point: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "k"]:
     """Return the sign of the side of a line that a point lies on."""
-    along, away = end - start, point - start
-    return np.sign(along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0])
+    return np.sign(cross(end - start, point - start))
 
 
 def check_coordinates(points: Float[np.ndarray, "..."], where: str) -> None:
@@ -222,9 +221,9 @@ def label_position(room: shapely.Polygon) -> tuple[float, float]:
     return point_xy(shapely.maximum_inscribed_circle(room, 0.01).coords[0])
 
 
-def cross(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
-    """Return the third component of the cross product; it is positive where b points to the left of a."""
-    return float(a[0] * b[1] - a[1] * b[0])
+def cross(a: Float[np.ndarray, "*n 2"], b: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*n"]:
+    """Return the third component of cross products; it is positive where b points to the left of a."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def point_xy(point: Float[np.ndarray, "2"] | tuple[float, ...]) -> tuple[float, float]:

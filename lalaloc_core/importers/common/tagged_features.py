@@ -22,7 +22,7 @@ from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, room_typ
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
 from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions, to_number
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.map_projection import ORDERED, projection
 from lalaloc_core.importers.common.opening_placement import WallLines
@@ -164,10 +164,7 @@ def _level_names(text: str) -> list[str]:
 
 
 def _level(key: str) -> Level:
-    try:
-        number = float(key)
-    except ValueError:
-        number = math.nan
+    number = to_number(key)
     return Level(key, number if math.isfinite(number) else None)
 
 

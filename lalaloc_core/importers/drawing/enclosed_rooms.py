@@ -16,7 +16,14 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.geometry import WallAreas, check_network, distinct, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import (
+    WallAreas,
+    check_network,
+    cross,
+    distinct,
+    point_xy,
+    polygons_from_geometry,
+)
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, WallConfig
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
@@ -200,7 +207,7 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
     steps = np.roll(points, -1, axis=0) - points
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / np.maximum(lengths, 1e-12)[:, None]
-    turns = _cross(directions, np.roll(directions, -1, axis=0))
+    turns = cross(directions, np.roll(directions, -1, axis=0))
     is_end = (lengths >= config.thinnest) & (lengths <= max(config.thickest, config.widest_pier))
     found = []
     for i in np.flatnonzero(is_end & (np.minimum(np.roll(turns, 1), turns) >= _CORNER)).tolist():
@@ -283,7 +290,7 @@ def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[
         steps = ends[beside] - ends[index]
         apart = np.linalg.norm(steps, axis=1)
         across = np.abs(steps @ directions[index]) < 0.25 * np.maximum(apart, 1e-12)
-        parallel = np.abs(_cross(directions[beside], directions[index][None])) < 0.1
+        parallel = np.abs(cross(directions[beside], directions[index][None])) < 0.1
         partners = np.flatnonzero((apart > config.thinnest) & (apart <= config.thickest) & across & parallel)
         if len(partners):
             partner = beside[partners[np.argmin(apart[partners])]]
@@ -369,7 +376,3 @@ def _is_wall(face: shapely.Polygon, config: WallConfig) -> bool:
     usual = 2.0 * face.area / face.length
     is_slim = face.length >= _LONG_M and usual <= _USUAL * config.thickest
     return is_slim and face.buffer(-0.5 * _WIDEST * config.thickest).is_empty
-
-
-def _cross(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "n"]:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -6,6 +6,7 @@ ways along them. https://wiki.openstreetmap.org/wiki/Simple_Indoor_Tagging
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -18,6 +19,7 @@ from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions
 from lalaloc_core.importers.common.bounded_files import read_xml
 from lalaloc_core.importers.common.geometry import check_network, polygons_from_geometry
+from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.tagged_features import Feature, import_features
 
 _Position = tuple[float, float]
@@ -57,14 +59,11 @@ def _from_xml(content: bytes, budget: Budget) -> list[dict[str, Any]]:
 
 def _decimal(element: Element, key: str) -> float | None:
     text = element.get(key)
-    if text is None:
-        return None
-    try:
-        return float(text)
-    except ValueError as error:
+    if text is not None and math.isnan(to_number(text)):
         raise InvalidFloorPlanError(
             f"{element.tag} {str(element.get('id'))[:20]} has {key} '{text[:50]}'; it must be a number of degrees"
-        ) from error
+        )
+    return None if text is None else to_number(text)
 
 
 def _features(elements: Sequence[Mapping[str, Any]], budget: Budget) -> Iterator[Feature]:

@@ -24,6 +24,7 @@ from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
@@ -273,10 +274,7 @@ def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
-    try:
-        value = float(root.get(_SCALE_ATTRIBUTE, ""))
-    except ValueError:
-        return None
+    value = to_number(root.get(_SCALE_ATTRIBUTE))
     return (value, _SCALE_ATTRIBUTE) if 1e-6 <= value <= 1e3 else None
 
 
@@ -367,10 +365,8 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         elif not len(points):
             builder.use(layer, "ignored (coordinates out of range)")
     if shells:
-        is_wall, is_nonzero = (
-            fill is not None and is_filled and fill.is_dark,
-            element.values.get("fill-rule") in _NONZERO,
-        )
+        is_wall = fill is not None and is_filled and fill.is_dark
+        is_nonzero = element.values.get("fill-rule") in _NONZERO
         like = Area(shells[0], layer, role, _name_of(element, context), context.kind, is_wall, width)
         count = drawing.add_areas(shells, like, fill, is_nonzero=is_filled and is_nonzero, has_line=True)
         builder.use(layer, f"areas: {role or 'possible rooms'}", count)

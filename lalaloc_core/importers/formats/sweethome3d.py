@@ -23,6 +23,7 @@ from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBu
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, enclose
 
@@ -188,8 +189,5 @@ def _box(piece: Element) -> shapely.Polygon | None:
 
 def _number(element: Element, key: str, default: float = math.nan) -> float:
     """Return an attribute as a number, or the default if it is missing or none."""
-    try:
-        value = float(element.get(key) or default)
-    except ValueError:
-        return default
+    value = to_number(element.get(key))
     return value if math.isfinite(value) else default
