@@ -228,7 +228,7 @@ def test_open_polyline_in_surveyed_coordinates_stays_open():
     for ring, close in ((outer, True), (inner, False)):
         points = [(east + x, north + y) for x, y in ring]
         space.add_lwpolyline(points, close=close, dxfattribs={"layer": "WALL"})
-    drawing = dxf._read_drawing(document, ImportOptions(), ReportBuilder(), Budget())
+    drawing = joined(dxf._read_drawings(document, ImportOptions(), ReportBuilder(), Budget()).values())
     assert [stroke.line.length for stroke in drawing.strokes] == pytest.approx([1.6 + 9.6 + 7.6 + 9.6 + 2.0])
     assert [area.shape.area for area in drawing.areas] == pytest.approx([80.0])
 
@@ -238,7 +238,7 @@ def test_polyline_with_equal_ends_is_closed_at_any_coordinates():
         document = new_dxf()
         ring = [(0, 0), (4, 0), (4, 3), (0, 3), (0, 1e-6)]
         document.modelspace().add_lwpolyline([(origin + x, origin + y) for x, y in ring])
-        drawing = dxf._read_drawing(document, ImportOptions(), ReportBuilder(), Budget())
+        drawing = joined(dxf._read_drawings(document, ImportOptions(), ReportBuilder(), Budget()).values())
         assert [area.shape.area for area in drawing.areas] == pytest.approx([12.0])
 
 

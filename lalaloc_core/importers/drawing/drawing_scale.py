@@ -254,23 +254,32 @@ def check_areas(
     is_sure, length = len(agreeing) >= _MIN_AREAS, math.sqrt(middle)
     # Without sizes that agree, the scale is believed.
     usual, tolerance = (middle, _AREA_TOLERANCE) if is_sure else (1.0, 0.1)
-    against = [
+    against = {
         f"{areas[index][0]:.4g} m² was read as the area of a room of {areas[index][1]:.1f} m²"
-        + (f" ('{rooms[index].name}')" if rooms[index].name else "")
+        + (f" ('{rooms[index].name}')" if rooms[index].name else ""): rooms[index].shape
         for index, share in shares.items()
         if abs(share / usual - 1.0) > tolerance
-    ]
+    }
     for index, written in enumerate([*texts, outside]):
         # Open rooms have the sizes of their parts; a single size that does not fit is a contradiction.
         unused = [f"'{text[:50]}'" for text in written if index not in areas and _has_size(text)]
         reason = "does not fit its room" if len(unused) == 1 else "is one of several in a room"
         reason = reason if index < len(rooms) else "is in no room"
         lines = [f"{text} was read as the size of a room, but {reason}" for text in unused]
-        (against if len(lines) == 1 and index < len(rooms) else builder.rejected_texts).extend(lines)
+        placed = dict.fromkeys(lines, rooms[index].shape) if index < len(rooms) else {}
+        builder.places |= placed
+        if len(placed) == 1:
+            against |= placed
+        else:
+            builder.rejected_texts += lines
     if not is_sure:
         builder.rejected_texts += against
+        builder.places |= against
         return
-    builder.warnings += [f"{text}, against {len(agreeing)} sizes that agree; check its walls" for text in against]
+    agreed = f"against {len(agreeing)} sizes that agree; check its walls"
+    against = {f"{text}, {agreed}": place for text, place in against.items()}
+    builder.warnings += against
+    builder.places |= against
     if abs(length - 1.0) <= _TOLERANCE:
         builder.notes.append(f"the areas written in {len(shares)} rooms agree with the scale")
     measured = builder.metres_per_unit / length, f"the areas and sides written in {len(agreeing)} rooms"

@@ -22,7 +22,15 @@ from lalaloc_core.importers.common.geometry import check_overlaps, polygons_from
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
 from lalaloc_core.importers.drawing.drawn_openings import cut_painted, drawn_panes
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose, explained_size
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, clusters, split_lines
+from lalaloc_core.importers.drawing.vector_drawing import (
+    Area,
+    Drawing,
+    Stroke,
+    Swing,
+    clusters,
+    outline_of,
+    split_lines,
+)
 
 _MAX_NAMED = 8
 _NAMED = "the walls"
@@ -231,7 +239,7 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
 
 def _drawn_thick(drawing: Drawing, role: Role | None, bounds: RoomBounds) -> list[tuple[shapely.Polygon, int]]:
     """Return what lines of a thick pen cover, of one role, with their places in the order of painting."""
-    drawn = [item for item in (*drawing.strokes, *drawing.areas) if item.role == role and _is_thick(item, bounds)]
+    drawn = [item for item in drawing.lines if item.role == role and _is_thick(item, bounds)]
     return [(part, item.order) for item in drawn for part in polygons_from_geometry(_covered(item, bounds))]
 
 
@@ -239,8 +247,7 @@ def _covered(item: Stroke | Area, bounds: RoomBounds) -> BaseGeometry:
     """Return what a line of a thick pen covers; the outline of a wall or pillar is its faces, whatever the pen."""
     if isinstance(item, Area) and not _is_outline(item, bounds):
         return item.shape
-    line = item.line if isinstance(item, Stroke) else item.shape.boundary
-    return line.buffer(0.5 * item.width, cap_style="square", join_style="mitre")
+    return outline_of(item).buffer(0.5 * item.width, cap_style="square", join_style="mitre")
 
 
 def _is_thick(drawn: Stroke | Area, bounds: RoomBounds) -> bool:

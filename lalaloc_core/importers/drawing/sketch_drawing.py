@@ -42,6 +42,7 @@ from lalaloc_core.importers.drawing.vector_drawing import (
     clusters,
     split_lines,
     without_frames,
+    without_plot,
 )
 
 # Letters of a line of prose, and the least number of such lines on a page of text.
@@ -132,6 +133,12 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             f"a rectangle of {long:.1f} m x {short:.1f} m is taken for the sheet's frame, and was left out with the "
             "lines beside it; if it is a wall, set crop to the walls"
         )
+    drawing, plot = without_plot(drawing)
+    if plot is not None:
+        builder.unsure.append(
+            f"an outline of {plot.area:.0f} m² around all walls, of one line, is taken for the plot and was left out; "
+            "if it is a wall, draw both of its faces, or write the name of its room beside it"
+        )
     drawing = with_half_open_doors(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
@@ -191,6 +198,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
                 f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
                 f"window; it is taken for a {kind}"
             )
+            builder.places[builder.unsure[-1]] = line
     budget.check_time()
     return sketch
 
@@ -254,11 +262,10 @@ def name_rooms(
     Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
     """
     texts, outside = texts_of_rooms([area.shape for area in shapes], letterings)
-    lost = [found for found in outside if drawn is not None and drawn.covers(shapely.Point(found.position))]
-    if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_types)):
-        builder.warnings.append(
-            f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
-        )
+    for found in _names(outside):
+        if drawn is not None and found.room_types and drawn.covers(place := shapely.Point(found.position)):
+            line = f"no room was found where '{found.text}' is written; close its walls, or draw the room"
+            builder.warnings, builder.places[line] = [*builder.warnings, line], place
     rooms = []
     for area, inside in zip(shapes, texts, strict=True):
         words = _names(inside)
@@ -273,6 +280,7 @@ def name_rooms(
                 f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
                 "between them"
             )
+            builder.places[builder.warnings[-1]] = area.shape
     check_areas(rooms, [[raw.text for raw in inside] for inside in texts], [raw.text for raw in outside], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 import shapely
@@ -25,9 +26,11 @@ from lalaloc_core.importers.common.geometry import (
     extent_of,
     lines_of,
     point_xy,
+    polygons_from_geometry,
     segments_of,
     side_lengths,
 )
+from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import SketchedFixture
 
 # Of 255: fills of lower luminance can be walls, channels of white are not lower, and glass is bluer than red by this.
@@ -169,6 +172,11 @@ class Drawing:
         return len(self.areas) + len(self.strokes) + len(self.patches)
 
     @property
+    def lines(self) -> list[Area | Stroke]:
+        """Areas and lines, whose outlines can be walls."""
+        return [*self.areas, *self.strokes]
+
+    @property
     def shapes(self) -> list[BaseGeometry]:
         """Areas and lines."""
         return [*(area.shape for area in self.areas), *(stroke.line for stroke in self.strokes)]
@@ -235,6 +243,17 @@ class Drawing:
         )
 
 
+def outline_of(item: Area | Stroke) -> BaseGeometry:
+    """Return a line, or the boundary of an area."""
+    return item.line if isinstance(item, Stroke) else item.shape.boundary
+
+
+def joined(drawings: Iterable[Drawing]) -> Drawing:
+    """Return drawings as one."""
+    kinds = zip(*(vars(drawing).values() for drawing in drawings), strict=True)
+    return Drawing(*(list(chain.from_iterable(items)) for items in kinds))
+
+
 def without_frames(
     drawing: Drawing, check_time: Callable[[], None], most: int = 4
 ) -> tuple[Drawing, list[BaseGeometry]]:
@@ -243,8 +262,8 @@ def without_frames(
     A frame is a rectangle around most lines, which are away from it, of a sheet's proportions or with a title. Up to
     `most` frames around each other are found. `check_time` raises an exception to stop.
     """
-    items = [*drawing.areas, *drawing.strokes]
-    lines = [item.line if isinstance(item, Stroke) else item.shape.boundary for item in items]
+    items = drawing.lines
+    lines = list(map(outline_of, items))
     if not items or not most:
         return drawing, []
     tree, whole = shapely.STRtree(lines), shapely.box(*shapely.total_bounds(lines))
@@ -275,6 +294,31 @@ def without_frames(
             found, frames = without_frames(replace(drawing, areas=areas, strokes=strokes), check_time, most - 1)
             return found, [box, *frames]
     return drawing, []
+
+
+def without_plot(drawing: Drawing) -> tuple[Drawing, shapely.Polygon | None]:
+    """Return a drawing in metres without the outline of the plot around its walls, and this outline; None without one.
+
+    It is one thin line around all others, away from them and from names of rooms; without names, walls have two faces.
+    """
+    light = [item for item in drawing.lines if not getattr(item, "is_dark", False) and item.role in (None, "wall")]
+    thin = [item for item in light if item.width < ROOM_BOUNDS.thick_m[0]]
+    faces = polygons_from_geometry(shapely.polygonize(shapely.get_parts(list(map(outline_of, thin))).tolist()))
+    plot = shapely.Polygon(max(faces, key=lambda face: face.envelope.area, default=shapely.Polygon()).exterior)
+    edge = plot.exterior.buffer(_ON_BOX_M)
+    own = {id(item) for item in thin if edge.covers(outline_of(item))}
+    rest = [item for item in drawing.lines if id(item) not in own]
+    walls = shapely.GeometryCollection(list(map(outline_of, rest)))
+    named = [shapely.Point(text.position) for text in drawing.letterings if set(text.room_types) - {"balcony"}]
+    names = [place for place in named if plot.covers(place)]
+    is_walled = len(light) < len(drawing.lines) or any(
+        face.buffer(-0.5 * ROOM_BOUNDS.walls.thickest).is_empty for face in faces
+    )
+    is_plot = all(map(walls.convex_hull.covers, names)) if names else is_walled
+    if not is_plot or not rest or not plot.buffer(-_BESIDE_FRAME_M).covers(walls):
+        return drawing, None
+    areas, strokes = ([item for item in rest if isinstance(item, kind)] for kind in (Area, Stroke))
+    return replace(drawing, areas=areas, strokes=strokes), plot
 
 
 def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[], None]) -> set[int]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, R
 from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.drawing.storeys import by_storey
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, leaves_of
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, joined, leaves_of
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
@@ -74,6 +74,8 @@ _MAX_BLOCK_DEPTH = 16
 _BYTES_PER_SHAPE = 10
 # Maximum distance of a curve from its polyline, as a share of the drawing's size.
 _SAG = 2e-5
+# Members with a point of an entity, and heights that are told apart.
+_PLACES, _MOST_HEIGHTS = ("start", "center", "insert", "elevation", "vtx0", "location"), 1000
 # Largest relation of the widths of a polyline that are one.
 _SAME_WIDTH = 1.05
 # A polyline is closed if its ends are nearer than this share of its length. The distance to the origin must not matter,
@@ -100,15 +102,16 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     document = _open(content)
     _check_blocks(document, budget)
     builder = ReportBuilder("dxf")
-    drawing = _read_drawing(document, options, builder, budget)
+    drawings: Mapping[float, Drawing] = _read_drawings(document, options, builder, budget)
     if options.crop is not None:
-        drawing = drawing.cropped(options.crop)
-    builder.metres_per_unit, builder.scale_source = find_unit(document, drawing, options, builder, budget)
+        drawings = {height: drawing.cropped(options.crop) for height, drawing in drawings.items()}
+    whole = joined(drawings.values())
+    builder.metres_per_unit, builder.scale_source = find_unit(document, whole, options, builder, budget)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
-    return by_storey(drawing, builder, options, budget, flip_y=options.y_axis == "down")
+    return by_storey(drawings, builder, options, budget, flip_y=options.y_axis == "down")
 
 
 @contextmanager
@@ -211,8 +214,11 @@ def _weight(entity: DXFEntity) -> int:
     return 1
 
 
-def _read_drawing(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
-    drawing = Drawing()
+def _read_drawings(
+    document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget
+) -> dict[float, Drawing]:
+    """Return what is drawn at each height."""
+    drawings: defaultdict[float, Drawing] = defaultdict(Drawing)
     states = (Layer.is_off, Layer.is_frozen, lambda layer: not layer.dxf.plot)
     off, frozen, unplotted = (frozenset(x.dxf.name.casefold() for x in document.layers if state(x)) for state in states)
     low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
@@ -221,7 +227,8 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     missing = _count_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget, frozen):
-        layer = context.layer.casefold()
+        layer, height = context.layer.casefold(), _height(entity)
+        drawing = drawings[height if height in drawings or len(drawings) < _MOST_HEIGHTS else 0.0]
         if layer in off | frozen or entity.dxf.get("invisible", 0):
             builder.use(context.layer, f"ignored ({'layer is off' if layer in off | frozen else 'invisible'})")
         elif layer in unplotted and context.role is None and not options.layers:
@@ -244,13 +251,23 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
                 missing[subject, f" is not read: {_REMEDIES.get(kind, 'explode it (EXPLODE)')}"] += 1
     for (subject, remedy), count in missing.items():
         builder.warnings.append(f"{subject}{f' ({count} times)' if count > 1 else ''}{remedy}")
-    if options.layers and not drawing.areas and not drawing.strokes:
+    if options.layers and not any(drawing.shapes for drawing in drawings.values()):
         available = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
             f"layers is {', '.join(options.layers)[:200]}, but these layers are empty; "
             f"layers of the drawing: {', '.join(repr(layer) for layer in available) or 'none'}"
         )
-    return drawing
+    return drawings
+
+
+def _height(entity: DXFGraphic) -> float:
+    """Return the height of a point of an entity, in the file's unit."""
+    source = (
+        entity.vertices[0] if isinstance(entity, Polyline) and entity.is_3d_polyline and entity.vertices else entity
+    )
+    stated = next((source.dxf.get(key) for key in _PLACES if source.dxf.hasattr(key)), 0.0)
+    height = float(stated if isinstance(stated, float | int) else stated[2])
+    return round(height, 6) if in_range(np.array(height)) else 0.0
 
 
 def _is_dashed(entity: DXFGraphic, context: _Context, document: DxfDocument) -> bool:

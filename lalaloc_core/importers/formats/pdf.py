@@ -56,7 +56,8 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         if found.hidden:
             named = ", ".join(repr(layer) if layer else "one without a name" for layer in found.hidden)
             budget.hints.append(
-                f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan"
+                f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan, "
+                "for screens and for print"
             )
         found.crop, paper, shapes = options.crop, options.crop or page.get_bbox(), found.drawing.shapes
         if options.crop is not None or (shapes and not shapely.covers(shapely.box(*paper), shapes).all()):

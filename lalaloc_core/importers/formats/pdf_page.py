@@ -45,8 +45,9 @@ _BYTES_PER_SHAPE = 4
 # Pixels of the longer side of a page on which hidden objects are looked for, and bytes of the name of a layer.
 _SEEN_PX, _NAME_BYTES = 400, 200
 _LAYER, _USER_UNIT = re.compile(rb"/OC(?:G|MD)\b"), re.compile(rb"/UserUnit\s+(\d{1,5}(?:\.\d{1,9})?)")
-# Members of layers that are shown depending on others.
-_CONDITION, _MARKS_OF_ORDER = re.compile(rb"/(?=(?:VE|OCGs)\s*[\[\d])[VO]"), (codecs.BOM_UTF16_BE, codecs.BOM_UTF16_LE)
+# Members of layers that are shown depending on others or on their use: on screens or in print.
+_CONDITION = re.compile(rb"/(?=(?:VE|OCGs)\s*[\[\d]|Usage\b)[VOU]")
+_USES, _MARKS_OF_ORDER = (None, "print"), (codecs.BOM_UTF16_BE, codecs.BOM_UTF16_LE)
 _METRES_PER_POINT = 0.0254 / 72.0
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -185,10 +186,10 @@ def _activate(pairs: Sequence[tuple[Any, Any]], *, is_active: bool) -> None:
 
 
 def _pixels(page: pypdfium2.PdfPage) -> UInt8[np.ndarray, "h w c"]:
-    """Return the pixels of the active objects of a page, transparent where there are none."""
-    scale = _SEEN_PX / max(*page.get_size(), 1.0)
-    bitmap = page.render(scale=scale, fill_color=(0, 0, 0, 0), draw_annots=False, may_draw_forms=False)
-    return np.asarray(bitmap.to_numpy())
+    """Return the pixels of the active objects of a page, transparent where there are none on a screen or in print."""
+    look: Any = {"scale": _SEEN_PX / max(*page.get_size(), 1.0), "fill_color": (0, 0, 0, 0), "draw_annots": False}
+    drawn = [page.render(**look, may_draw_forms=False, optimize_mode=use).to_numpy() for use in _USES]
+    return np.minimum(*drawn)
 
 
 def _count_shapes(holder: Any, budget: Budget, depth: int = 0) -> int:

@@ -220,7 +220,7 @@ def _read_plan(root: Element, warnings: list[str], options: ImportOptions, budge
     )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
-    return by_storey(drawing, builder, options, budget, flip_y=options.y_axis != "up")
+    return by_storey({0.0: drawing}, builder, options, budget, flip_y=options.y_axis != "up")
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:

@@ -274,6 +274,7 @@ def _openings(
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
             builder.unsure.append(f"a gap of {width:.2f} m at {position} is taken for a {kind}: {doubt}")
+            builder.places[builder.unsure[-1]] = shapely.Point(start)
     return found
 
 
