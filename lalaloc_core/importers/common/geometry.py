@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.import_report import ReportBuilder
 
 # Largest coordinate of a file, in any unit: 10,000 km in millimetres.
@@ -299,7 +300,7 @@ class Floor:
     higher_m2: float
 
 
-def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: Callable[[], None]) -> Floor | None:
+def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: CheckTime) -> Floor | None:
     """Return the floor among the faces of a solid, or of a surface, in metres; None if all faces are steep.
 
     The floor begins with the lowest face and grows over faces that touch it, up to a step of 60 cm each. `check_time`

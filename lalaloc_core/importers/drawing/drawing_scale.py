@@ -15,6 +15,7 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import extent_of, lines_of, segments_of, side_lengths
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
@@ -99,7 +100,7 @@ def drawing_scale(
     options: ImportOptions,
     subject: str,
     drawings: Sequence[Drawing] = (),
-    check_time: Callable[[], None] = lambda: None,
+    check_time: CheckTime = lambda: None,
     *,
     paper_m_per_unit: float | None = None,
     paper_m: float | None = None,
@@ -363,7 +364,7 @@ def _areas_m2(text: str) -> tuple[float, ...]:
     return tuple(area for area in areas if _AREA_M2[0] <= area <= _AREA_M2[1])
 
 
-def written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
+def written_dimensions(drawing: Drawing, check_time: CheckTime) -> list[Dimension]:
     """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
     texts = [lettering for lettering in drawing.letterings if values_m(lettering.text)][:_MAX_TEXTS]
     segments = segments_of([stroke.line for stroke in drawing.strokes])

@@ -7,7 +7,7 @@ light area hides a part of a wall.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import shapely
@@ -22,6 +22,7 @@ from lalaloc_core.importers.common.geometry import (
     polygons_from_geometry,
     side_lengths,
 )
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.drawing.vector_drawing import Patch
 
@@ -47,7 +48,7 @@ _PAIRS, _PAIRS_PER_AREA = 1000, 4
 
 
 def drawn_panes(
-    lines: Iterable[shapely.LineString], walls: BaseGeometry, least: int, check_time: Callable[[], None]
+    lines: Iterable[shapely.LineString], walls: BaseGeometry, least: int, check_time: CheckTime
 ) -> list[Gap]:
     """Return the windows among the thin lines of a drawing (m).
 
@@ -125,10 +126,7 @@ def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:
 
 
 def cut_painted(
-    bodies: Sequence[tuple[shapely.Polygon, int]],
-    patches: Sequence[Patch],
-    thickest_m: float,
-    check_time: Callable[[], None],
+    bodies: Sequence[tuple[shapely.Polygon, int]], patches: Sequence[Patch], thickest_m: float, check_time: CheckTime
 ) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Take what is hidden from walls, which come with their places in the order of painting, in metres.
 

@@ -24,6 +24,7 @@ from lalaloc_core.importers.common.geometry import (
     point_xy,
     polygons_from_geometry,
 )
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, WallConfig
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
@@ -88,7 +89,7 @@ def enclose(
     lines: Sequence[shapely.LineString],
     closers: Sequence[BaseGeometry] = (),
     config: WallConfig = ROOM_BOUNDS.walls,
-    check_time: Callable[[], None] = lambda: None,
+    check_time: CheckTime = lambda: None,
     rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> Enclosed:
     """Find the rooms between walls.
@@ -133,7 +134,7 @@ def explained_size(rooms: Sequence[shapely.Polygon]) -> float:
 def find_gaps(
     walls: BaseGeometry,
     config: WallConfig,
-    check_time: Callable[[], None] = lambda: None,
+    check_time: CheckTime = lambda: None,
     rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> list[Gap]:
     """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
@@ -164,7 +165,7 @@ def find_gaps(
 
 
 def without_overlaps(
-    shapes: Sequence[shapely.Polygon], share: float, check_time: Callable[[], None] = lambda: None
+    shapes: Sequence[shapely.Polygon], share: float, check_time: CheckTime = lambda: None
 ) -> list[int]:
     """Return the numbers of the shapes that share less than a part of their area with each that was kept before."""
     tree, is_kept = shapely.STRtree(shapes), np.zeros(len(shapes), bool)
@@ -254,7 +255,7 @@ def _gaps_before(walls: Sequence[_End], areas: WallAreas, config: WallConfig) ->
 
 
 def _faces(
-    lines: Sequence[shapely.LineString], config: WallConfig, check_time: Callable[[], None]
+    lines: Sequence[shapely.LineString], config: WallConfig, check_time: CheckTime
 ) -> tuple[list[shapely.Polygon], list[shapely.LineString]]:
     """Return the areas between the joined lines, and the lines that bound no area."""
     segments = _network(lines)
@@ -315,10 +316,7 @@ def _loose_ends(segments: Sequence[shapely.LineString]) -> tuple[Float[np.ndarra
 
 
 def _from_single_lines(
-    lines: Sequence[shapely.LineString],
-    closers: Sequence[BaseGeometry],
-    config: WallConfig,
-    check_time: Callable[[], None],
+    lines: Sequence[shapely.LineString], closers: Sequence[BaseGeometry], config: WallConfig, check_time: CheckTime
 ) -> Enclosed:
     """Find rooms between walls without thickness; gaps lie in front of loose ends."""
     if not lines:
@@ -351,9 +349,7 @@ def _from_single_lines(
     return Enclosed(_insides([walls, *joints, *closers], config, check_time), list(distinct.values()), walls)
 
 
-def _insides(
-    pieces: Sequence[BaseGeometry], config: WallConfig, check_time: Callable[[], None]
-) -> list[shapely.Polygon]:
+def _insides(pieces: Sequence[BaseGeometry], config: WallConfig, check_time: CheckTime) -> list[shapely.Polygon]:
     """Return the areas enclosed by the union of some pieces that are large enough for a room, the largest first."""
     parts = polygons_from_geometry(shapely.unary_union(list(pieces)))
     filled = shapely.union_all([shapely.Polygon(part.exterior) for part in parts])

@@ -7,7 +7,7 @@ passage without a symbol that is wider than a door are divided where their names
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -18,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
-from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.import_limits import Budget, CheckTime
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
@@ -69,7 +69,7 @@ def split_named_rooms(
     walls: BaseGeometry,
     closed: Sequence[Gap],
     letterings: Sequence[Lettering],
-    check_time: Callable[[], None],
+    check_time: CheckTime,
 ) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Divide rooms with several names of rooms at gaps between ends of walls that leave a name on both sides.
 
@@ -98,7 +98,7 @@ def split_named_rooms(
 
 
 def _division(
-    pieces: Sequence[shapely.Polygon], gaps: Sequence[Gap], names: shapely.STRtree, check_time: Callable[[], None]
+    pieces: Sequence[shapely.Polygon], gaps: Sequence[Gap], names: shapely.STRtree, check_time: CheckTime
 ) -> tuple[int, list[shapely.Polygon], tuple[Gap, ...]] | None:
     """Return the number of a piece with its two sides and the gaps between them; None if no gaps divide names."""
     # One passage, or two beside a wall that stands free.

@@ -30,6 +30,7 @@ from lalaloc_core.importers.common.geometry import (
     segments_of,
     side_lengths,
 )
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import SketchedFixture
 
@@ -254,9 +255,7 @@ def joined(drawings: Iterable[Drawing]) -> Drawing:
     return Drawing(*(list(chain.from_iterable(items)) for items in kinds))
 
 
-def without_frames(
-    drawing: Drawing, check_time: Callable[[], None], most: int = 4
-) -> tuple[Drawing, list[BaseGeometry]]:
+def without_frames(drawing: Drawing, check_time: CheckTime, most: int = 4) -> tuple[Drawing, list[BaseGeometry]]:
     """Return a drawing in metres without the frames of its sheet and what they touch, such as a title block; and these.
 
     A frame is a rectangle around most lines, which are away from it, of a sheet's proportions or with a title. Up to
@@ -321,7 +320,7 @@ def without_plot(drawing: Drawing) -> tuple[Drawing, shapely.Polygon | None]:
     return replace(drawing, areas=areas, strokes=strokes), plot
 
 
-def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[], None]) -> set[int]:
+def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: CheckTime) -> set[int]:
     """Return the numbers of the lines that are connected with a frame, or are beside it."""
     found, new = set[int](), [frame]
     while new:

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -26,7 +25,7 @@ from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, f
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
-from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
+from lalaloc_core.importers.picture.ink import Colours, Gray, blank_outside, darken_pale_walls, drawn_extent
 from lalaloc_core.importers.picture.lettering import read_texts
 from lalaloc_core.importers.picture.occupancy import sketch_map
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
@@ -108,7 +107,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     return assemble_storeys(sketch, letterings, builder, options, budget, in_file)
 
 
-def _check_kind(gray: UInt8[np.ndarray, "h w"], options: ImportOptions, builder: ReportBuilder) -> None:
+def _check_kind(gray: Gray, options: ImportOptions, builder: ReportBuilder) -> None:
     """Refuse photographs, unless the options say that the picture is a plan."""
     tones = Tones.of(gray)
     if tones is None or not tones.is_photograph:
@@ -121,9 +120,7 @@ def _check_kind(gray: UInt8[np.ndarray, "h w"], options: ImportOptions, builder:
     builder.notes.append("the picture looks like a photograph and was read as a plan, because plan=true is set")
 
 
-def _open(
-    content: bytes, builder: ReportBuilder, budget: Budget
-) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, UInt8[np.ndarray, "h w 3"], float | None]:
+def _open(content: bytes, builder: ReportBuilder, budget: Budget) -> tuple[Gray, Gray | None, Colours, float | None]:
     """Return the grey picture on white, its warmth, its colours, and the length of a pixel on paper if it is given."""
     with open_picture(content, ("PNG", "JPEG"), "the picture", "save it again as PNG", budget) as picture:
         if min(picture.size) < _MIN_SIDE_PX:
@@ -190,14 +187,14 @@ def _is_light(picture: Image.Image) -> bool:
     return float(np.quantile(np.asarray(picture.convert("L"))[alpha >= _CLEAR], _LEAST_DARK)) > _LIGHT
 
 
-def _has_dark_ground(gray: UInt8[np.ndarray, "h w"]) -> bool:
+def _has_dark_ground(gray: Gray) -> bool:
     """Return whether the most frequent tone is dark, and most of the picture has about this tone."""
     share = np.bincount(gray.ravel() >> 4, minlength=16) / gray.size
     ground = int(share.argmax())
     return ground < _DARK_TONES and float(share[max(ground - 1, 0) : ground + 2].sum()) > _MOSTLY
 
 
-def _warmth(picture: Image.Image) -> UInt8[np.ndarray, "h w"]:
+def _warmth(picture: Image.Image) -> Gray:
     """Return half of red minus blue, plus 128 (see `Ink.warmth`)."""
     red, blue = (np.asarray(picture.getchannel(name)) for name in "RB")
     # Computed in bytes: wider types take hundreds of megabytes for the largest pictures.

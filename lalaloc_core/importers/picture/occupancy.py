@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float
 
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_from_geometry
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import explained_size
-from lalaloc_core.importers.picture.ink import find_skew, rotate_picture
+from lalaloc_core.importers.picture.ink import Colours, Gray, Labels, Mask, find_skew, rotate_picture
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from lalaloc_core.importers.picture.wall_mask import usual_thickness
 
@@ -55,13 +55,11 @@ class OccupancyGrid:
     """Grid with its occupied and free cells; all others are unknown."""
 
     frame: MapFrame
-    occupied: Bool[np.ndarray, "h w"]
-    free: Bool[np.ndarray, "h w"]
+    occupied: Mask
+    free: Mask
 
 
-def sketch_map(
-    colours: UInt8[np.ndarray, "h w 3"], metres_per_pixel: float, builder: ReportBuilder, budget: Budget
-) -> Sketch | None:
+def sketch_map(colours: Colours, metres_per_pixel: float, builder: ReportBuilder, budget: Budget) -> Sketch | None:
     """Return the rooms and passages of a map as apps of robots show it; None if the picture is none.
 
     Rooms are areas of flat colours that touch or have thin lines between them, below paths, names and symbols.
@@ -135,11 +133,11 @@ def sketch_map(
     return sketch
 
 
-def _near(mask: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+def _near(mask: Mask, reach: float) -> Mask:
     return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)) <= reach
 
 
-def _closed(mask: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+def _closed(mask: Mask, reach: float) -> Mask:
     rim = math.ceil(reach) + 1
     return ~_near(~_near(np.pad(mask, rim), reach), reach)[rim:-rim, rim:-rim]
 
@@ -158,19 +156,15 @@ def _distances(colours: np.ndarray, tones: np.ndarray) -> Float[np.ndarray, "n h
     return np.array([np.abs(colours.astype(np.float32) - tone).max(axis=2) for tone in tones])
 
 
-def _is_floor(mask: Bool[np.ndarray, "h w"], cell_m: float) -> bool:
+def _is_floor(mask: Mask, cell_m: float) -> bool:
     """Return whether an area is wide somewhere, apart from lines over it."""
     inside = ~_near(~_closed(mask, _NOTCH_M / cell_m), _INSIDE_M / cell_m)
     return bool(inside.any()) and float(mask[inside].mean()) >= _EVEN
 
 
 def _lines_around(
-    ground: Bool[np.ndarray, "h w"],
-    floor: Bool[np.ndarray, "h w"],
-    colours: np.ndarray,
-    tones: Float[np.ndarray, "n 3"],
-    cell_m: float,
-) -> Bool[np.ndarray, "h w"]:
+    ground: Mask, floor: Mask, colours: np.ndarray, tones: Float[np.ndarray, "n 3"], cell_m: float
+) -> Mask:
     """Return all lines of the tone that most lines between ground and floors have; none if blends are between them."""
     far = _distances(colours, tones).min(axis=0)
     beside = _near(ground, max(1.5, 0.8 * _OUTER_M / cell_m)) & ~ground & _near(floor, 1.5 * _OUTER_M / cell_m)
@@ -187,9 +181,7 @@ def _lines_around(
     return cv2.morphologyEx(walls, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
 
-def _areas(
-    label: np.ndarray, walls: Bool[np.ndarray, "h w"], cell_m: float, budget: Budget
-) -> tuple[Int[np.ndarray, "h w"], list[float]]:
+def _areas(label: np.ndarray, walls: Mask, cell_m: float, budget: Budget) -> tuple[Labels, list[float]]:
     """Return the number of each cell's room, 0 without, and the sizes (m²) of zones and carpets inside rooms."""
     areas, zones_m2 = np.zeros(label.shape, np.int32), list[float]()
     for tone in np.unique(label[label > 0]):
@@ -265,7 +257,7 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     return sketch
 
 
-def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Budget) -> tuple[Sketch, ReportBuilder]:
+def _read_walls(cells: Gray, grid: OccupancyGrid, budget: Budget) -> tuple[Sketch, ReportBuilder]:
     """Return what the picture importer finds between walls (1), in the map frame."""
     frame = grid.frame
     rows, columns = frame.size
@@ -310,9 +302,7 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
 
 
-def _furniture(
-    cells: UInt8[np.ndarray, "h w"], frame: MapFrame
-) -> tuple[UInt8[np.ndarray, "h w"], list[tuple[float, float]]]:
+def _furniture(cells: Gray, frame: MapFrame) -> tuple[Gray, list[tuple[float, float]]]:
     """Return the groups of cells (1) of the size of furniture that touch no wall, and their middles in the map frame.
 
     Thinner ones are free-standing walls.
@@ -333,7 +323,7 @@ def _furniture(
     return found, places
 
 
-def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Bool[np.ndarray, "h w"]) -> list[float]:
+def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Mask) -> list[float]:
     """Return the share of each room's outline (map frame) that has a wall beside it that was seen."""
     cell_m, shares = grid.frame.resolution_m, []
     distance_m = np.asarray(cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)) * cell_m
@@ -356,7 +346,7 @@ def _report_free_cells(sketch: Sketch, grid: OccupancyGrid, builder: ReportBuild
         )
 
 
-def _without_specks(cells: Bool[np.ndarray, "h w"], frame: MapFrame) -> UInt8[np.ndarray, "h w"]:
+def _without_specks(cells: Mask, frame: MapFrame) -> Gray:
     """Return cells, as 1, without those that are too few for a wall."""
     _, found, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
     longest = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
@@ -20,7 +19,7 @@ from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFi
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
 from lalaloc_core.importers.drawing.sketch_drawing import is_between_rooms, split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
-from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
+from lalaloc_core.importers.picture.ink import FINEST_M, Gray, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.symbols import Symbol, find_symbols, fixtures_in, is_taken, without_symbols
 from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
@@ -98,11 +97,11 @@ class _Reading:
 
 
 def sketch_picture(
-    gray: UInt8[np.ndarray, "h w"],
+    gray: Gray,
     metres_per_pixel: float,
     builder: ReportBuilder,
     budget: Budget,
-    warmth: UInt8[np.ndarray, "h w"] | None = None,
+    warmth: Gray | None = None,
     *,
     straighten: bool = True,
     has_symbols: bool = True,
