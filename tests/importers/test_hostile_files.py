@@ -183,14 +183,14 @@ def test_time_is_checked_at_every_empty_block():
 
 def test_curves_beyond_the_stated_size_have_few_points(monkeypatch: pytest.MonkeyPatch):
     counts = []
-    whole = dxf._points
+    whole = dxf._flatten
 
     def counted(*arguments: Any) -> np.ndarray:
         points = whole(*arguments)
         counts.append(len(points))
         return points
 
-    monkeypatch.setattr(dxf, "_points", counted)
+    monkeypatch.setattr(dxf, "_flatten", counted)
     for radius in (1e3, 1e5, 1e7, 1e9):
         circle = [(0, "CIRCLE"), (8, "WALL"), (10, 0), (20, 0), (40, radius)]
         content = _dxf_text((0, "SECTION"), (2, "ENTITIES"), *circle, (0, "ENDSEC"), (0, "EOF"))

@@ -92,8 +92,8 @@ _EXTENT_M = (3.0, 300.0)
 # Length of a unit of any drawing (m).
 _METRES_PER_UNIT = (1e-9, 1e4)
 
-# Text of a dimension, and the lengths in units of the drawing that it may be about.
-Dimension = tuple[str, Sequence[float]]
+# Text of a dimension, and the lengths in units of the drawing that it may be about; metres per unit and their source.
+Dimension, Scale = tuple[str, Sequence[float]], tuple[float, str]
 
 
 def drawing_scale(
@@ -104,9 +104,9 @@ def drawing_scale(
     *,
     paper_m_per_unit: float | None = None,
     paper_m: float | None = None,
-    own: tuple[float, str] | None = None,
-    guess: Callable[[Sequence[tuple[float, str]]], tuple[float, str] | None] = lambda written: None,
-) -> tuple[float, str]:
+    own: Scale | None = None,
+    guess: Callable[[Sequence[Scale]], Scale | None] = lambda written: None,
+) -> Scale:
     """Return metres per unit of a drawing, and the source of that value.
 
     The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
@@ -116,7 +116,7 @@ def drawing_scale(
     multiplies any of them.
     """
 
-    def checked(metres_per_unit: float, source: str) -> tuple[float, str]:
+    def checked(metres_per_unit: float, source: str) -> Scale:
         low, high = _METRES_PER_UNIT
         if not low <= metres_per_unit <= high:
             raise InvalidFloorPlanError(
@@ -125,7 +125,7 @@ def drawing_scale(
             )
         return metres_per_unit, source
 
-    def given() -> tuple[float, str]:
+    def given() -> Scale:
         if options.known_distance is not None:
             return options.known_distance.metres_per_unit, "option known_distance"
         if options.metres_per_pixel is not None:
@@ -166,7 +166,7 @@ def drawing_scale(
     return checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)")
 
 
-def _written_scales(texts: Sequence[str], paper_m: float) -> list[tuple[float, str]]:
+def _written_scales(texts: Sequence[str], paper_m: float) -> list[Scale]:
     """Return the denominators of the scales written, for a page with the longer side `paper_m`, and their sources."""
 
     def ratio(inches: re.Match[str]) -> str:
@@ -195,7 +195,7 @@ def _written_scales(texts: Sequence[str], paper_m: float) -> list[tuple[float, s
     return found
 
 
-def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:
+def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> Scale | None:
     """Return metres per unit that most dimensions agree on, and their number in words; None if too few agree.
 
     `extent` is the size of the drawing in its units.
@@ -217,9 +217,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
     return math.exp(middle), f"{count} dimensions written in the drawing"
 
 
-def check_scale(
-    metres_per_unit: float, source: str, measured: tuple[float, str] | None, builder: ReportBuilder
-) -> None:
+def check_scale(metres_per_unit: float, source: str, measured: Scale | None, builder: ReportBuilder) -> None:
     """Warn if a scale differs from that of the sizes that are written in the drawing, `measured`."""
     if measured is not None and abs(metres_per_unit / measured[0] - 1.0) > _TOLERANCE:
         builder.scale_factor = measured[0] / metres_per_unit

@@ -19,7 +19,7 @@ from lalaloc_core.importers.common.geometry import extent_of
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, ScaleClue
 from lalaloc_core.importers.common.sketch import Sketch
-from lalaloc_core.importers.drawing.drawing_scale import Dimension, areas_of_rooms, values_m
+from lalaloc_core.importers.drawing.drawing_scale import Dimension, Scale, areas_of_rooms, values_m
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
 # Logarithms of scales that are compared, around the first one.
@@ -102,9 +102,7 @@ class ScaleGuess:
         )
 
 
-def assume_scale(
-    guess: ScaleGuess | None, builder: ReportBuilder, written: Sequence[tuple[float, str]] = ()
-) -> tuple[float, str] | None:
+def assume_scale(guess: ScaleGuess | None, builder: ReportBuilder, written: Sequence[Scale] = ()) -> Scale | None:
     """Return the only scale written that is near a guessed one, else that as an assumption; None without a guess."""
     if guess is None:
         return None

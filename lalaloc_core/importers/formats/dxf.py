@@ -24,11 +24,13 @@ from ezdxf import recover
 from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dxfentity import DXFEntity, DXFTagStorage
 from ezdxf.entities.dxfgfx import DXFGraphic
+from ezdxf.entities.hatch import Hatch
 from ezdxf.entities.image import Image
 from ezdxf.entities.insert import Insert
 from ezdxf.entities.layer import Layer
 from ezdxf.entities.lwpolyline import LWPolyline
 from ezdxf.entities.mline import MLine
+from ezdxf.entities.mpolygon import MPolygon
 from ezdxf.entities.mtext import MText
 from ezdxf.entities.polyline import Polyface, Polyline, Polymesh
 from ezdxf.entities.text import Text
@@ -51,9 +53,9 @@ from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _STRAIGHT = {"LINE", "LWPOLYLINE", "POLYLINE"}
-_FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
+_FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE", "3DFACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
-_READ = _LINES | _FILLED | _TEXTS | {"INSERT", "3DFACE"}
+_READ = _LINES | _FILLED | _TEXTS | {"INSERT"}
 # Alignments of texts that reach from one point to another. Half of the width of a letter and of the distance of lines,
 # relative to the height of letters, and letters of a name.
 _BETWEEN, _HALF_LETTER, _HALF_LINE, _LETTERS = (3, 5), 0.3, 0.8, 12
@@ -363,10 +365,11 @@ def _add(
     if isinstance(entity, Insert):
         _add_block(entity, context, drawing, builder, sag, budget)
     elif kind in _FILLED:
-        shapes = _filled_areas(entity, sag)
-        is_solid = kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
+        shapes, is_face = _filled_areas(entity, sag), kind == "3DFACE"
+        is_solid = None if is_face else kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
         drawing.areas += [Area(shape, context.layer, role, is_dark=is_solid) for shape in shapes]
-        builder.use(context.layer, f"hatches: {role or 'possible walls'}", max(len(shapes), 1))
+        used_as = f"{'faces' if is_face else 'hatches'}: {role or 'possible walls'}"
+        builder.use(context.layer, used_as if shapes or not is_face else "ignored", max(len(shapes), 1))
     elif kind in _LINES:
         parts: Iterable[DXFGraphic] = (entity,)
         if isinstance(entity, LWPolyline) and entity.has_arc and not entity.closed and role in (None, "wall", "door"):
@@ -374,11 +377,6 @@ def _add(
             parts = entity.virtual_entities()
         for part in parts:
             _add_line(part, context, drawing, builder, sag)
-    elif kind == "3DFACE":
-        corners = np.array([(corner.x, corner.y) for corner in entity.wcs_vertices()])  # type: ignore[attr-defined]
-        faces = polygons_from_geometry(shapely.Polygon(corners)) if in_range(corners) else []
-        drawing.areas += [Area(face, context.layer, role) for face in faces]
-        builder.use(context.layer, f"faces: {role or 'possible walls'}" if faces else "ignored")
 
 
 def _anchor(entity: DXFGraphic) -> tuple[float, float] | None:
@@ -428,7 +426,8 @@ def _add_block(
 
 
 def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
-    points = _points(entity, sag)
+    points = next(iter(_rings(entity, sag)), np.empty((0, 2)))
+    points = points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])[: len(points)]]
     if len(points) < 2:
         builder.use(context.layer, "ignored (no length, or coordinates out of range)")
         return
@@ -471,15 +470,13 @@ def _ends_meet(points: np.ndarray) -> bool:
     return len(points) > 3 and float(np.linalg.norm(points[0] - points[-1])) <= _CLOSED * length
 
 
-def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
-    """Return the points along a line, in world coordinates seen from above."""
+def _rings(entity: DXFGraphic, sag: float) -> list[Float[np.ndarray, "_ 2"]]:
+    """Return the points along a line or each outline of an area, in world coordinates seen from above, if in range."""
     try:
-        points = _flatten(dxf_path.make_path(entity), sag)
+        paths = dxf_path.from_hatch(entity) if isinstance(entity, Hatch | MPolygon) else [dxf_path.make_path(entity)]
+        return [ring for path in paths if len(ring := _flatten(path, sag)) and in_range(ring)]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
-        return np.empty((0, 2))
-    if not len(points) or not in_range(points):
-        return np.empty((0, 2))
-    return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
+        return []
 
 
 def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
@@ -492,12 +489,6 @@ def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
 
 
 def _filled_areas(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
-    """Return the filled area of a hatch, between its outlines."""
-    try:
-        is_hatch = entity.dxftype() in ("HATCH", "MPOLYGON")
-        paths = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
-        rings = [_flatten(path, sag) for path in paths]
-    except (TypeError, ValueError, ZeroDivisionError, DXFError):
-        return []
-    usable = [ring for ring in rings if len(ring) >= 4 and in_range(ring)]
-    return even_odd_polygons(part for ring in usable for part in polygons_from_geometry(shapely.Polygon(ring)))
+    """Return the filled area of a hatch, between its outlines, or of a face."""
+    rings = (shapely.Polygon(ring) for ring in _rings(entity, sag) if len(ring) >= 4)
+    return even_odd_polygons(part for ring in rings for part in polygons_from_geometry(ring))

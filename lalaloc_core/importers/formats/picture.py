@@ -15,6 +15,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import Tones
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
 from lalaloc_core.importers.drawing.drawing_scale import (
+    Scale,
     check_scale,
     drawing_scale,
     reject_dimensions,
@@ -63,7 +64,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         )
         return measures_of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
 
-    def guess(written: Sequence[tuple[float, str]]) -> tuple[float, str] | None:
+    def guess(written: Sequence[Scale]) -> Scale | None:
         first = first_scale(drawn_extent(gray))
         if sketch_map(colours, first, ReportBuilder(), budget) is not None:
             budget.hints.append("maps as robots draw them have no leaves of doors, which would tell the scale")
