@@ -27,7 +27,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from lalaloc_core.importers.common.assemble import assemble
-from lalaloc_core.importers.common.geometry import check_network, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, polygons_of
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
@@ -328,11 +328,11 @@ def test_small_file_takes_little_time(plan: HostilePlan):
 def test_outline_that_crosses_itself_is_refused_before_it_is_repaired(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shapely, "make_valid", pytest.fail)
     with pytest.raises(InvalidFloorPlanError, match=r"2001 points .* crosses itself more than 2000 times"):
-        polygons_from_geometry(shapely.Polygon(star(2001)))
+        polygons_of(shapely.Polygon(star(2001)))
 
 
 def test_outline_that_crosses_itself_a_few_times_is_repaired():
-    assert len(polygons_from_geometry(shapely.Polygon(star(5)))) == 5
+    assert len(polygons_of(shapely.Polygon(star(5)))) == 5
 
 
 def test_crossing_lines_are_refused_before_they_are_joined(monkeypatch: pytest.MonkeyPatch):

@@ -21,7 +21,7 @@ from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAUL
 from lalaloc_core.floorplan.plan_words import is_roof
 from lalaloc_core.floorplan.room_types import room_types_from_name, type_fields
 from lalaloc_core.importers.common.fixtures_in_rooms import place_fixtures, type_rooms
-from lalaloc_core.importers.common.geometry import check_network, check_overlaps, distinct, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, check_overlaps, distinct, polygons_of
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
@@ -201,11 +201,7 @@ def _clean(
     near = obstacles.geometries[np.sort(obstacles.query(shape))]
     if inside := [obstacle for obstacle in near if obstacle.intersects(shape)]:
         shape = shapely.difference(shape, shapely.union_all(inside))
-    floors = [
-        simple
-        for floor in polygons_from_geometry(shape)
-        for simple in _simple(_simplify(floor, label, limits, builder))
-    ]
+    floors = [simple for floor in polygons_of(shape) for simple in _simple(_simplify(floor, label, limits, builder))]
     floors = [floor for floor in floors if floor.area >= limits.min_room_area_m2]
     if not floors and room.shape.area >= _SLIVER_M2:
         builder.notes.append(
@@ -294,12 +290,12 @@ def _vertices(shape: BaseGeometry) -> int:
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
     """Return polygons with rounded coordinates whose outlines do not touch themselves."""
     found = []
-    for part in polygons_from_geometry(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
+    for part in polygons_of(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
         if shapely.Polygon(part.exterior).is_valid:
             found.append(part)
         else:
             apart = part.buffer(-10.0 * _GRID_M).buffer(10.0 * _GRID_M, join_style="mitre")
-            found += polygons_from_geometry(shapely.set_precision(apart, _GRID_M))
+            found += polygons_of(shapely.set_precision(apart, _GRID_M))
     return found
 
 

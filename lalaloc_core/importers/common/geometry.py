@@ -144,7 +144,7 @@ def in_range(points: Float[np.ndarray, "..."]) -> bool:
     return bool((np.abs(points) <= MAX_COORDINATE).all())
 
 
-def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
+def polygons_of(geometry: BaseGeometry) -> list[shapely.Polygon]:
     """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:
         return []
@@ -163,7 +163,7 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     if isinstance(valid, shapely.Polygon):
         return [valid] if valid.area > 0.0 else []
     has_parts = isinstance(valid, shapely.MultiPolygon | shapely.GeometryCollection)
-    return [polygon for part in shapely.get_parts(valid) if has_parts for polygon in polygons_from_geometry(part)]
+    return [polygon for part in shapely.get_parts(valid) if has_parts for polygon in polygons_of(part)]
 
 
 def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = False) -> list[shapely.Polygon]:
@@ -180,7 +180,7 @@ def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = Fa
     while len(shapes) > 1:
         pairs = zip(shapes[::2], shapes[1::2], strict=False)
         shapes = [*(shapely.symmetric_difference(a, b) for a, b in pairs), *shapes[len(shapes) & ~1 :]]
-    return polygons_from_geometry(shapes[0]) if shapes else []
+    return polygons_of(shapes[0]) if shapes else []
 
 
 def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -215,6 +215,19 @@ def extent_of(shapes: Sequence[BaseGeometry]) -> float:
     """Return the longer side of the box around shapes, whose sides are along the axes; NaN without any."""
     x0, y0, x1, y1 = shapely.total_bounds(shapes)
     return float(max(x1 - x0, y1 - y0))
+
+
+def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
+    """Group shapes that are near each other into one geometry each."""
+    if not shapes:
+        return []
+    check_network(shapes)
+    around = shapely.union_all(shapely.buffer(shapes, 0.5 * reach_m, quad_segs=2))
+    tree = shapely.STRtree(shapely.get_parts(around))
+    members: dict[int, list[BaseGeometry]] = {}
+    for index, region in zip(*tree.query(shapes, predicate="intersects").tolist(), strict=True):
+        members.setdefault(region, []).append(shapes[index])
+    return [shapely.GeometryCollection(group) for group in members.values()]
 
 
 def label_position(room: shapely.Polygon) -> tuple[float, float]:
@@ -354,7 +367,7 @@ def report_floor(name: str, floor: Floor, builder: ReportBuilder) -> None:
 def join_faces(shapes: list[shapely.Polygon]) -> list[shapely.Polygon]:
     """Return the area that faces cover, without the gaps that rounding leaves between them."""
     union = shapely.unary_union([shape.buffer(_SEAM_M, join_style="mitre") for shape in shapes])
-    return polygons_from_geometry(union.buffer(-_SEAM_M, join_style="mitre"))
+    return polygons_of(union.buffer(-_SEAM_M, join_style="mitre"))
 
 
 def _seen_from_above(face: Float[np.ndarray, "n 3"]) -> shapely.Polygon | None:
@@ -367,5 +380,5 @@ def _seen_from_above(face: Float[np.ndarray, "n 3"]) -> shapely.Polygon | None:
     size = float(np.linalg.norm(normal))
     if size < 1e-9 or abs(normal[2]) < _FLAT * size:
         return None
-    parts = polygons_from_geometry(shapely.Polygon(face[:, :2]))
+    parts = polygons_of(shapely.Polygon(face[:, :2]))
     return max(parts, key=lambda part: part.area, default=None)

@@ -15,13 +15,7 @@ from jaxtyping import Bool, Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import (
-    check_network,
-    opening_line,
-    point_xy,
-    polygons_from_geometry,
-    side_lengths,
-)
+from lalaloc_core.importers.common.geometry import check_network, opening_line, point_xy, polygons_of, side_lengths
 from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.drawing.vector_drawing import Patch
@@ -150,12 +144,12 @@ def cut_painted(
         for k, part in covered:
             hidden.setdefault(k, []).append(part)
         rest = shapely.difference(body, shapely.union_all([part for _, part in covered]))
-        visible += polygons_from_geometry(rest) if covered else [body]
+        visible += polygons_of(rest) if covered else [body]
     walls = shapely.STRtree(visible)
     gaps: list[Gap] = []
     for k, parts in hidden.items():
         check_time()
-        pieces = polygons_from_geometry(shapely.union_all(parts))
+        pieces = polygons_of(shapely.union_all(parts))
         gaps += filter(None, [_gap(piece, walls, patches[k], thickest_m) for piece in pieces])
     return visible, gaps
 

@@ -16,14 +16,7 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.geometry import (
-    WallAreas,
-    check_network,
-    cross,
-    distinct,
-    point_xy,
-    polygons_from_geometry,
-)
+from lalaloc_core.importers.common.geometry import WallAreas, check_network, cross, distinct, point_xy, polygons_of
 from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, WallConfig
 
@@ -138,9 +131,7 @@ def find_gaps(
     rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> list[Gap]:
     """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
-    areas = WallAreas(
-        [simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))]
-    )
+    areas = WallAreas([simple for part in polygons_of(walls) for simple in polygons_of(part.simplify(0.004))])
     rings = shapely.get_rings(shapely.orient_polygons(areas.parts))
     ends = [end for ring in rings for end in _ends(shapely.get_coordinates(ring), config)]
     check_time()
@@ -351,10 +342,10 @@ def _from_single_lines(
 
 def _insides(pieces: Sequence[BaseGeometry], config: WallConfig, check_time: CheckTime) -> list[shapely.Polygon]:
     """Return the areas enclosed by the union of some pieces that are large enough for a room, the largest first."""
-    parts = polygons_from_geometry(shapely.unary_union(list(pieces)))
+    parts = polygons_of(shapely.unary_union(list(pieces)))
     filled = shapely.union_all([shapely.Polygon(part.exterior) for part in parts])
     rooms = []
-    for floor in polygons_from_geometry(shapely.difference(filled, shapely.MultiPolygon(parts))):
+    for floor in polygons_of(shapely.difference(filled, shapely.MultiPolygon(parts))):
         check_time()
         if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config.shallowest_room):
             rooms.append(floor.simplify(0.004))

@@ -76,6 +76,26 @@ class Measures:
     dimensions: Sequence[Dimension] = ()
     extent: float = 0.0
 
+    @classmethod
+    def of(
+        cls, sketch: Sketch, scale: float, texts: Sequence[Lettering], drawing: Drawing, dimensions: Sequence[Dimension]
+    ) -> Measures:
+        """Return the sizes of the parts in a sketch at a scale, in units of the drawing.
+
+        `texts` are placed in the metres of the sketch, `drawing` has the lines in its own units.
+        """
+        areas = areas_of_rooms([room.shape for room in sketch.rooms], texts)
+        fixtures = [(item.kind, extent_of([item.shape]) / scale) for item in sketch.fixtures if item.kind in _FIXTURE]
+        return cls(
+            [leaf_m / scale for leaf_m in sketch.leaves_m],
+            sketch.wall_m / scale,
+            tread_spacings(stroke.line for stroke in drawing.strokes),
+            fixtures,
+            [(written_m2, area_m2 / scale**2) for written_m2, area_m2 in areas.values()],
+            dimensions,
+            extent_of([room.shape for room in sketch.rooms]) / scale if sketch.rooms else 0.0,
+        )
+
 
 @dataclass(frozen=True)
 class ScaleGuess:
@@ -171,26 +191,6 @@ def combine(measures: Measures, around: float) -> ScaleGuess | None:
         agrees = abs(own - middle) <= limit
         clues.append(ScaleClue(kind, agreeing.get(kind, count), math.exp(own), own_std, agrees))
     return ScaleGuess(math.exp(middle), std, tuple(clues))
-
-
-def measures_of(
-    sketch: Sketch, scale: float, letterings: Sequence[Lettering], drawing: Drawing, dimensions: Sequence[Dimension]
-) -> Measures:
-    """Return the sizes of the parts in a sketch at a scale, in units of the drawing.
-
-    `letterings` are placed in the metres of the sketch, `drawing` has the lines in its own units.
-    """
-    areas = areas_of_rooms([room.shape for room in sketch.rooms], letterings)
-    fixtures = [(item.kind, extent_of([item.shape]) / scale) for item in sketch.fixtures if item.kind in _FIXTURE]
-    return Measures(
-        [leaf_m / scale for leaf_m in sketch.leaves_m],
-        sketch.wall_m / scale,
-        tread_spacings(stroke.line for stroke in drawing.strokes),
-        fixtures,
-        [(written_m2, area_m2 / scale**2) for written_m2, area_m2 in areas.values()],
-        dimensions,
-        extent_of([room.shape for room in sketch.rooms]) / scale if sketch.rooms else 0.0,
-    )
 
 
 def first_scale(extent: float, leaves: Sequence[float] = ()) -> float:

@@ -17,33 +17,18 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
+from lalaloc_core.importers.common.geometry import clusters, opening_line, polygons_of, side_lengths
 from lalaloc_core.importers.common.import_limits import Budget, CheckTime
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.drawing.door_leaves import (
-    LEAF_M,
-    drawn_leaves,
-    take_leaves,
-    with_half_open_doors,
-    without_leaves,
-)
+from lalaloc_core.importers.drawing.door_leaves import LEAF_M, drawn_leaves, take_leaves, with_swings, without_leaves
 from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, without_sizes, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
 from lalaloc_core.importers.drawing.rooms_in_drawing import GapFinder, choose_reading, marked_rooms, report_unused
-from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale, measures_of
-from lalaloc_core.importers.drawing.vector_drawing import (
-    Area,
-    Drawing,
-    Lettering,
-    Swing,
-    clusters,
-    split_lines,
-    without_frames,
-    without_plot,
-)
+from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing, split_lines, without_frames
 
 # Letters of a line of prose, and the least number of such lines on a page of text.
 _LINE_LETTERS, _MIN_LINES_OF_TEXT = 25, 8
@@ -106,7 +91,7 @@ def _division(
         check_time()
         cut = shapely.union_all([gap.shape for gap in group])
         for index, piece in enumerate(pieces):
-            sides = polygons_from_geometry(piece.difference(cut))
+            sides = polygons_of(piece.difference(cut))
             named = [side for side in sides if len(names.query(side, predicate="contains"))]
             if len(named) == len(sides) == 2 and all(side.area >= _SMALLEST_M2 for side in sides):
                 return index, sides, group
@@ -133,13 +118,13 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             f"a rectangle of {long:.1f} m x {short:.1f} m is taken for the sheet's frame, and was left out with the "
             "lines beside it; if it is a wall, set crop to the walls"
         )
-    drawing, plot = without_plot(drawing)
+    drawing, plot = drawing.without_plot()
     if plot is not None:
         builder.unsure.append(
             f"an outline of {plot.area:.0f} m² around all walls, of one line, is taken for the plot and was left out; "
             "if it is a wall, draw both of its faces, or write the name of its room beside it"
         )
-    drawing = with_half_open_doors(drawing)
+    drawing = with_swings(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
     budget.begin("finding doors and walls")
@@ -212,7 +197,7 @@ def guess_drawing(drawing: Drawing, budget: Budget, *, flip_y: bool) -> ScaleGue
     def measure(scale: float) -> Measures:
         scaled = drawing.scaled(scale, flip_y=flip_y)
         sketch = sketch_drawing(scaled, ReportBuilder(), budget)
-        return measures_of(sketch, scale, scaled.letterings, drawing, dimensions)
+        return Measures.of(sketch, scale, scaled.letterings, drawing, dimensions)
 
     start = first_scale(drawing.extent, [swing.radius for swing in drawing.swings])
     return guess_scale(measure, start, budget)

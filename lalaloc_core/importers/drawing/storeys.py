@@ -23,10 +23,10 @@ from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import extent_of, lines_of, polygons_from_geometry, segments_of
+from lalaloc_core.importers.common.geometry import extent_of, lines_of, polygons_of, segments_of
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
-from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, joined, outline_of
+from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, joined, line_of
 
 Box = tuple[float, float, float, float]
 # Rooms farther apart (m) are of different storeys; in pictures, also those that no wall joins within the second.
@@ -105,7 +105,7 @@ def storeys_beside(sketch: Sketch) -> list[BaseGeometry]:
         return [shapely.union_all(rooms)]
     reach_m = 0.5 * (_APART_M if sketch.walls is None else _JOINED_M)
     drawn = [*rooms, *([] if sketch.walls is None else [sketch.walls])]
-    parts = polygons_from_geometry(shapely.union_all(shapely.buffer(drawn, reach_m)))
+    parts = polygons_of(shapely.union_all(shapely.buffer(drawn, reach_m)))
     # Walls can be thousands of parts without a room, such as letters.
     room, part = shapely.STRtree(parts).query(rooms, predicate="intersects")
     areas = np.bincount(part, shapely.area(rooms)[room], minlength=len(parts))
@@ -263,7 +263,7 @@ def storeys_of(drawing: Drawing, main: Role | None, builder: ReportBuilder) -> d
         name, number = _storey(item.layer) or (item.layer, item.layer)
         if names.get(number, "0").isdecimal():
             names[number] = name
-        walls[number].append(outline_of(item))
+        walls[number].append(line_of(item))
     largest = sorted(walls, key=lambda key: -shapely.length(walls[key]).sum())[:_MOST_COMPARED]
     around = {key for a, b in combinations(largest, 2) if _are_over_each_other(walls[a], walls[b]) for key in (a, b)}
     by_word = {key for key in walls if main and not names[key].isdecimal()}
@@ -294,9 +294,7 @@ def _by_height(drawings: Mapping[float, Drawing], main: Role | None) -> dict[str
 
     A storey is higher than the last by a ceiling, and has other lines or texts: not the upper edges of walls alone.
     """
-    walls = {
-        height: [outline_of(item) for item in part.lines if item.role == main] for height, part in drawings.items()
-    }
+    walls = {height: [line_of(item) for item in part.lines if item.role == main] for height, part in drawings.items()}
     trees = {height: shapely.STRtree(lines_of(segments_of(lines))) for height, lines in walls.items()}
     lengths = {height: shapely.length(lines).sum() for height, lines in walls.items()}
     floors: list[float] = []

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import ClassVar
 
 import numpy as np
 import shapely
@@ -20,13 +21,12 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.plan_words import Role, room_types_from_reading
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, room_types_from_name, split_words
 from lalaloc_core.importers.common.geometry import (
-    check_network,
     distinct,
     even_odd_polygons,
     extent_of,
     lines_of,
     point_xy,
-    polygons_from_geometry,
+    polygons_of,
     segments_of,
     side_lengths,
 )
@@ -38,8 +38,6 @@ from lalaloc_core.importers.common.sketch import SketchedFixture
 _DARK, _WHITE, _BLUER = 110.0, 250.0, 20.0
 # Least opacity (of 255) of what can be seen, and of fills that hide what is below them.
 _VISIBLE, _HIDING = 60.0, 230.0
-# Straight pieces per curve.
-CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
 _SWING_DEG = (55.0, 125.0)
 _ROUND = 0.03
@@ -206,6 +204,30 @@ class Drawing:
         seen = [stroke for stroke in self.strokes if not stroke.is_white or stroke.role is not None]
         return replace(self, strokes=seen) if 2 * len(seen) + len(self.areas) > len(self.strokes) else self
 
+    def without_plot(self) -> tuple[Drawing, shapely.Polygon | None]:
+        """Return a drawing in metres without the outline of the plot around its walls, and this outline if there is one.
+
+        It is one thin line around all others, away from them and from names of rooms; without names, walls have faces.
+        """
+        light = [item for item in self.lines if not getattr(item, "is_dark", False) and item.role in (None, "wall")]
+        thin = [item for item in light if item.width < ROOM_BOUNDS.thick_m[0]]
+        faces = polygons_of(shapely.polygonize(shapely.get_parts(list(map(line_of, thin))).tolist()))
+        plot = shapely.Polygon(max(faces, key=lambda face: face.envelope.area, default=shapely.Polygon()).exterior)
+        edge = plot.exterior.buffer(_ON_BOX_M)
+        own = {id(item) for item in thin if edge.covers(line_of(item))}
+        rest = [item for item in self.lines if id(item) not in own]
+        walls = shapely.GeometryCollection(list(map(line_of, rest)))
+        named = [shapely.Point(text.position) for text in self.letterings if set(text.room_types) - {"balcony"}]
+        names = [place for place in named if plot.covers(place)]
+        is_walled = len(light) < len(self.lines) or any(
+            face.buffer(-0.5 * ROOM_BOUNDS.walls.thickest).is_empty for face in faces
+        )
+        is_plot = all(map(walls.convex_hull.covers, names)) if names else is_walled
+        if not is_plot or not rest or not plot.buffer(-_BESIDE_FRAME_M).covers(walls):
+            return self, None
+        areas, strokes = ([item for item in rest if isinstance(item, kind)] for kind in (Area, Stroke))
+        return replace(self, areas=areas, strokes=strokes), plot
+
     def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
         """Return what is on some layers; patches, which have none, stay."""
         kept = {kind: [item for item in items if is_wanted(item.layer)] for kind, items in vars(self).items()}
@@ -244,7 +266,7 @@ class Drawing:
         )
 
 
-def outline_of(item: Area | Stroke) -> BaseGeometry:
+def line_of(item: Area | Stroke) -> BaseGeometry:
     """Return a line, or the boundary of an area."""
     return item.line if isinstance(item, Stroke) else item.shape.boundary
 
@@ -262,7 +284,7 @@ def without_frames(drawing: Drawing, check_time: CheckTime, most: int = 4) -> tu
     `most` frames around each other are found. `check_time` raises an exception to stop.
     """
     items = drawing.lines
-    lines = list(map(outline_of, items))
+    lines = list(map(line_of, items))
     if not items or not most:
         return drawing, []
     tree, whole = shapely.STRtree(lines), shapely.box(*shapely.total_bounds(lines))
@@ -295,31 +317,6 @@ def without_frames(drawing: Drawing, check_time: CheckTime, most: int = 4) -> tu
     return drawing, []
 
 
-def without_plot(drawing: Drawing) -> tuple[Drawing, shapely.Polygon | None]:
-    """Return a drawing in metres without the outline of the plot around its walls, and this outline; None without one.
-
-    It is one thin line around all others, away from them and from names of rooms; without names, walls have two faces.
-    """
-    light = [item for item in drawing.lines if not getattr(item, "is_dark", False) and item.role in (None, "wall")]
-    thin = [item for item in light if item.width < ROOM_BOUNDS.thick_m[0]]
-    faces = polygons_from_geometry(shapely.polygonize(shapely.get_parts(list(map(outline_of, thin))).tolist()))
-    plot = shapely.Polygon(max(faces, key=lambda face: face.envelope.area, default=shapely.Polygon()).exterior)
-    edge = plot.exterior.buffer(_ON_BOX_M)
-    own = {id(item) for item in thin if edge.covers(outline_of(item))}
-    rest = [item for item in drawing.lines if id(item) not in own]
-    walls = shapely.GeometryCollection(list(map(outline_of, rest)))
-    named = [shapely.Point(text.position) for text in drawing.letterings if set(text.room_types) - {"balcony"}]
-    names = [place for place in named if plot.covers(place)]
-    is_walled = len(light) < len(drawing.lines) or any(
-        face.buffer(-0.5 * ROOM_BOUNDS.walls.thickest).is_empty for face in faces
-    )
-    is_plot = all(map(walls.convex_hull.covers, names)) if names else is_walled
-    if not is_plot or not rest or not plot.buffer(-_BESIDE_FRAME_M).covers(walls):
-        return drawing, None
-    areas, strokes = ([item for item in rest if isinstance(item, kind)] for kind in (Area, Stroke))
-    return replace(drawing, areas=areas, strokes=strokes), plot
-
-
 def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: CheckTime) -> set[int]:
     """Return the numbers of the lines that are connected with a frame, or are beside it."""
     found, new = set[int](), [frame]
@@ -337,6 +334,8 @@ def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: CheckTime) -
 class Subpath:
     """Part of a path: its points, its curves (runs of curved pieces), and whether it is closed."""
 
+    # Straight pieces per curve.
+    STEPS: ClassVar[int] = 12
     points: list[tuple[float, float]] = field(default_factory=list)
     curves: list[list[tuple[float, float]]] = field(default_factory=list)
     is_closed: bool = False
@@ -390,16 +389,3 @@ def split_lines(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
             f"{len(pieces)} lines could be walls; the limit is {_MAX_SEGMENTS}; set layers to the layers of the walls"
         )
     return lines_of(pieces)
-
-
-def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
-    """Group shapes that are near each other into one geometry each."""
-    if not shapes:
-        return []
-    check_network(shapes)
-    around = shapely.union_all(shapely.buffer(shapes, 0.5 * reach_m, quad_segs=2))
-    tree = shapely.STRtree(shapely.get_parts(around))
-    members: dict[int, list[BaseGeometry]] = {}
-    for index, region in zip(*tree.query(shapes, predicate="intersects").tolist(), strict=True):
-        members.setdefault(region, []).append(shapes[index])
-    return [shapely.GeometryCollection(group) for group in members.values()]

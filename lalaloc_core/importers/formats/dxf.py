@@ -45,7 +45,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
-from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_of
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.drawing.storeys import by_storey
 from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, joined, leaves_of
@@ -441,7 +441,7 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
         drawing.swings += leaves
         builder.use(context.layer, "door swings")
     elif len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
-        shapes = polygons_from_geometry(shapely.Polygon(points))
+        shapes = polygons_of(shapely.Polygon(points))
         drawing.areas += [Area(shape, context.layer, role, width=width) for shape in shapes]
         builder.use(context.layer, f"closed lines: {role or 'possible walls or rooms'}", max(len(shapes), 1))
     elif shapely.LineString(points).length > 0.0:
@@ -491,4 +491,4 @@ def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
 def _filled_areas(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
     """Return the filled area of a hatch, between its outlines, or of a face."""
     rings = (shapely.Polygon(ring) for ring in _rings(entity, sag) if len(ring) >= 4)
-    return even_odd_polygons(part for ring in rings for part in polygons_from_geometry(ring))
+    return even_odd_polygons(part for ring in rings for part in polygons_of(ring))

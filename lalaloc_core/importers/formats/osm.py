@@ -18,7 +18,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions
 from lalaloc_core.importers.common.bounded_files import read_xml
-from lalaloc_core.importers.common.geometry import check_network, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, polygons_of
 from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.tagged_features import Feature, import_features
 
@@ -134,4 +134,4 @@ def _multipolygon(
         check_network(rings[role])
     outer, inner = (shapely.union_all(shapely.get_parts(shapely.polygonize(rings[role]))) for role in (False, True))
     area = shapely.difference(outer, inner)
-    return shapely.MultiPolygon(parts) if (parts := polygons_from_geometry(area)) else None
+    return shapely.MultiPolygon(parts) if (parts := polygons_of(area)) else None

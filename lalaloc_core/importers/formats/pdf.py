@@ -19,14 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder, Sketch
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
-from lalaloc_core.importers.drawing.scale_guess import (
-    Measures,
-    ScaleGuess,
-    assume_scale,
-    first_scale,
-    guess_scale,
-    measures_of,
-)
+from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, assume_scale, first_scale, guess_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, sketch_drawing, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
@@ -120,7 +113,7 @@ def _guess(found: PageContent, scan: PictureTexts, budget: Budget) -> ScaleGuess
         # Symbols that are found by their size tell nothing about the scale.
         letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
         sketch = _as_picture(found, scale, ReportBuilder(), budget, has_symbols=False, letterings=letterings)
-        return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
+        return Measures.of(sketch, scale, letterings, scan.drawing, dimensions)
 
     return guess_scale(measure, first_scale(0.9 * max(found.size_pt)), budget)
 

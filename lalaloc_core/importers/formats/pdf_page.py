@@ -20,18 +20,9 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import clean_name
-from lalaloc_core.importers.common.geometry import in_range, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, point_xy, polygons_of
 from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.drawing.vector_drawing import (
-    CURVE_STEPS,
-    Area,
-    Drawing,
-    Lettering,
-    Paint,
-    Stroke,
-    Subpath,
-    leaves_of,
-)
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Paint, Stroke, Subpath, leaves_of
 
 # Functions that count and return the objects of a page, and those of a form in it.
 _OF_PAGE: Any = pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject
@@ -260,7 +251,7 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
         if leaves:
             drawing.swings += leaves
         elif len(points) >= 3 and (is_filled or (subpath.is_closed and pen is not None)):
-            shells += polygons_from_geometry(shapely.Polygon(points))
+            shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and pen is not None and (line := shapely.LineString(points)).length > 0.0:
             drawing.strokes.append(Stroke(line, "", None, width_pt, drawing.next_order, pen.is_white))
     if shells:
@@ -299,7 +290,7 @@ def _subpaths(item: Any, budget: Budget) -> list[Subpath]:
 def _curve(*control: tuple[float, float]) -> list[tuple[float, float]]:
     """Return the points of a Bézier curve."""
     start, a, b, end = map(np.array, control)
-    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[:, None]
+    t = np.linspace(0.0, 1.0, Subpath.STEPS + 1)[:, None]
     return list(map(point_xy, (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end))
 
 

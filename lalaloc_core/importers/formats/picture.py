@@ -22,7 +22,7 @@ from lalaloc_core.importers.drawing.drawing_scale import (
     scale_by_dimensions,
     written_dimensions,
 )
-from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
+from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
@@ -62,7 +62,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         sketch = sketch_picture(
             gray, metres_per_pixel, ReportBuilder(), budget, warmth, has_symbols=False, letterings=placed
         )
-        return measures_of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
+        return Measures.of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
 
     def guess(written: Sequence[Scale]) -> Scale | None:
         first = first_scale(drawn_extent(gray))

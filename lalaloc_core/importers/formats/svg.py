@@ -23,23 +23,14 @@ from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_of
 from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
 from lalaloc_core.importers.drawing.storeys import by_storey
-from lalaloc_core.importers.drawing.vector_drawing import (
-    CURVE_STEPS,
-    Area,
-    Drawing,
-    Lettering,
-    Paint,
-    Stroke,
-    Subpath,
-    leaves_of,
-)
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Paint, Stroke, Subpath, leaves_of
 from lalaloc_core.importers.formats.svg_limits import HREF, check_work
 
 # Attribute of the root element with the scale of exported drawings.
@@ -357,7 +348,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         elif pen is not None and not pen.is_visible and not closed and role is None:
             builder.use(layer, "ignored (invisible)")
         elif len(points) >= 4 and (closed or (role in ("room", "wall", "obstacle") and is_filled)):
-            shells += polygons_from_geometry(shapely.Polygon(points))
+            shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and (line := shapely.LineString(points)).length > 0.0:
             is_white = pen is not None and pen.is_white
             drawing.strokes.append(Stroke(line, layer, role, width, drawing.next_order, is_white))
@@ -391,7 +382,7 @@ def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.nda
             if isinstance(segment, svgelements.Move) or segment.start is None or segment.end is None:
                 continue
             is_curved = not isinstance(segment, svgelements.Line | svgelements.Close)
-            steps = CURVE_STEPS if is_curved else 1
+            steps = Subpath.STEPS if is_curved else 1
             budget.spend(steps)
             path.add([(*segment.point(k / steps),) for k in range(steps + 1)], is_curved=is_curved)
         points = np.array(path.points, dtype=float).reshape(-1, 2)

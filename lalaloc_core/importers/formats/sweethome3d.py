@@ -22,7 +22,7 @@ from lalaloc_core.floorplan.plan_words import fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import point_xy, polygons_of
 from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, enclose
@@ -105,7 +105,7 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
         outline = _CM * np.array([(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"])
         budget.spend(len(outline))
         has_area = len(outline) >= 3 and np.isfinite(outline).all()
-        parts = polygons_from_geometry(shapely.Polygon(outline)) if has_area else []
+        parts = polygons_of(shapely.Polygon(outline)) if has_area else []
         builder.use("room", "rooms" if parts else "ignored (no area)")
         drawn += [(part, room.get("name") or None) for part in parts]
     height_m = storey.height_m if ROOM_HEIGHT_M[0] <= storey.height_m <= ROOM_HEIGHT_M[1] else None
@@ -117,7 +117,7 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
     taken = shapely.union_all([room.shape for room in sketch.rooms])
     for part, name in drawn:
         if shapely.intersection(part, taken).area <= _SAME * part.area:
-            free = polygons_from_geometry(part.difference(walls))
+            free = polygons_of(part.difference(walls))
             sketch.rooms += [SketchedRoom(free_part, name, (), height_m) for free_part in free]
     sketch.openings += [SketchedOpening("passage", gap.start, gap.end) for gap in enclosed.gaps]
 
@@ -135,7 +135,7 @@ def _wall(wall: Element, builder: ReportBuilder, budget: Budget) -> list[shapely
         return []
     builder.use("wall", "walls")
     body = shapely.LineString(points).buffer(0.5 * thickness_m, cap_style="square", join_style="mitre")
-    return polygons_from_geometry(body)
+    return polygons_of(body)
 
 
 def _arc(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], angle: float) -> Float[np.ndarray, "n 2"]:

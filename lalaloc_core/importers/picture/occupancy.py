@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_of
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import explained_size
 from lalaloc_core.importers.picture.ink import Colours, Gray, Labels, Mask, find_skew, rotate_picture
@@ -291,7 +291,7 @@ def _read_walls(cells: Gray, grid: OccupancyGrid, budget: Budget) -> tuple[Sketc
     inner.no_room = [shapely.transform(area, to_map) for area in inner.no_room]
     rooms = []
     for room in sketch.rooms:
-        for part in polygons_from_geometry(room.shape.buffer(grown * fine_m, join_style="mitre")):
+        for part in polygons_of(room.shape.buffer(grown * fine_m, join_style="mitre")):
             floor = shapely.transform(part, to_grid)
             if _free_share(floor, grid) >= _FREE_SHARE:
                 rooms.append(SketchedRoom(shapely.transform(floor, frame.to_map)))

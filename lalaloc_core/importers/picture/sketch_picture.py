@@ -13,7 +13,7 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.geometry import polygons_of
 from lalaloc_core.importers.common.room_bounds import WallConfig
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
@@ -317,11 +317,11 @@ def _report_coverage(reading: _Reading, builder: ReportBuilder) -> None:
     """Report the share of the drawn area that became rooms, and the parts that did not."""
     walls = shapely.union_all([reading.enclosed.walls, *(gap.shape for gap in reading.enclosed.gaps)])
     closed = walls.buffer(_CLOSING_M, join_style="mitre")
-    drawn = shapely.union_all([shapely.Polygon(part.exterior) for part in polygons_from_geometry(closed)])
+    drawn = shapely.union_all([shapely.Polygon(part.exterior) for part in polygons_of(closed)])
     inside = drawn.buffer(-_CLOSING_M, join_style="mitre").difference(walls)
     rooms = shapely.union_all(reading.enclosed.rooms)
     half_m = 0.5 * reading.walls.thickness_m + _CLEARANCE_M
-    missing = polygons_from_geometry(inside.difference(rooms).buffer(-half_m).buffer(half_m))
+    missing = polygons_of(inside.difference(rooms).buffer(-half_m).buffer(half_m))
     lost = sorted((part for part in missing if part.area >= _MIN_ROOM_M2), key=lambda part: -part.area)
     if inside.area <= 0.0:
         return

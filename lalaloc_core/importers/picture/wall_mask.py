@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Bool, Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import cross, polygons_of
 from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.picture.ink import Ink, Labels, Mask
 
@@ -258,8 +258,8 @@ def wall_polygons(walls: WallMask, ink: Ink, check_time: CheckTime) -> list[shap
             continue
         shell = shapely.Polygon(ring, holes[index])
         # Contours run through pixel centres, so the wall reaches half a pixel farther.
-        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_from_geometry(shell)]
-        found += [align_edges(part) for shape in grown for part in polygons_from_geometry(shape.simplify(straight))]
+        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_of(shell)]
+        found += [align_edges(part) for shape in grown for part in polygons_of(shape.simplify(straight))]
     return found
 
 
