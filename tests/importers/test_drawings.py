@@ -16,6 +16,7 @@ from lalaloc_core.importers import ImportOptions, import_plan
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.drawing.drawing_scale import scale_by_dimensions
+from lalaloc_core.importers.drawing.vector_drawing import joined
 from lalaloc_core.importers.formats import dxf
 from tests.importers.conftest import dxf_file, lines, names_and_types, shapes
 

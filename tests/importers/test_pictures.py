@@ -26,7 +26,6 @@ from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import find_skew
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from tests.importers.conftest import lines, names_and_types, shapes
-from tests.importers.test_fault_files import FOLDER
 from tests.painted import picture_file
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
@@ -485,12 +484,6 @@ def test_walls_that_are_unreadable_without_symbols_are_read_with_them():
     plan = draw_plan("thin", 2, has_symbols=True)
     draft = import_plan(plan.png(), ImportOptions(metres_per_pixel=plan.metres_per_pixel))
     assert len(draft.document["rooms"]) == len(plan.rooms)
-
-
-@pytest.mark.parametrize("name", ["transparent.png", "white_on_transparent.png"])
-def test_lines_on_a_transparent_ground_are_walls_whatever_their_tone(name: str):
-    draft = import_plan((FOLDER / name).read_bytes(), ImportOptions(metres_per_pixel=0.0125))
-    assert sorted(room.area for room in shapes(draft.document)) == pytest.approx([18.91, 26.63], abs=0.4)
 
 
 def test_white_rooms_with_dark_walls_on_a_transparent_ground_are_rooms():

@@ -120,7 +120,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if fixtures:
         document["fixtures"] = [{"kind": item.kind, "outline": _ring(item.shape.exterior)} for _, item in fixtures]
     _add_trust(document, sketch, builder)
-    builder.warnings += check_document(document, is_scale_certain=is_certain, metres_per_unit=metres_per_unit)
+    builder.warnings += check_document(document, is_certain=is_certain, metres_per_unit=metres_per_unit)
     # Validate now, while the error can still refer to the file.
     plan = FloorPlan.from_dict(document, limits)
     builder.warnings += [f"{line}; draw each area once" for line in plan.warnings if " overlap" in line]
@@ -156,9 +156,7 @@ def assemble_levels(
     """
     chosen = choose_levels(levels, options)
     if len(chosen) > (most := budget.limits.max_levels):
-        raise InvalidFloorPlanError(
-            f"the file has {len(chosen)} levels; the limit is {most} (max_levels); choose one with level"
-        )
+        raise InvalidFloorPlanError(f"the file has {len(chosen)} levels; the limit is {most} (max_levels); set level")
     plans: list[ImportedPlan] = []
     empty: dict[str, NoRoomError] = {}
     for done, (level, content) in enumerate(chosen):
@@ -179,10 +177,8 @@ def assemble_levels(
         roofs = [plan.level.name for plan in plans if plan.level is not None and plan not in below]
         reasons += [(name, "it is a roof (set level to read it)") for name in roofs[:_MAX_NAMED]]
         plans = below
-    left_out = [f"level '{name}' was left out: {reason}" for name, reason in reasons]
-    return tuple(
-        replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *left_out))) for plan in plans
-    )
+    lost = [f"level '{name}' was left out: {reason}" for name, reason in reasons]
+    return tuple(replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *lost))) for plan in plans)
 
 
 def clean_name(name: str | None) -> str | None:
@@ -193,12 +189,10 @@ def clean_name(name: str | None) -> str | None:
     return " ".join(spaced.split())[: DEFAULT_LIMITS.max_name_length] or None
 
 
-def _clean(
-    room: SketchedRoom, obstacles: shapely.STRtree, limits: PlanLimits, builder: ReportBuilder
-) -> list[SketchedRoom]:
+def _clean(room: SketchedRoom, tree: shapely.STRtree, limits: PlanLimits, builder: ReportBuilder) -> list[SketchedRoom]:
     label = _label(room)
     shape = room.shape
-    near = obstacles.geometries[np.sort(obstacles.query(shape))]
+    near = tree.geometries[np.sort(tree.query(shape))]
     if inside := [obstacle for obstacle in near if obstacle.intersects(shape)]:
         shape = shapely.difference(shape, shapely.union_all(inside))
     floors = [simple for floor in polygons_of(shape) for simple in _simple(_simplify(floor, label, limits, builder))]

@@ -353,9 +353,7 @@ def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: CheckTime)
 def report_floor(name: str, floor: Floor, builder: ReportBuilder) -> None:
     """Report a floor that is not level, and parts of a room that are higher than its floor."""
     if floor.rise_m > _UNEVEN_M:
-        builder.notes.append(
-            f"the floor of {name} rises by {floor.rise_m:.2f} m; heights in it count from its lowest point"
-        )
+        builder.notes.append(f"the floor of {name} rises by {floor.rise_m:.2f} m; heights count from its lowest point")
     whole_m2 = floor.higher_m2 + sum(part.area for part in floor.parts)
     if floor.higher_m2 > _MIN_HIGHER * whole_m2:
         builder.warnings.append(

@@ -285,11 +285,9 @@ def check_areas(
     check_scale(builder.metres_per_unit, builder.scale_source, measured, builder)
 
 
-def areas_of_rooms(
-    shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
-) -> dict[int, tuple[float, float]]:
+def areas_of_rooms(shapes: Sequence[shapely.Polygon], written: Sequence[Lettering]) -> dict[int, tuple[float, float]]:
     """Return the area (m²) that is written in each room, and the room's area, by the index of the room."""
-    texts, _ = texts_of_rooms(shapes, letterings)
+    texts, _ = texts_of_rooms(shapes, written)
     return _written_areas(shapes, [[lettering.text for lettering in found] for found in texts])
 
 

@@ -7,7 +7,7 @@ light area hides a part of a wall.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -41,9 +41,7 @@ _TOUCHING_M = 0.01
 _PAIRS, _PAIRS_PER_AREA = 1000, 4
 
 
-def drawn_panes(
-    lines: Iterable[shapely.LineString], walls: BaseGeometry, least: int, check_time: CheckTime
-) -> list[Gap]:
+def drawn_panes(lines: list[shapely.LineString], walls: BaseGeometry, least: int, check_time: CheckTime) -> list[Gap]:
     """Return the windows among the thin lines of a drawing (m).
 
     The walls include the areas between the lines of windows, if walls are drawn with two lines. At least `least` lines

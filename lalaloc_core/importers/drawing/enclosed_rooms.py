@@ -155,16 +155,14 @@ def find_gaps(
     return [gaps[index] for index in without_overlaps([gap.shape for gap in gaps], 0.25, check_time)]
 
 
-def without_overlaps(
-    shapes: Sequence[shapely.Polygon], share: float, check_time: CheckTime = lambda: None
-) -> list[int]:
-    """Return the numbers of the shapes that share less than a part of their area with each that was kept before."""
-    tree, is_kept = shapely.STRtree(shapes), np.zeros(len(shapes), bool)
-    for index, shape in enumerate(shapes):
+def without_overlaps(areas: Sequence[shapely.Polygon], share: float, check_time: CheckTime = lambda: None) -> list[int]:
+    """Return the numbers of the areas that share less than a part of their area with each that was kept before."""
+    tree, is_kept = shapely.STRtree(areas), np.zeros(len(areas), bool)
+    for index, shape in enumerate(areas):
         check_time()
         near = tree.query(shape)
-        shared = (shapely.intersection(shape, shapes[k]).area for k in near[is_kept[near]])
-        is_kept[index] = all(area < share * shape.area for area in shared)
+        shared = (shapely.intersection(shape, areas[k]).area for k in near[is_kept[near]])
+        is_kept[index] = all(shared_area < share * shape.area for shared_area in shared)
     return np.flatnonzero(is_kept).tolist()
 
 

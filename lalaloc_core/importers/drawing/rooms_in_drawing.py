@@ -88,9 +88,8 @@ def choose_reading(
                 continue
             if found is not None:
                 rooms = [Area(shape, "", "room") for shape in found.rooms]
-                readings.append(
-                    Reading(f"the areas enclosed by {source}", rooms, found.gaps, found.walls, bounds=bounds)
-                )
+                named = f"the areas enclosed by {source}"
+                readings.append(Reading(named, rooms, found.gaps, found.walls, bounds=bounds))
         if refused is not None and not any(reading.rooms for reading in readings):
             raise refused
     nothing = Reading("the areas enclosed by all lines", [], walls=shapely.Polygon(), bounds=bounds)

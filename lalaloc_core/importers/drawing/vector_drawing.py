@@ -205,7 +205,7 @@ class Drawing:
         return replace(self, strokes=seen) if 2 * len(seen) + len(self.areas) > len(self.strokes) else self
 
     def without_plot(self) -> tuple[Drawing, shapely.Polygon | None]:
-        """Return a drawing in metres without the outline of the plot around its walls, and this outline if there is one.
+        """Return a drawing in metres without the outline of the plot around its walls, and this outline, if any.
 
         It is one thin line around all others, away from them and from names of rooms; without names, walls have faces.
         """
@@ -219,9 +219,8 @@ class Drawing:
         walls = shapely.GeometryCollection(list(map(line_of, rest)))
         named = [shapely.Point(text.position) for text in self.letterings if set(text.room_types) - {"balcony"}]
         names = [place for place in named if plot.covers(place)]
-        is_walled = len(light) < len(self.lines) or any(
-            face.buffer(-0.5 * ROOM_BOUNDS.walls.thickest).is_empty for face in faces
-        )
+        thickest_m = ROOM_BOUNDS.walls.thickest
+        is_walled = len(light) < len(self.lines) or any(face.buffer(-0.5 * thickest_m).is_empty for face in faces)
         is_plot = all(map(walls.convex_hull.covers, names)) if names else is_walled
         if not is_plot or not rest or not plot.buffer(-_BESIDE_FRAME_M).covers(walls):
             return self, None
@@ -356,10 +355,8 @@ def leaves_of(curves: Sequence[Float[np.ndarray, "_ 2"]], layer: str = "") -> li
     return [swing for swing in swings if swing is not None]
 
 
-def fit_swing(
-    points: Float[np.ndarray, "n 2"], layer: str, angles_deg: tuple[float, float] = _SWING_DEG
-) -> Swing | None:
-    """Return the arc that a curve follows, None if its angle is outside `angles_deg` or it is not round."""
+def fit_swing(points: Float[np.ndarray, "n 2"], layer: str, turn_deg: tuple[float, float] = _SWING_DEG) -> Swing | None:
+    """Return the arc that a curve follows, None if its angle is outside `turn_deg` or it is not round."""
     if len(points) < 4 or not np.isfinite(points).all():
         return None
     middle = points.mean(axis=0)
@@ -375,7 +372,7 @@ def fit_swing(
     if radius <= 0.0 or float(np.abs(radii - radius).max()) > _ROUND * radius:
         return None
     angles = np.unwrap(np.arctan2(*(local - centre).T[::-1]))
-    if not angles_deg[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= angles_deg[1]:
+    if not turn_deg[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= turn_deg[1]:
         return None
     hinge, first, last = centre + middle, points[0], points[-1]
     return Swing(point_xy(hinge), point_xy(first), point_xy(last), layer)

@@ -166,9 +166,7 @@ def _open(content: bytes) -> DxfDocument:
             content = text.getvalue().encode()
         document, _ = recover.read(io.BytesIO(content))
     except (DXFError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise InvalidFloorPlanError(
-            "the DXF is damaged and cannot be read; save it again, as DXF R2010 or later"
-        ) from error
+        raise InvalidFloorPlanError("the DXF is damaged and cannot be read; save it as DXF R2010 or later") from error
     return document
 
 

@@ -116,11 +116,9 @@ def _way_shape(points: list[_Position], tags: Mapping[str, Any]) -> BaseGeometry
     return shapely.LineString(points) if len(points) >= 2 else None
 
 
-def _multipolygon(
-    element: Mapping[str, Any], lines: Mapping[Any, list[_Position]], budget: Budget
-) -> BaseGeometry | None:
+def _multipolygon(raw: Mapping[str, Any], lines: Mapping[Any, list[_Position]], budget: Budget) -> BaseGeometry | None:
     """Return the area of a relation; its rings can be divided into several ways."""
-    members = element.get("members")
+    members = raw.get("members")
     rings: dict[bool, list[shapely.LineString]] = {True: [], False: []}
     for member in members if isinstance(members, list) else []:
         if isinstance(member, Mapping) and member.get("type") == "way":

@@ -57,14 +57,12 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
             found.drawing = found.drawing.cropped(paper)
         notes = list(budget.hints)
         budget.hints += text_hints(found.drawing.letterings, f"page {options.page} of the PDF")
-        return _read_plan(found, notes, options, budget)
+        return _read(found, notes, options, budget)
     finally:
         document.close()
 
 
-def _read_plan(
-    found: PageContent, notes: list[str], options: ImportOptions, budget: Budget
-) -> tuple[ImportedPlan, ...]:
+def _read(found: PageContent, notes: list[str], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     builder = ReportBuilder("pdf", is_draft=True, notes=notes)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")

@@ -56,13 +56,11 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     dimensions = written_dimensions(texts.drawing, budget.check_time)
     measured = scale_by_dimensions(dimensions, texts.drawing.extent) if texts.drawing.shapes else None
 
-    def measure(metres_per_pixel: float) -> Measures:
+    def measure(scale: float) -> Measures:
         # Symbols that are found by their size tell nothing about the scale.
-        placed = texts.placed(metres_per_pixel)
-        sketch = sketch_picture(
-            gray, metres_per_pixel, ReportBuilder(), budget, warmth, has_symbols=False, letterings=placed
-        )
-        return Measures.of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
+        placed = texts.placed(scale)
+        sketch = sketch_picture(gray, scale, ReportBuilder(), budget, warmth, has_symbols=False, letterings=placed)
+        return Measures.of(sketch, scale, placed, texts.drawing, dimensions)
 
     def guess(written: Sequence[Scale]) -> Scale | None:
         first = first_scale(drawn_extent(gray))
@@ -123,7 +121,7 @@ def _check_kind(gray: Gray, options: ImportOptions, builder: ReportBuilder) -> N
 
 def _open(content: bytes, builder: ReportBuilder, budget: Budget) -> tuple[Gray, Gray | None, Colours, float | None]:
     """Return the grey picture on white, its warmth, its colours, and the length of a pixel on paper if it is given."""
-    with open_picture(content, ("PNG", "JPEG"), "the picture", "save it again as PNG", budget) as picture:
+    with open_picture(content, ["PNG", "JPEG"], "the picture", "save it again as PNG", budget) as picture:
         if min(picture.size) < _MIN_SIDE_PX:
             raise InvalidFloorPlanError(
                 f"the picture has {picture.width} x {picture.height} pixels; the minimum is {_MIN_SIDE_PX} x "
@@ -153,16 +151,14 @@ def _open(content: bytes, builder: ReportBuilder, budget: Budget) -> tuple[Gray,
 
 
 @contextmanager
-def open_picture(
-    content: bytes, formats: tuple[str, ...], name: str, remedy: str, budget: Budget
-) -> Iterator[Image.Image]:
+def open_picture(content: bytes, kinds: list[str], name: str, remedy: str, budget: Budget) -> Iterator[Image.Image]:
     """Open a picture within the limit of pixels; errors in the block are those of a damaged file."""
     limit = budget.limits.max_plan_pixels
     many = f"the limit is {limit} in total (max_plan_pixels); reduce its resolution, or crop it"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=formats) as picture:
+            with Image.open(io.BytesIO(content), formats=kinds) as picture:
                 if picture.width * picture.height > limit:
                     raise InvalidFloorPlanError(f"{name} has {picture.width} x {picture.height} pixels; {many}")
                 yield picture

@@ -187,7 +187,7 @@ def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
 
     from lalaloc_core.importers.formats.picture import in_bytes, open_picture
 
-    with open_picture(content, ("PPM", "PNG"), "the picture of the ROS map", "save it again", budget) as picture:
+    with open_picture(content, ["PPM", "PNG"], "the picture of the ROS map", "save it again", budget) as picture:
         # Transparent cells are unknown.
         flat = Image.new("RGBA", picture.size, (_UNKNOWN, _UNKNOWN, _UNKNOWN, 255))
         flat.alpha_composite(in_bytes(picture).convert("RGBA"))

@@ -41,9 +41,7 @@ _GROUPS = (svgelements.Group, svgelements.Use)
 _COMBINED = re.compile(r"(?:^|,)\s*([^\s@,][^,]*[\s>+~\[:][^\s,][^,]*)")
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 # Names that editors generate.
-_AUTOMATIC = re.compile(
-    r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I
-)
+_MADE = re.compile(r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I)
 # A character in an id of Illustrator.
 _ESCAPED = re.compile(r"_x([0-9A-F]{2,4})_")
 _NONZERO = (None, "nonzero")
@@ -399,7 +397,7 @@ def _name_of(element: Any, context: _Context) -> str | None:
     own = element.values.get("attributes") or {}
     for key in (_LABEL, "data-name", "id"):
         text = _ESCAPED.sub(lambda found: chr(int(found[1], 16)), str(own.get(key) or "")).strip()
-        if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_from_name(text) is None):
+        if text and not _MADE.fullmatch(text) and (key != "id" or role_from_name(text) is None):
             return text.replace("_", " ")
     if context.role != "room" or context.kind is None:
         return None

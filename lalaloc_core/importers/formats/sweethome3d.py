@@ -58,9 +58,7 @@ def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> 
         raise InvalidFloorPlanError(f"the root element of {_MEMBER} is <{local_name(root)[:50]}>; it must be <home>")
     storeys = _storeys(root)
     if not storeys:
-        raise InvalidFloorPlanError(
-            "the home has no walls and no rooms; draw them in Sweet Home 3D, or export the plan"
-        )
+        raise InvalidFloorPlanError("the home has no walls and no rooms; draw them in Sweet Home 3D or export the plan")
     compass = next((element for element in root if local_name(element) == "compass"), None)
     north_deg = None if compass is None else math.degrees(_number(compass, "northDirection", 0.0))
 

@@ -83,7 +83,7 @@ def sketch_map(colours: Colours, metres_per_pixel: float, builder: ReportBuilder
     ground = (label >= 0) & (label < first)
     ground &= _near(~_near(~ground, _OUTER_M / cell_m), _OUTER_M / cell_m)
     label = np.where(label >= first, label, 0)
-    walls = _without_specks(_lines_around(ground, label > 0, small, tones, cell_m), frame) > 0
+    walls = _without_specks(_lines_at(ground, label > 0, small, tones, cell_m), frame) > 0
     areas, zones_m2 = _areas(label, walls, cell_m, budget)
     free = areas > 0
     between = _closed(free, _GAP_M / cell_m) & ~free
@@ -162,9 +162,7 @@ def _is_floor(mask: Mask, cell_m: float) -> bool:
     return bool(inside.any()) and float(mask[inside].mean()) >= _EVEN
 
 
-def _lines_around(
-    ground: Mask, floor: Mask, colours: np.ndarray, tones: Float[np.ndarray, "n 3"], cell_m: float
-) -> Mask:
+def _lines_at(ground: Mask, floor: Mask, colours: np.ndarray, tones: Float[np.ndarray, "n 3"], cell_m: float) -> Mask:
     """Return all lines of the tone that most lines between ground and floors have; none if blends are between them."""
     far = _distances(colours, tones).min(axis=0)
     beside = _near(ground, max(1.5, 0.8 * _OUTER_M / cell_m)) & ~ground & _near(floor, 1.5 * _OUTER_M / cell_m)
@@ -248,9 +246,7 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     builder.no_room = report.no_room
     if builder.no_room:
         area_m2 = sum(area.area for area in builder.no_room)
-        builder.warnings.append(
-            f"{area_m2:.0f} m² inside the walls became no room (no_room); close the walls in the picture"
-        )
+        builder.warnings.append(f"{area_m2:.0f} m² inside walls became no room (no_room); close them in the picture")
     _report_free_cells(sketch, grid, builder)
     if sketch.openings:
         builder.unsure.append(f"{len(sketch.openings)} gaps in walls are taken for passages or doors")

@@ -246,9 +246,7 @@ def _fixtures(
         and not any(other.holds(shape) for other in large)
     ]
     if unused:
-        builder.notes.append(
-            f"{len(unused)} drawn shapes inside rooms are no clear symbols of fixtures and were not used"
-        )
+        builder.notes.append(f"{len(unused)} drawn shapes in rooms are no clear symbols of fixtures and were not used")
     return found
 
 
