@@ -37,9 +37,8 @@ def test_largest_of_several_storeys_is_read_and_the_others_are_named():
     (warning,) = (warning for warning in plan.report.warnings if "storeys seem to be drawn" in warning)
     assert "this plan is 'Storey 1'" in warning
     crop = warning.split("m² at crop=")[2].split(";")[0]
-    other = import_plan(
-        picture_file(_storeys()), ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop})
-    )
+    options = ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop})
+    other = import_plan(picture_file(_storeys()), options)
     (room,) = shapes(other.document)
     assert room.area == pytest.approx(15.6, abs=0.5)
     # Coordinates stay those of the whole picture.
@@ -51,6 +50,8 @@ def test_every_storey_of_a_picture_is_a_level():
     left, right = import_plans(picture_file(_storeys()), ImportOptions.from_text(options), building="House")
     assert (left.document["name"], right.document["name"]) == ("House – Storey 1", "House – Storey 2")
     assert left.report.levels == right.report.levels == ("Storey 1", "Storey 2")
+    # The doorway of the first storey is said of it alone.
+    assert [sum("taken for a passage" in line for line in plan.report.unsure) for plan in (left, right)] == [1, 0]
     chosen = import_plan(picture_file(_storeys()), ImportOptions.from_text({**options, "level": "Storey 2"}))
     assert chosen.document["rooms"] == right.document["rooms"]
 

@@ -132,6 +132,7 @@ def test_file_is_refused_with_a_remedy(name: str, tmp_path: Path, capsys: pytest
 def test_storeys_on_layers_of_their_own_are_plans():
     plans = import_plans(content_of("levels_by_layer.dxf"))
     assert [plan.level and plan.level.name for plan in plans] == ["EG", "OG"]
+    assert [any("OG" in use.layer for use in plan.report.layers) for plan in plans] == [False, True]
     assert [round(sum(room.area for room in shapes(plan.document)), 1) for plan in plans] == [79.9, 79.9]
 
 

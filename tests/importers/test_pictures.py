@@ -408,8 +408,11 @@ def test_skew_is_found(degrees: float):
     assert find_skew(turned) == pytest.approx(-degrees, abs=0.15)
 
 
-def vector_pdf(more: str = "") -> bytes:
-    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres."""
+def vector_pdf(more: str = "", layer: str = "") -> bytes:
+    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres.
+
+    `layer` are members of a layer /L, which the operators can be on.
+    """
     centimetre = 72 / 2.54
     content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n{more}\n"
     for x, y, w, h in [
@@ -423,22 +426,31 @@ def vector_pdf(more: str = "") -> bytes:
     for line in range(8):
         content += f"7 {4 + 0.1 * line:.1f} m 8 {4 + 0.1 * line:.1f} l S\n"
     objects = [
-        "<< /Type /Catalog /Pages 2 0 R >>",
+        "<< /Type /Catalog /Pages 2 0 R /OCProperties << /OCGs [6 0 R] /D << >> >> >>",
         "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
         "<< /Type /Page /Parent 2 0 R /MediaBox [0 0 400 300] /Contents 4 0 R "
-        "/Resources << /Font << /F1 5 0 R >> >> >>",
+        "/Resources << /Font << /F1 5 0 R >> /Properties << /L 6 0 R >> >> >>",
         f"<< /Length {len(content)} >>\nstream\n{content}endstream",
         "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+        f"<< /Type /OCG /Name (Old) {layer} >>",
     ]
     out, offsets = "%PDF-1.4\n", []
     for number, body in enumerate(objects, 1):
         offsets.append(len(out))
         out += f"{number} 0 obj\n{body}\nendobj\n"
     start = len(out)
-    out += f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n" + "".join(
-        f"{offset:010} 00000 n \n" for offset in offsets
-    )
+    places = "".join(f"{offset:010} 00000 n \n" for offset in offsets)
+    out += f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{places}"
     return f"{out}trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
+
+
+@pytest.mark.parametrize("use", ["View", "Print"])
+def test_layer_of_a_pdf_that_is_off_by_its_use_is_left_out(use: str):
+    wall = "/OC /L BDC 2 0 0.1 5.3 re f EMC"
+    assert len(import_plan(vector_pdf(wall)).document["rooms"]) == 3
+    plan = import_plan(vector_pdf(wall, f"/Usage << /{use} << /{use}State /OFF >> >>"))
+    assert len(plan.document["rooms"]) == 2
+    assert any("switched off in the PDF were not read: 'Old'" in line for line in plan.report.notes)
 
 
 @pytest.mark.parametrize(("picture", "count"), [("", 0), ("q 3 0 0 4 10 1 cm BI /W 1 /H 1 /CS /G /BPC 8 ID x EI Q", 1)])
