@@ -68,10 +68,9 @@ def test_storeys_are_apart_where_no_wall_joins_them(gap_px: int, count: int):
 def test_storeys_have_the_levels_of_their_titles():
     rooms = [SketchedRoom(shapely.box(0.0, y, 6.0, y + 4.0)) for y in (0.0, 6.0, 12.0)]
     texts = {"FIRST FLOOR": (-3.0, 2.0), "Ground floor": (-3.0, 8.0), "Loft": (3.0, 14.0), "Garage": (-3.0, 14.0)}
-    letterings = [Lettering(text, position) for text, position in texts.items()]
-    plans = assemble_storeys(
-        Sketch(rooms=rooms), letterings, ReportBuilder("picture"), ImportOptions(), Budget(), lambda box: box
-    )
+    titles = [Lettering(text, position) for text, position in texts.items()]
+    sketch = Sketch(rooms=rooms)
+    plans = assemble_storeys(sketch, titles, ReportBuilder("picture"), ImportOptions(), Budget(), lambda box: box)
     found = [(plan.level.name, plan.level.number) for plan in plans if plan.level is not None]
     assert sorted(found, key=str) == [("FIRST FLOOR", 1.0), ("Ground floor", 0.0), ("Storey 1", None)]
 

@@ -180,16 +180,12 @@ def test_drawing_without_rooms_names_layers_and_attempts():
     document = new_dxf()
     for x in range(5):
         document.modelspace().add_line((x, 0), (x, 9), dxfattribs={"layer": "WALL"})
-    with pytest.raises(
-        InvalidFloorPlanError, match=r"has 5 lines: wall on 'WALL' \(tried: rooms are the areas enclosed"
-    ):
+    with pytest.raises(InvalidFloorPlanError, match=r"has 5 lines: wall on 'WALL' \(tried: rooms are the areas"):
         import_plan(dxf_file(document))
 
 
 def test_unknown_layers_are_rejected_with_the_known_ones():
-    with pytest.raises(
-        InvalidFloorPlanError, match=r"layers is walls, but these layers are empty; .*'Fenster', .*'WAND'"
-    ):
+    with pytest.raises(InvalidFloorPlanError, match=r"layers is walls, but .* are empty; .*'Fenster', .*'WAND'"):
         import_plan(dxf_file(_german_walls()), ImportOptions(layers=("walls",)))
 
 

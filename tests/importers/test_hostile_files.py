@@ -171,14 +171,9 @@ def test_repeated_empty_block(rows: int, columns: int):
 
 
 def test_time_is_checked_at_every_empty_block():
-    ticks = itertools.count()
+    ticks, limits = itertools.count(), ImportLimits(max_import_s=500.0)
     with pytest.raises(InvalidFloorPlanError, match="takes more than"):
-        import_plans(
-            _dxf_insert(100, 100),
-            ImportOptions(units="m"),
-            ImportLimits(max_import_s=500.0),
-            lambda: float(next(ticks)),
-        )
+        import_plans(_dxf_insert(100, 100), ImportOptions(units="m"), limits, lambda: float(next(ticks)))
 
 
 def test_curves_beyond_the_stated_size_have_few_points(monkeypatch: pytest.MonkeyPatch):
@@ -387,9 +382,7 @@ def _hostile(format: str, title: str) -> HostilePlan:
         ("symbols of symbols", r"the file of \d+ bytes draws more than \d+ shapes, the limit for its size"),
     ],
 )
-def test_svg_is_refused_before_its_library_multiplies_what_it_reads(
-    monkeypatch: pytest.MonkeyPatch, title: str, message: str
-):
+def test_svg_is_refused_before_its_library_multiplies_it(monkeypatch: pytest.MonkeyPatch, title: str, message: str):
     monkeypatch.setattr(svgelements.SVG, "parse", pytest.fail)
     _assert_rejected(_hostile("svg", title).make(100_000), message)
 

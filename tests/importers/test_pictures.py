@@ -315,12 +315,9 @@ def test_openings_that_look_like_doors_inside_are_doors_outside():
 
 def test_single_line_is_a_window_outside_and_a_passage_inside():
     page, pen = two_rooms()
-    for box, line in [
-        ((200, 95, 320, 125), ((200, 110), (320, 110))),
-        ((440, 200, 460, 290), ((450, 200), (450, 290))),
-    ]:
+    for box, ends in [((200, 95, 320, 125), (200, 110, 320, 110)), ((440, 200, 460, 290), (450, 200, 450, 290))]:
         pen.rectangle(box, fill="white")
-        pen.line(line, fill="black", width=2)
+        pen.line(ends, fill="black", width=2)
     plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01))
     assert len(plan.document["rooms"]) == 2
     (window,) = lines(plan.document, "window")
@@ -484,9 +481,7 @@ def test_clear_symbols_become_fixtures_and_other_shapes_are_counted():
     fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in draft.document["fixtures"]]
     assert {kind for kind, _ in fixtures} == {"stairs", "sink", "bath", "stove", "basin", "shower"}
     for kind, outline in fixtures:
-        assert any(
-            symbol.kind == kind and intersection_over_union(symbol.outline, outline) > 0.6 for symbol in plan.symbols
-        )
+        assert any(item.kind == kind and intersection_over_union(item.outline, outline) > 0.6 for item in plan.symbols)
     assert any("fixtures are taken from their symbols" in line for line in draft.report.unsure)
     assert any("no clear symbols of fixtures" in line for line in draft.report.notes)
 

@@ -419,9 +419,7 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
 
 
 @pytest.mark.slow
-def test_link_holds_an_answer_that_the_service_does_not_keep(
-    browser: Browser, start_app: StartApp, tmp_path: Path
-) -> None:
+def test_link_holds_an_answer_that_is_not_kept(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         for visited in visit(browser, client):
             page = visited.open_example()
