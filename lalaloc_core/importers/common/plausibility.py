@@ -70,12 +70,12 @@ def unit_hints(subject: str, value: float, usual_m: tuple[float, float], metres_
     return [f"{subject} is {value:g} m; the usual range is {low:.2g} to {high:.2g} m; {advice}"]
 
 
-def check_leaves(leaves_m: Sequence[float], metres_per_unit: float) -> list[str]:
-    """Return a warning if the leaves of doors in a drawing are alike, but not as wide as usual."""
+def check_leaves(leaves_m: Sequence[float], metres_per_unit: float, least: int = 2) -> list[str]:
+    """Return a warning if at least so many leaves of doors in a drawing are alike, but not as wide as usual."""
     median = float(np.median(leaves_m or [0.0]))
     alike = sum(abs(leaf / median - 1.0) <= _ALIKE for leaf in leaves_m)
     usual = sum(_WIDTHS_M[0] <= leaf <= _WIDTHS_M[1] for leaf in leaves_m)
-    if alike < max(2, 0.5 * len(leaves_m)) or usual > _SOME * len(leaves_m):
+    if alike < max(least, 0.5 * len(leaves_m)) or usual > _SOME * len(leaves_m):
         return []
     subject = f"the median width of the leaves of {len(leaves_m)} doors"
     found = unit_hints(subject, round(median, 4), _WIDTHS_M, metres_per_unit)

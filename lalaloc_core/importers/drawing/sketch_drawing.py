@@ -155,6 +155,12 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             budget.trace.add("gap", [gap.shape for gap in gaps])
     budget.begin("placing names and openings")
     sketch.rooms = name_rooms(shapes, drawing.letterings, builder, sketch.drawn)
+    for room in (room for room in sketch.rooms if room.name is None and len(sketch.rooms) > 1):
+        if all(shapely.covers(shapely.Polygon(room.shape.exterior), [other.shape for other in sketch.rooms])):
+            builder.warnings.append(
+                f"a room of {room.shape.area:.0f} m² without a name lies around all others; if it is the plot, set "
+                "layers or crop to the walls"
+            )
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
@@ -166,7 +172,8 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     leaf_m = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
     sketch.leaves_m = list(leaf_m.values()) or [swing.radius for swing in swings]
     drawn_m = [swing.radius for swing in (*drawing.swings, *leaves)]
-    builder.warnings += check_leaves(drawn_m, builder.metres_per_unit)
+    is_sure = any(finder.closed_by(swing) is not None for swing in drawing.swings)
+    builder.warnings += check_leaves(drawn_m, builder.metres_per_unit, 1 if is_sure else 2)
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
     taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
     rooms = shapely.STRtree([room.shape for room in shapes])

@@ -239,15 +239,23 @@ def by_storey(
         others = {layer for layer, _ in builder.uses if (found := _storey(layer)) and found[1] in numbers}
         report.uses = Counter({use: count for use, count in builder.uses.items() if use[0] not in others})
         report.warnings = [line for line in builder.warnings if not any(f"'{x[:50]}'" in line for x in others)]
-        told_by = "the heights of its lines" if storeys is by_height else "the names of layers; others belong to all"
+        told_by = (
+            "the heights of its lines"
+            if len(by_height) == len(storeys)
+            else "the names of layers; others belong to all"
+        )
         report.notes.append(f"storey '{level.name}' by {told_by}")
         return make(part, report, level)
 
     roles = {item.role for item in drawing.lines}
     main = "wall" if "wall" in roles else "room" if "room" in roles else None
     by_height = _by_height(scaled, main)
-    # Layers that tell storeys are believed before heights.
+    # Layers name storeys better than heights, which divide what is on other layers.
     storeys = storeys_of(drawing, main, builder if not by_height else ReportBuilder()) or by_height
+    if len(storeys) == len(by_height):
+        levels = sorted((level for level, _ in storeys.values()), key=lambda level: level.number or 0.0)
+        parts = (part for _, part in by_height.values())
+        storeys = {level.name: (level, part) for level, part in zip(levels, parts, strict=True)}
     return assemble_levels(storeys, options, budget, make_level) if storeys else (make(drawing, builder, None),)
 
 

@@ -93,7 +93,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     root = read_xml(content, budget)
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
-    pictures = sum(local_name(element) == "image" for element in root.iter())
+    pictures = sum(local_name(element) in ("image", "img") for element in root.iter())
     hypertexts = (element for element in root.iter() if local_name(element) == "foreignObject")
     texts = sum(any(text.strip() for text in element.itertext()) for element in hypertexts)
     for parent in list(root.iter()):

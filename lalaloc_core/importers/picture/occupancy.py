@@ -44,7 +44,7 @@ _OUTER_M, _DOOR_M, _GROWN_M = 0.1, 1.3, 0.036
 # Tones: number, least shares of the picture, of its edge (ground) and of a floor; tolerances (of 255) of equal tones,
 # of pixels of a tone, and of walls.
 _TONES, _LEAST, _GROUND, _EVEN, _SAME, _OF_TONE, _OF_WALL = 24, 0.001, 0.05, 0.6, 10.0, 24.0, 40.0
-# Blur of edges and thinnest walls (cells), thickest inner and outer walls of maps (m), thickness of paths relative to
+# Blur of edges and thinnest walls (cells), thickest thin and other walls of maps (m), thickness of paths relative to
 # walls, least share of floors, smallest floor and largest zone inside one (m²), and share of its rim without a wall.
 _BLURRED, _WALL_CELLS, _THICKEST_M, _THINNER = 2.0, 1.5, (0.065, 0.12), 0.35
 _FLOORS, _FLOOR_M2, _ZONE_M2, _OPEN = 0.6, 1.0, 6.0, 0.5
@@ -92,7 +92,9 @@ def sketch_map(colours: Colours, metres_per_pixel: float, builder: ReportBuilder
     within = np.asarray(found)
     outer = np.concatenate([within[0], within[-1], within[:, 0], within[:, -1]])
     inside = ~(ground & np.isin(within, outer))
-    is_map = thick_m[0] <= _THICKEST_M[0] and thick_m[1] <= _THICKEST_M[1] and float(free[inside].mean()) >= _FLOORS
+    # Beside thin outer walls, a wall between two rooms can have a line of each.
+    is_thin = thick_m[0] <= _THICKEST_M[0] or 0.0 < thick_m[1] <= _THICKEST_M[0]
+    is_map = is_thin and max(thick_m) <= _THICKEST_M[1] and float(free[inside].mean()) >= _FLOORS
     if not is_map or not (walls.any() or len(np.unique(areas)) > 2):
         return None
     if zones_m2:
