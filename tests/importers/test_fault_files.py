@@ -1,7 +1,4 @@
-"""Small files with the traits of real ones: each is read right on the command line, or refused with a remedy.
-
-`tests/service/test_floorplans.py` sends them over HTTP.
-"""
+"""Small files with traits of real ones: read right, or refused with a remedy; `test_floorplans.py` sends them, too."""
 
 from __future__ import annotations
 

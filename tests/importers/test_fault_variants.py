@@ -147,6 +147,8 @@ def test_plot_around_walls_is_no_room_unless_its_name_is(plot: str, name: str, c
     plan = _svg(*walls, f'<text x="{600 if name == "Bed" else 1100}" y="300">{name}</text>')
     assert len(plan.document["rooms"]) == count
     assert any("is taken for the plot" in line for line in plan.report.unsure) == (count == 2)
+    single = _svg(walls[0], walls[3], walls[1].replace("M20 20H490V580H20Z", "M490 0V600")).report
+    assert any("m² without a name lies around all others" in line for line in single.warnings)
 
 
 def test_floors_painted_over_the_edges_of_walls_are_no_openings():

@@ -245,6 +245,7 @@ def test_walls_that_are_paler_than_coloured_floors_are_walls():
         ("#f5f7fa", ("#99c8ff", "#ffd68a", "#ffaa96"), None),
         ("#1c1c1e", ("#3a6296", "#96783c", "#3c7d6e"), None),
         ("white", ("#19a1a1", "#7ac950", "#df5618"), "#5d6d7e"),
+        ("black", ("#19a1a1", "#7ac950", "#df5618"), "#5d6d7e"),
         ("#e7f0fa", ("#b9ddfb", "#b9ddfb", "#b9ddfb"), "#5c9dde"),
     ],
 )
@@ -261,7 +262,7 @@ def test_map_of_a_robot_has_a_room_for_each_colour_or_each_area_between_walls(
     if wall is not None:
         pen.rectangle((100, 100, 900, 800), outline=wall, width=5)
         for line in [(500, 100, 500, 250), (500, 340, 500, 500), (100, 500, 250, 500), (340, 500, 900, 500)]:
-            pen.line(line, fill=wall, width=5)
+            pen.line(line, fill=wall, width=7 if ground == "black" else 5)
     pen.rectangle((200, 600, 350, 750), fill="#ff7070")
     page = page.rotate(turn_deg, fillcolor=ground, expand=True)
     page = page.resize((round(page.width * size), round(page.height * size)))
@@ -455,6 +456,8 @@ def test_pdf_with_lines_is_read_as_a_drawing(picture: str, count: int):
     plan = import_plan(vector_pdf(picture))
     assert sum("pictures cover 8% of the page" in warning for warning in plan.report.warnings) == count
     assert plan.report.scale_source == "1:100, written in the drawing"
+    (doubt,) = import_plan(vector_pdf(), ImportOptions(scale=50.0)).report.warnings
+    assert doubt.startswith("the median width of the leaves of 1 doors is 0.45 m")
     assert plan.report.is_draft
     assert sorted(names_and_types(plan)) == [("Kitchen", "kitchen"), ("Wohnzimmer", "living")]
     assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.35 * 5.0, 4.55 * 5.0], rel=5e-3)

@@ -239,11 +239,8 @@ def by_storey(
         others = {layer for layer, _ in builder.uses if (found := _storey(layer)) and found[1] in numbers}
         report.uses = Counter({use: count for use, count in builder.uses.items() if use[0] not in others})
         report.warnings = [line for line in builder.warnings if not any(f"'{x[:50]}'" in line for x in others)]
-        told_by = (
-            "the heights of its lines"
-            if len(by_height) == len(storeys)
-            else "the names of layers; others belong to all"
-        )
+        is_by_height = len(by_height) == len(storeys)
+        told_by = "the heights of its lines" if is_by_height else "the names of layers; others belong to all"
         report.notes.append(f"storey '{level.name}' by {told_by}")
         return make(part, report, level)
 
